@@ -12,8 +12,9 @@ import io
 import json
 import math
 import re
-from collections import deque
+import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -26,7 +27,7 @@ from drake_diff._base.files import MOST_TEXT, arrays_of, json_of, make_folder, p
 from drake_diff._base.sandbox import reading
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError, UnknownNameError
-from drake_diff.logs.mcap_file import read_mcap, records
+from drake_diff.logs.mcap_file import has_channels, raw_messages, read_mcap
 from drake_diff.mechanics.coordinates import rotation
 from drake_diff.mechanics.description import Link, describe_whole
 from drake_diff.model.model import Model
@@ -35,21 +36,10 @@ from drake_diff.model.tangent import tangent_space
 
 JOINTS, ODOMETRY = "sensor_msgs/msg/JointState", "nav_msgs/msg/Odometry"
 POSE, TWIST = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TwistStamped"
+ROS2 = "cdr"  # how its messages are encoded
 USED = (JOINTS, ODOMETRY, POSE, TWIST)
 Stamped = dict[int, Any]  # messages by time [ns]
 Source = tuple[str, str]  # a topic, and the frame of the body that its messages are of, empty where they say none
-
-
-def is_ros2(path: Path) -> bool:
-    """Whether the messages in an MCAP file are encoded as ROS 2's; False where it is damaged, for others to say."""
-    from mcap.reader import make_reader
-
-    with path.open("rb") as file:
-        try:
-            summary = make_reader(file).get_summary()
-        except Exception:  # as in `mcap_read`, which then names the damage
-            return False
-    return summary is not None and any(c.message_encoding == "cdr" for c in summary.channels.values())
 
 
 def read_ros2(path: Path, model: Model) -> tuple[tuple[Array, Array, Array], Mapping[str, str]]:
@@ -79,19 +69,23 @@ def _frame_of_body(kind: str, message: Any) -> str:
 
 def _messages(path: Path) -> tuple[list[tuple[str, str, bytes]], Mapping[str, str]]:
     """Topic, type and bytes of what is used, and the metadata record "contract" of an MCAP file."""
-    from mcap.reader import make_reader
     from rosbags.rosbag2 import Reader
 
-    if path.is_dir():
-        with Reader(path) as bag:
-            wanted = [c for c in bag.connections if c.msgtype in USED]
-            return [(c.topic, c.msgtype, data) for c, _, data in bag.messages(wanted)] if wanted else [], {}
-    data = read_plain(path, links=True)
-    deque(records(data), maxlen=0)  # which refuses what unpacks to too much
-    reader = make_reader(io.BytesIO(data), validate_crcs=True)
-    rows = [(c.topic, s.name, m.data) for s, c, m in reader.iter_messages() if s and s.name in USED]
-    metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
-    return rows, metadata.get("contract", {})
+    files, rows, facts = sorted(path.glob("*.mcap")) if path.is_dir() else [path], [], dict[str, str]()
+    if files:
+        for file in files:
+            messages, metadata = raw_messages(read_plain(file, links=True), ROS2)
+            rows += [message for message in messages if message[1] in USED]
+            facts |= metadata.get("contract", {}) if file == path else {}
+        return rows, facts
+    for file in path.glob("*.db3"):
+        with closing(sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro", uri=True)) as base:
+            (others,) = base.execute("SELECT count(*) FROM sqlite_master WHERE type IN ('view', 'trigger')").fetchone()
+        if others:  # which can stand for rows without end
+            raise ArtifactError(f"{file}: expected tables of messages alone, got {others} views and triggers")
+    with Reader(path) as bag:
+        wanted = [c for c in bag.connections if c.msgtype in USED]
+        return [(c.topic, c.msgtype, data) for c, _, data in bag.messages(wanted)] if wanted else [], {}
 
 
 class _Found:
@@ -368,7 +362,7 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None, g
     with reading(path, "a ROS 2 bag" if path.is_dir() else f"a complete {path.suffix} file"):
         if path.suffix == ".csv":
             motion, outputs = _read_csv(path, model, gaps)
-        elif path.is_dir() or (path.suffix == ".mcap" and is_ros2(path)):
+        elif path.is_dir() or (path.suffix == ".mcap" and has_channels(read_plain(path, links=True), ROS2)):
             motion, facts = read_ros2(path, model)
         elif path.suffix == ".mcap":
             motion, facts = _read_mcap(path, model)

@@ -310,6 +310,37 @@ class _Reading:
         return log.messages.setdefault(topic, []), decode
 
 
+def has_channels(data: bytes, encoding: str) -> bool:
+    """Whether a file has a channel whose messages have that encoding; what is damaged has none."""
+    try:
+        channels = (kinds.Channel.read(ReadDataStream(BytesIO(body))) for o, body in _unpacked(data) if o == CHANNEL)
+        return any(channel.message_encoding == encoding for channel in channels)
+    except Exception:  # as in `parse_mcap`, which names the damage
+        return False
+
+
+def raw_messages(data: bytes, encoding: str) -> tuple[list[tuple[str, str, bytes]], dict[str, dict[str, str]]]:
+    """Topic, schema's name and bytes of all messages of an `encoding`, such as "cdr", and the metadata records.
+
+    No checksum but that of each chunk is looked at: other writers leave the rest out. ValueError where it is damaged.
+    """
+    names, topics, rows, metadata = dict[int, str](), dict[int, tuple[str, str]](), [], dict[str, dict[str, str]]()
+    for opcode, body in _unpacked(data):
+        if opcode == MESSAGE_OPCODE and (number := MESSAGE.unpack_from(body)[0]) in topics:
+            rows.append((*topics[number], body[MESSAGE.size :]))
+        elif opcode == SCHEMA:
+            schema = kinds.Schema.read(ReadDataStream(BytesIO(body)))
+            names[schema.id] = schema.name
+        elif opcode == METADATA:
+            record = kinds.Metadata.read(ReadDataStream(BytesIO(body)))
+            metadata[record.name] = dict(record.metadata)
+        elif opcode == CHANNEL:
+            channel = kinds.Channel.read(ReadDataStream(BytesIO(body)))
+            if channel.message_encoding == encoding:
+                topics[channel.id] = channel.topic, names.get(channel.schema_id, "")
+    return rows, metadata
+
+
 def _unpacked(data: bytes) -> Iterator[tuple[int, bytes]]:
     """Those of `records`, and in the place of each chunk what is in it."""
     for opcode, body in records(data):
@@ -321,8 +352,8 @@ def _unpacked(data: bytes) -> Iterator[tuple[int, bytes]]:
         while position < size:
             opcode, length = RECORD.unpack_from(inner, position)
             position += RECORD.size + length
-            if position > size:
-                raise ValueError("a record in a chunk is cut short")
+            if position > size or not opcode:
+                raise ValueError("a record in a chunk is cut short, or has the opcode 0")
             yield opcode, inner[position - length : position]
 
 

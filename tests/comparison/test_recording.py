@@ -2,6 +2,9 @@
 
 import gzip
 import json
+import sqlite3
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +20,7 @@ from drake_diff.comparison import read_recording
 from drake_diff.comparison.attribution import move
 from drake_diff.engines.formats import mjcf
 from drake_diff.exceptions import ArtifactError, InputError, ShapeError
+from drake_diff.logs.mcap_file import raw_messages
 
 pytestmark = pytest.mark.solve
 
@@ -325,6 +329,22 @@ def test_a_damaged_bag_is_no_recording(run, tmp_path):
     for path in (file, tmp_path / "bag"):
         with pytest.raises(ArtifactError):
             read_recording(path, model)
+
+
+def test_rows_and_records_without_end_are_refused(load, tmp_path):
+    pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
+    (tmp_path / "bag").mkdir()
+    with sqlite3.connect(tmp_path / "bag" / "bag.db3") as base:
+        numbers = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i FROM n) SELECT i FROM n"
+        base.execute(f"CREATE VIEW messages AS {numbers}")
+    with pytest.raises(ArtifactError, match=r"bag\.db3: expected tables of messages alone, got 1 views and triggers"):
+        read_recording(tmp_path / "bag", load("pendulum.urdf"))
+    zeros = bytes(
+        9 * 10
+    )  # ten records of opcode 0 and no length: the mcap package reads 33 million of them in a minute
+    chunk = struct.pack("<QQQIIQ", 0, 0, len(zeros), zlib.crc32(zeros), 0, len(zeros)) + zeros
+    with pytest.raises(ValueError, match="opcode 0"):
+        raw_messages(b"\x89MCAP0\r\n" + struct.pack("<BQ", 6, len(chunk)) + chunk, "cdr")
 
 
 def bag_of(path, messages):
