@@ -18,6 +18,7 @@ Indices = NDArray[np.intp]
 FLOAT = np.dtype(float)
 NUMBERS = "fiub"  # the kinds of NumPy's types that are: floats, integers, booleans
 LARGEST, LARGEST_COUNT = float(np.finfo(float).max), 2**31 - 1  # what a double holds; an int of the solvers
+MOST_STEPS = 10_000_000  # of a motion: each has a state and an input, at least
 LARGEST_SEED = 2**64  # of NumPy's generators, which are also given the seeds of 32 bits that others make
 SHORTEST, LONGEST = 1e-12, 1e6  # [s]
 
@@ -76,6 +77,11 @@ def count(subject: str, value: Any, least: int, most: int = LARGEST_COUNT) -> in
         limit = f" and at most {most}" if whole and value > most else ""
         raise InputError(subject, got=f"{value!r:.80}", expected=f"a whole number of at least {least}{limit}")
     return int(value)
+
+
+def number_of_steps(value: Any) -> int:
+    """`value`, the argument num_steps of a motion, as an int of at least 1."""
+    return count("num_steps", value, 1, MOST_STEPS)
 
 
 def positive_int(subject: str, value: Any) -> int:

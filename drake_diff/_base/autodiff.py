@@ -4,7 +4,11 @@ A loss of a motion has as many variables as the motion has numbers. AutoDiffXd c
 every number, so that its time grows with the square of the motion's length; autograd goes once forward and once back.
 """
 
+import inspect
 from collections.abc import Callable, Sequence
+from functools import update_wrapper
+from numbers import Real
+from pathlib import Path
 from typing import Any, NoReturn
 
 import autograd.numpy
@@ -13,11 +17,106 @@ from autograd import value_and_grad
 from autograd.numpy.numpy_boxes import ArrayBox
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, InitializeAutoDiff
 
-from drake_diff._base.arrays import Array
-from drake_diff.exceptions import GradientError, InputError
+from drake_diff._base.arrays import FLOAT, NUMBERS, Array
+from drake_diff._base.clock import TimeIsUpError
+from drake_diff.exceptions import DrakeDiffError, GradientError, InputError, ShapeError
 
 # AutoDiffXd carries a whole row of derivatives with every number; this many at a time keeps memory flat.
 DIRECTIONS = 128
+ORDINARY = "ordinary arithmetic and NumPy functions, without float()"
+Shape = tuple[int | str, ...]
+
+
+class UntraceableError(Exception):
+    """A function does something that autograd cannot follow."""
+
+
+def named(subject: str, function: Any) -> str:
+    """What a user's function is, its name, and the file and line where it is known."""
+    inner = inspect.unwrap(getattr(function, "func", function))  # of a partial, or of what was made of it
+    code = getattr(inner, "__code__", None) or getattr(inner.__call__, "__code__", None)
+    where = f" ({Path(code.co_filename).name}:{code.co_firstlineno})" if code else ""
+    return f"{subject} {getattr(inner, '__name__', type(inner).__name__)}{where}"
+
+
+def noted(subject: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """What a user's function returns that may end us by an error of its own, which gets a note with its name."""
+    try:
+        return function(*arguments)
+    except Exception as error:
+        error.add_note(f"raised by {named(subject, function)}")
+        raise
+
+
+def called(subject: str, function: Callable[..., Any], *arguments: Any, shape: Shape | None = None) -> Any:
+    """What a user's function gives for plain numbers; any number or array of numbers where `shape` is None.
+
+    InputError where it raises or gives no numbers, ShapeError where they are others, both with the function's name.
+    """
+    try:
+        result = function(*arguments)
+    except (DrakeDiffError, TimeIsUpError):
+        raise
+    except Exception as error:
+        got = f"{type(error).__name__}: {error!s:.200}"
+        raise InputError(named(subject, function), got=got, expected=_in_words(shape)) from error
+    if type(result) is float or (type(result) is np.ndarray and result.dtype is FLOAT and result.shape == shape):
+        return result  # as a rule
+    try:
+        array = np.asarray(result)
+    except ValueError:  # rows of several lengths
+        array = np.array(None)
+    entries = array.flat if array.dtype.kind == "O" else ()
+    if array.dtype.kind not in NUMBERS and not (entries and all(isinstance(e, (Real, AutoDiffXd)) for e in entries)):
+        got = f"{type(result).__name__} {result!r:.80}"
+        raise InputError(f"{named(subject, function)}: its result", got=got, expected=_in_words(shape))
+    sizes = zip(array.shape, shape or (), strict=False)
+    if shape is not None and (array.ndim != len(shape) or any(n != m and not isinstance(n, str) for m, n in sizes)):
+        raise ShapeError(f"{named(subject, function)}: its {type(result).__name__}", got=array.shape, expected=shape)
+    return result
+
+
+def _in_words(shape: Shape | None) -> str:
+    return "numbers" if shape is None else "one number" if shape == () else f"numbers of shape {list(shape)}"
+
+
+def carrying(subject: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """What a user's function gives for AutoDiffXd; GradientError, with the function's name, where it raises."""
+    try:
+        return function(*arguments)
+    except (DrakeDiffError, TimeIsUpError):
+        raise
+    except Exception as error:
+        what = f"{named(subject, function)} lost its derivatives: {type(error).__name__}: {error!s:.200}"
+        raise GradientError(f"{what}; write it with {ORDINARY}") from error
+
+
+class UserFunction:
+    """A user's function of arrays that is `called` with plain numbers and `carrying` with AutoDiffXd.
+
+    Its first argument has `ndim` dimensions; whatever else is tried with it, symbols or many points, is as it was.
+    """
+
+    def __init__(self, subject: str, function: Any, shape: Shape | None, ndim: int):
+        update_wrapper(self, function, updated=())
+        self.subject, self.function, self.shape, self.ndim = subject, function, shape, ndim
+
+    def __call__(self, *arguments: Any) -> Any:
+        x = arguments[0]
+        if isinstance(x, np.ndarray) and x.ndim == self.ndim:
+            if x.dtype == FLOAT:
+                return called(self.subject, self.function, *arguments, shape=self.shape)
+            if x.size and isinstance(x.flat[0], AutoDiffXd):
+                return carrying(self.subject, self.function, *arguments)
+        return self.function(*arguments)
+
+
+def user_function(subject: str, function: Any, shape: Shape | None = (), ndim: int = 1) -> Any:
+    """A user's function as a `UserFunction`; what this package made, and what is no function, as it is."""
+    ours = isinstance(function, UserFunction) or type(function).__module__.startswith("drake_diff.")
+    if ours or not callable(function) or hasattr(function, "linearize"):
+        return function
+    return UserFunction(subject, function, shape, ndim)
 
 
 def gradient_of(f: Callable[[Any], Any], z: Array) -> tuple[float, Array]:
@@ -89,10 +188,6 @@ def chain_rows(values: Array, jacobian: Array, z: Any) -> Any:
     seed = _seed(z)
     gradient = jacobian if seed is None else jacobian @ seed
     return InitializeAutoDiff(value=values.reshape(-1, 1), gradient=gradient).ravel()
-
-
-class UntraceableError(Exception):
-    """A function does something that autograd cannot follow."""
 
 
 class TracedArray(ArrayBox):  # type: ignore[misc]  # autograd has no types

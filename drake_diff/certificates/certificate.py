@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_diff._base.arrays import Array, Indices, finite_array, frozen
+from drake_diff._base.arrays import Array, Indices, array_with_gaps, finite_array, frozen
+from drake_diff._base.autodiff import Shape, called
 from drake_diff._base.differences import Difference, Function, Many, one_by_one
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.certificates.differences import DIFFERENCES, TINY, Neighbourhood, line, look_around
@@ -462,10 +463,18 @@ def certify_jacobian(
     """
     x = finite_array("x", x, ("n",))
     scale = np.maximum(1.0, np.abs(x)) if scale is None else finite_array("scale", scale, x.shape)
-    at_x, beside = np.asarray(jacobian(x) if callable(jacobian) else jacobian, dtype=float), None
+    given: Any = jacobian
     if callable(jacobian):
-        beside = np.asarray(jacobian(x + jitter(scale)), dtype=float) * scale
-    many = f if batched else one_by_one(lambda point: np.asarray(f(point), dtype=float))
+        given = called("jacobian", jacobian, x, shape=("m", len(x)))
+    at_x, beside = array_with_gaps("jacobian", given, ("m", len(x))), None
+    if callable(jacobian):
+        beside = np.asarray(called("jacobian", jacobian, x + jitter(scale), shape=at_x.shape), dtype=float) * scale
+    shape: Shape = ("K", len(at_x)) if batched else (len(at_x),)
+
+    def ask(point: Array) -> Array:
+        return np.asarray(called("f", f, point, shape=shape), dtype=float)
+
+    many = ask if batched else one_by_one(ask)
     unsolved: Array | float = 0.0
     if solver_tolerance:
         unsolved = solver_tolerance * np.maximum(1.0, np.abs(np.asarray(many(x[None]), dtype=float)[0]))

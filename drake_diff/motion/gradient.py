@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
+from drake_diff._base.arrays import Array, finite_array, frozen, number_of_steps
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.derivatives.sources import check_method
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
@@ -149,7 +149,7 @@ def differentiate_rollout(
             inputs = check_inputs(model, us, num_steps)
             linearization = derivatives_along(set_model, x0, inputs, vector=vector, method=method)
         else:
-            steps = positive_int("num_steps", num_steps)
+            steps = number_of_steps(num_steps)
             linearization, feedback, inputs = _close_the_loop(set_model, x0, policy, steps, vector, method)
     value, totals = total_gradients(loss, x0, inputs, policy, linearization, feedback)
     return _collected(value, totals, x0, inputs, linearization)
@@ -192,10 +192,7 @@ def _in_continuous_time(
     from drake_diff.motion.flow import FlowSteps  # loads CasADi
     from drake_diff.motion.undefined import Beside, undefined_columns
 
-    if policy is None:
-        given = check_inputs(model, us, num_steps)
-    else:
-        given = np.zeros((positive_int("num_steps", num_steps), model.nu))
+    given = check_inputs(model, us, num_steps) if policy is None else np.zeros((number_of_steps(num_steps), model.nu))
     with applied(vector) as set_model:
         beside = Beside(model, x0, given, policy, loss, vector, FlowSteps(set_model, vector))
     still = np.zeros(beside.space.size + len(beside.given) + len(vector.values))

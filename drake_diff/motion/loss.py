@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.autodiff import gradient_of, traced_gradient
+from drake_diff._base.autodiff import called, carrying, gradient_of, traced_gradient, user_function
 from drake_diff.derivatives.step import StepDerivatives
 from drake_diff.exceptions import GradientError, InputError
 from drake_diff.motion.policy import Feedback, policy_parameters
@@ -69,7 +69,8 @@ def total_gradients(
 
 def evaluate_loss(loss: Loss, xs: Array, us: Array) -> float:
     """`loss` at a rollout of plain numbers."""
-    return float(loss(xs[-1]) if takes_one_argument(loss) else loss(xs, us))
+    arguments = (xs[-1],) if takes_one_argument(loss) else (xs, us)
+    return float(called("loss", loss, *arguments, shape=()))
 
 
 def differentiate_loss(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, Array, str]:
@@ -78,8 +79,10 @@ def differentiate_loss(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, 
     The method is "autograd"; "autodiff", whose time grows with the square of the motion's length, for what autograd
     cannot follow, and for a loss of the final state alone.
     """
+    with np.errstate(all="ignore"):
+        evaluate_loss(loss, xs, us)  # which names what is wrong with it
     if takes_one_argument(loss):
-        value, gradient = gradient_of(loss, xs[-1])
+        value, gradient = gradient_of(user_function("loss", loss), xs[-1])
         return value, np.vstack([np.zeros_like(xs[:-1]), gradient]), np.zeros_like(us), AUTODIFF
     try:
         with np.errstate(all="ignore"):  # what is not finite is refused below, whole
@@ -96,7 +99,7 @@ def _by_autodiff(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, Array]
     split = xs.size
 
     def flat(z: Any) -> Any:
-        return loss(z[:split].reshape(xs.shape), z[split:].reshape(us.shape))
+        return carrying("loss", loss, z[:split].reshape(xs.shape), z[split:].reshape(us.shape))
 
     value, gradient = gradient_of(flat, np.concatenate([xs.ravel(), us.ravel()]))
     return value, gradient[:split].reshape(xs.shape), gradient[split:].reshape(us.shape)

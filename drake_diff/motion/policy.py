@@ -21,7 +21,7 @@ from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
 from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
 
 from drake_diff._base.arrays import Array, finite_array, frozen, scale
-from drake_diff._base.autodiff import gradient_rows
+from drake_diff._base.autodiff import called, gradient_rows
 from drake_diff.derivatives.sources import PARITY_TOLERANCE
 from drake_diff.derivatives.step import differentiate_step, linearize
 from drake_diff.exceptions import GradientError, InputError
@@ -285,7 +285,7 @@ def differentiate_policy(policy: Any, x: Array, t: float, nu: int) -> tuple[Arra
     derivatives were lost (float() was taken), u is another at the same point, or a derivative is not finite.
     """
     parameters = policy_parameters(policy)
-    u = finite_array("policy(x, t)", _call(policy, x.copy(), t, parameters), (nu,))
+    u = finite_array("policy(x, t)", _call(policy, x.copy(), t, parameters, nu), (nu,))
     active = active_parameters(policy, t)
     variables = InitializeAutoDiff(np.concatenate([x, parameters[active]])).ravel()
     moved = parameters.astype(object)
@@ -293,7 +293,7 @@ def differentiate_policy(policy: Any, x: Array, t: float, nu: int) -> tuple[Arra
     result = _call_with_derivatives(policy, variables[: len(x)], t, moved)
     plain = np.array([not isinstance(entry, AutoDiffXd) for entry in result], dtype=bool)
     if plain.any():  # which must be a constant: else its derivatives were thrown away
-        near = finite_array("policy(x, t)", _call(policy, x + NUDGE, t, parameters + NUDGE), (nu,))
+        near = finite_array("policy(x, t)", _call(policy, x + NUDGE, t, parameters + NUDGE, nu), (nu,))
         changed = np.flatnonzero(plain & (near != u))
         if len(changed):
             raise GradientError(
@@ -321,8 +321,10 @@ def recording_choice(policy: Any, model: Model, feedback: list[Feedback]) -> Cal
     return choose
 
 
-def _call(policy: Any, x: Any, t: float, parameters: Any) -> Any:
-    return policy(x, t, parameters) if hasattr(policy, "parameters") else policy(x, t)
+def _call(policy: Any, x: Any, t: float, parameters: Any, nu: int | None = None) -> Any:
+    """What it gives; of plain numbers, where `nu` is given, checked."""
+    arguments = (x, t, parameters) if hasattr(policy, "parameters") else (x, t)
+    return policy(*arguments) if nu is None else called("policy", policy, *arguments, shape=(nu,))
 
 
 def _call_with_derivatives(policy: Any, x: Any, t: float, parameters: Any) -> Any:

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
+from drake_diff._base.arrays import Array, finite_array, frozen, number_of_steps
+from drake_diff._base.autodiff import called
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import InputError, SimulationError, UnknownNameError
 from drake_diff.model.contact import ContactPoint, contacts_of_the_step, penetration
@@ -143,7 +144,7 @@ def rollout(
     if us is not None and policy is not None:
         raise InputError("rollout", got="us and policy", expected="one of them")
     inputs = check_inputs(model, us, num_steps) if policy is None else policy
-    count = len(inputs) if policy is None else positive_int("num_steps", num_steps)  # type: ignore[arg-type]
+    count = len(inputs) if policy is None else number_of_steps(num_steps)  # type: ignore[arg-type]
     vector = select(model, parameters or ())
     with applied(vector) as set_model:
         if method == CONTINUOUS:
@@ -206,7 +207,7 @@ def continuous_rollout(
 
 def _asked(policy: Policy, x: Array, t: float, nu: int) -> Array:
     """(nu,) what `policy` answers; most answers are as they should be, which costs a tenth to see."""
-    u = policy(x, t)
+    u = called("policy", policy, x, t, shape=(nu,))
     if type(u) is np.ndarray and u.dtype == float and u.shape == (nu,) and math.isfinite(u.dot(u)):
         return u
     return finite_array("u", u, (nu,))
@@ -215,7 +216,7 @@ def _asked(policy: Policy, x: Array, t: float, nu: int) -> Array:
 def check_inputs(model: Model, us: ArrayLike | None, num_steps: int | None = None) -> Array:
     """`us` as a finite (N, nu) array; for a model without actuators `num_steps` alone will do."""
     if us is None and model.nu == 0:
-        us = np.zeros((positive_int("num_steps", num_steps), 0))
+        us = np.zeros((number_of_steps(num_steps), 0))
     checked = finite_array("us", us, ("N", model.nu))
     if len(checked) == 0:
         raise InputError("us", got="0 steps", expected="at least one step")

@@ -10,6 +10,7 @@ from typing import Any, overload
 import numpy as np
 
 from drake_diff._base.arrays import LARGEST_SEED, count, positive_float, positive_int
+from drake_diff._base.autodiff import noted
 from drake_diff._base.clock import now, uncounted
 from drake_diff.exceptions import DrakeDiffError, InputError, SimulationError, UnknownNameError
 from drake_diff.model.contact import penetration
@@ -127,7 +128,11 @@ def solve(  # type: ignore[misc]  # its keywords are written here alone
         np.inf if time_limit is None else positive_float("time_limit [s]", time_limit),
         chosen.tolerance,
     )
-    report = Report(print if progress is True else (progress or None), callback, chosen.on_plan)
+    report = Report(
+        print if progress is True else (progress or None),
+        callback and partial(noted, "callback", callback),
+        chosen.on_plan,
+    )
     arguments: dict[str, Any] = {
         "method": method,
         "max_iterations": limits.max_iterations,
@@ -205,6 +210,8 @@ def _check_common(problem: Any, seed: Any, callback: Any, progress: Any, view: A
     if not isinstance(problem, (Problem, PhasedProblem)):
         raise InputError("problem", got=type(problem).__name__, expected="a Problem or a PhasedProblem")
     count("seed", seed, 0, LARGEST_SEED)
+    for phase in problem.phases:
+        phase.check_derivatives()
     if not (callback is None or callable(callback)):
         raise InputError("callback", got=repr(callback), expected="None or a function of an Iteration")
     if not (isinstance(progress, bool) or callable(progress)):

@@ -8,6 +8,7 @@ from helpers.models import Plant, contact_properties
 from helpers.table import each_row, slow_after
 
 import drake_diff as dd
+from drake_diff._base.autodiff import plain
 from drake_diff.derivatives.step import derivatives_along
 from drake_diff.exceptions import GradientError, InputError
 
@@ -122,8 +123,8 @@ def test_gradient_by_parameters_is_accumulated(write_urdf, load):
     "loss, error, words",
     [
         (lambda x: 1.0, GradientError, "plain number"),
-        (lambda x: float(x[0].value()), GradientError, "plain number"),
-        (lambda x: x, InputError, "one scalar"),
+        (lambda x: float(plain(x)[0]), GradientError, "plain number"),
+        (lambda x: x, InputError, r"^loss <lambda> .*: expected shape \(\), got shape \(2,\)"),
         (lambda: 1.0, InputError, r"loss\(xs, us\) or loss\(x_final\)"),
         (lambda x: np.log(x[0] - x[0]), GradientError, "not finite"),
     ],

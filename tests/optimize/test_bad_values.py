@@ -9,7 +9,8 @@ from helpers.solving import solve_with
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff.exceptions import InputError
+from drake_diff.certificates import certify_jacobian
+from drake_diff.exceptions import GradientError, InputError, ShapeError
 from drake_diff.optimize import Options
 
 NO_ARRAYS = [
@@ -142,6 +143,72 @@ def test_a_solve_with_such_an_option_is_refused(model, name, value):
 @each_row("value", [np.timedelta64(1, "s"), 10**400, -0.5, np.nan, "1"])
 def test_a_ground_of_such_friction_is_refused(model, value):
     refused(lambda m, v: dd.example_model("hopper", ground=v), model, value)
+
+
+# Functions that give no number where one is wanted, or two, and what the error says of each.
+BAD = {
+    "its ndarray: expected shape .*, got shape \\(2, 2\\)": lambda *_: np.eye(2),
+    "its result: expected .*number.*, got NoneType None": lambda *_: None,
+    "its result: expected .*number.*, got str 'a'": lambda *_: "a",
+    "its result: expected .*number.*, got dict {}": lambda *_: {},
+    r"its result: expected .*number.*, got complex 1j": lambda *_: 1j,
+    r"its result: expected .*number.*, got list \[\[1\], \[1, 2\]\]": lambda *_: [[1], [1, 2]],
+    r"expected .*number.*, got KeyError: 'a'": lambda *_: {}["a"],
+    r"expected .*number.*, got TypeError: .* positional argument": lambda: 0.0,
+}
+CALLED = {
+    "running_cost": lambda m, f: problem(m, running_cost=f),
+    "final_cost": lambda m, f: problem(m, final_cost=f),
+    "trajectory_cost": lambda m, f: problem(m, trajectory_cost=f),
+    "constraint": lambda m, f: problem(m, constraints=dd.Constraint(f, upper=1.0)),
+    "dynamics": lambda m, f: dd.Dynamics(f, nx=2, nu=1),
+    "map": lambda m, f: dd.optimize.DiscreteMap(f, nx=2, nu=1),
+    "policy": lambda m, f: dd.rollout(m, [0, 0], policy=f, num_steps=2),
+    "policy of a gradient": lambda m, f: dd.differentiate_rollout(
+        m, [0, 0], None, lambda x: x[0], policy=f, num_steps=2
+    ),
+    "loss": lambda m, f: dd.differentiate_rollout(m, [0, 0], np.zeros((2, 1)), lambda xs, us: f(xs, us)),
+    "jacobian": lambda m, f: certify_jacobian(lambda x: x[:1], [1.0, 2.0], f),
+    "f": lambda m, f: certify_jacobian(f, [1.0, 2.0], [[1.0, 0.0]]),
+}
+
+
+@each_row("name", CALLED)
+def test_a_function_that_gives_no_number_is_named_with_its_file_and_line(model, name):
+    for words, function in BAD.items():
+        if name == "jacobian" and "ndarray" in words:
+            continue  # which is one
+        with pytest.raises(InputError, match=rf"<lambda> \(test_bad_values\.py:\d+\):? {words}"):
+            CALLED[name](model, function)
+
+
+def test_a_cost_has_the_same_error_in_every_method(model):
+    shape = r"^running_cost <lambda> \(test_bad_values.py:\d+\): its \w+: expected shape \(\), got shape \(1,\)"
+    for cost in (lambda x, u: u**2, lambda x, u: [u[0] ** 2]):
+        for method in ("collocation", "shooting", "ilqr"):
+            with pytest.raises(ShapeError, match=shape):
+                dd.solve(problem(model, running_cost=cost), method=method)
+    for cost in (lambda x, u: float(u[0]) ** 2, lambda x, u: u[0] > 0, lambda x, u: np.interp(u[0], [0, 1], [0, 1])):
+        for method in ("collocation", "shooting", "ilqr"):
+            with pytest.raises(GradientError, match=r"^running_cost <lambda> \(test_bad.*\) lost its derivatives"):
+                dd.solve(problem(model, running_cost=cost), method=method)
+
+
+def test_a_callback_that_raises_is_named(model):
+    with pytest.raises(TypeError, match="not subscriptable") as error:
+        dd.solve(problem(model), method="shooting", callback=lambda row: row[0])
+    assert error.value.__notes__[0].startswith("raised by callback <lambda> (test_bad_values.py:")
+
+
+@each_row("steps", [10**7 + 1, 10**9])
+def test_a_motion_of_so_many_steps_is_refused(model, steps):
+    for call in (
+        lambda: problem(model, num_steps=steps),
+        lambda: dd.rollout(model, [0, 0], policy=lambda x, t: [0.0], num_steps=steps),
+        lambda: dd.compare(model, ["numpy"], num_steps=steps),
+    ):
+        with pytest.raises(InputError, match=r"num_steps: expected a whole number .* at most 10000000"):
+            call()
 
 
 def test_numbers_of_all_kinds_are_taken(model):

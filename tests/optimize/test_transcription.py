@@ -440,11 +440,9 @@ def test_a_plants_derivatives_are_those_of_its_equations_of_motion(load, name):
     "f, message",
     [
         (3, "dynamics: expected a function of x and u"),
-        (lambda x: x, "dynamics: expected a function .* got TypeError"),
-        (lambda x, u: np.array([x[1]]), r"dynamics: its result: expected shape \(2,\), got shape \(1,\)"),
+        (lambda x: x, r"dynamics <lambda> .*: expected numbers .* got TypeError"),
+        (lambda x, u: np.array([x[1]]), r"dynamics <lambda> .* its ndarray: expected shape \(2,\), got shape \(1,\)"),
         (lambda x, u: np.array([x[1], u[3]]), "got IndexError"),
-        (lambda x, u: np.array([x[1], math.sin(x[0])]), "got TypeError"),
-        (lambda x, u: np.array([x[1], float(x[0])]), "got TypeError"),
     ],
 )
 def test_a_function_that_is_no_dynamics_is_refused(f, message):
@@ -455,6 +453,9 @@ def test_a_function_that_is_no_dynamics_is_refused(f, message):
 def test_dynamics_without_derivatives_are_refused():
     with pytest.raises(GradientError, match="dynamics lost its derivatives"):
         Dynamics(lambda x, u: np.array([1.0, 2.0]), 2, 1)
+    for f in (lambda x, u: np.array([x[1], math.sin(x[0])]), lambda x, u: np.array([x[1], float(x[0])])):
+        with pytest.raises(GradientError, match=r"dynamics <lambda> .* lost its derivatives: TypeError"):
+            Dynamics(f, 2, 1)
 
 
 @each_row(
@@ -496,7 +497,7 @@ def test_bad_dynamics_are_named(options, message):
         ({"parameters": ("mass",)}, "parameters: expected none: these dynamics have no parameters"),
         ({"trajectory_cost": lambda xs, us: xs[0, 0]}, "trajectory_cost: expected .* got given"),
         ({"running_cost": np.nan}, "running_cost"),
-        ({"running_cost": lambda x, u: x}, "running_cost: its result"),
+        ({"running_cost": lambda x, u: x}, "running_cost <lambda> .* expected shape"),
         ({"running_cost": dd.QuadraticCost(R=np.eye(2))}, r"running_cost.R: expected shape \(1, 1\)"),
         ({"final_cost": dd.QuadraticCost(Q=np.eye(3))}, r"final_cost.Q: expected shape \(2, 2\)"),
         ({"final_cost": 3}, "final_cost: expected a function"),
@@ -513,7 +514,7 @@ def test_bad_input_is_named_before_anything_runs(options, message):
 
 
 def test_a_running_cost_without_derivatives_is_refused():
-    with pytest.raises(GradientError, match="running_cost lost its derivatives"):
+    with pytest.raises(GradientError, match=r"running_cost <lambda> .* lost its derivatives"):
         move(running_cost=lambda x, u: 1.0)
 
 

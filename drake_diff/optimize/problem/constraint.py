@@ -10,8 +10,8 @@ import numpy as np
 from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
 
 from drake_diff._base.arrays import Array, array_with_gaps, frozen
-from drake_diff._base.autodiff import chain_rows, gradient_rows
-from drake_diff.exceptions import GradientError, InputError
+from drake_diff._base.autodiff import called, carrying, chain_rows, gradient_rows, named
+from drake_diff.exceptions import GradientError, InputError, ShapeError
 from drake_diff.model.model import Model
 
 LOOKED_AT = 5  # states at which the slopes of a constraint are taken
@@ -230,14 +230,8 @@ class Constraint:
 
     def resolved(self, x: Array, u: Array) -> "Constraint":
         """This constraint with bounds as many as the function's values; InputError where the two do not fit."""
-        try:
-            with np.errstate(all="ignore"):
-                values = self._call(x, u)
-        except (TypeError, ValueError, IndexError, AttributeError) as error:
-            if isinstance(error, InputError):
-                raise
-            got = f"{type(error).__name__}: {error}"
-            raise InputError(f"constraint {self.label}", got=got, expected=FORM) from error
+        with np.errstate(all="ignore"):
+            values = self._call(x, u)
         size = len(self.lower)
         if size not in (1, len(values)):
             raise InputError(f"constraint {self.label}", got=f"{len(values)} values", expected=f"{size}, as its bounds")
@@ -245,9 +239,11 @@ class Constraint:
         return replace(self, lower=lower, upper=upper)
 
     def _call(self, x: Any, u: Any) -> Any:
-        result = np.asarray(self.function(x, u) if self.takes_input else self.function(x))
+        f, arguments = self.function, (x, u) if self.takes_input else (x,)
+        ask, subject = called if x.dtype == float else carrying, f"constraint {self.name}".strip()
+        result = np.asarray(ask(subject, f, *arguments))
         if result.ndim > 1:
-            raise InputError(f"constraint {self.label}", got=f"shape {result.shape}", expected="a number or shape (m,)")
+            raise ShapeError(f"{named(subject, f)}: its ndarray", got=result.shape, expected=("m",))
         return np.atleast_1d(result)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from pydrake.trajectories import Trajectory
 
 from drake_diff._base.arrays import Array, finite_array
-from drake_diff._base.autodiff import gradient_of
+from drake_diff._base.autodiff import UserFunction, gradient_of, user_function
 from drake_diff._base.differences import central_differences
 from drake_diff.exceptions import InputError, ShapeError
 from drake_diff.optimize.problem.constraint import ShowsArrays, arguments_of
@@ -375,9 +375,9 @@ def running_cost_of(given: Any) -> Any:
         if not given:
             raise InputError("running_cost", got="an empty list", expected="costs")
         return SumOfCosts(tuple(running_cost_of(cost) for cost in given))
-    if given is None or isinstance(given, (QuadraticCost, TimedCost)) or not callable(given):
-        return given
-    return FunctionOfTime(given) if arguments_of(given) == 3 else given
+    given = user_function("running_cost", given)
+    timed = isinstance(given, UserFunction) and arguments_of(given) == 3
+    return FunctionOfTime(given) if timed else given
 
 
 def _table(reference: Any) -> tuple[Any, Any, Any]:

@@ -178,7 +178,8 @@ class Coupling(Joins):
         def of_both(x: Any, u: Any) -> Any:
             return function(*np.split(x, count), *np.split(u, count))
 
-        packed = of_both if self.takes_input else of_states
+        packed: Any = of_both if self.takes_input else of_states
+        packed.func = function  # by which messages name it
         rows = Constraint(packed, self.lower, self.upper, name=self.label)
         return BoundCoupling(rows.resolved(np.zeros(count * nx), np.zeros(count * nu)), np.array([knots]))
 

@@ -12,7 +12,7 @@ import numpy as np
 from pydrake.autodiffutils import ExtractValue, InitializeAutoDiff
 
 from drake_diff._base.arrays import Array, Indices, array_with_gaps, finite_array, frozen, positive_int
-from drake_diff._base.autodiff import gradient_rows
+from drake_diff._base.autodiff import gradient_rows, user_function
 from drake_diff.exceptions import GradientError, InputError, ShapeError, UnknownNameError
 from drake_diff.mechanics.tree import tree_for
 from drake_diff.model.equations import EquationsOfMotion
@@ -160,7 +160,7 @@ class Dynamics:
                 raise InputError("parameters", got="given", expected="a function f(x, u, p) that they are of")
             self.form = f
             return
-        inputs = self.nu
+        inputs, f = self.nu, user_function("dynamics", f, (self.nx,))
         by_knot = (lambda x, z: f(x, z[:inputs], z[inputs:])) if self.parameters.names else f
         self.form = Pointwise("dynamics", by_knot, self.nx, (self.nx,), self.whole(self.probe()))
 
@@ -275,7 +275,8 @@ class DiscreteMap(Dynamics):
     """
 
     def __init__(self, f: Any, nx: int, nu: int, **limits: Any):
-        self.f, self.counts = f, arguments_of(f) > 2
+        self.counts = arguments_of(f) > 2
+        self.f = f = user_function("dynamics", f, (nx,))
         self.steps: dict[int, Pointwise] = {}
         super().__init__((lambda x, u: f(x, u, 0)) if self.counts else f, nx, nu, **limits)
 

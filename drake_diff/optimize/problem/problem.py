@@ -5,9 +5,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, cast
 
 import numpy as np
+from pydrake.autodiffutils import AutoDiffXd, InitializeAutoDiff
 
 from drake_diff._base.arrays import (
     Array,
@@ -16,9 +18,11 @@ from drake_diff._base.arrays import (
     count,
     finite_array,
     frozen,
+    number_of_steps,
     positive_float,
     seconds,
 )
+from drake_diff._base.autodiff import ORDINARY, named, user_function
 from drake_diff._base.values import PicklesItsFields, ShowsItsRepr
 from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, ShapeError, UnknownNameError
 from drake_diff.model.model import Model
@@ -52,7 +56,6 @@ from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics, bounds_o
 from drake_diff.optimize.problem.goals import LAST, Goal, GoalConstraint, WithGoals, in_words
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, doubts_of
 
-MOST_STEPS = 10**8  # each has a state and an input, at least
 OPTIMIZABLE = ("controls", "initial_state", "parameters")
 # A parameter that cannot be negative stays above this part of its first value, unless a bound is given.
 SMALLEST_PART = 1e-3
@@ -157,7 +160,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             raise InputError("system", got=type(system).__name__, expected="a Model or Dynamics")
         x0 = state_of(system, "x0", self.x0, system.default_state)
         self._set("x0", finite_array("x0", x0, (self.nx,)))
-        self._set("num_steps", count("num_steps", self.num_steps, 1, MOST_STEPS))
+        self._set("num_steps", number_of_steps(self.num_steps))
         self._set("optimize", _check_optimize(self.nu, self.optimize))
         if isinstance(system, Model):
             given = self.parameters
@@ -723,11 +726,38 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         if all(cost is None for cost in costs) and np.all(np.isnan(self.goal)) and not asked:
             raise InputError("problem", got="no cost and no goal", expected="a cost, an x_goal, goals or constraints")
         for name in ("running_cost", "final_cost", "trajectory_cost", "parameter_cost"):
+            self._set(name, user_function(name, getattr(self, name), ndim=2 if name == "trajectory_cost" else 1))
             cost = getattr(self, name)
             if cost is not None and not callable(cost) and not (name == "running_cost" and isinstance(cost, TimedCost)):
                 raise InputError(name, got=type(cost).__name__, expected="a function or a QuadraticCost")
             if isinstance(cost, (QuadraticCost, TimedCost)):
                 cost.check_sizes(name, self.nx, self.nu)
+        with np.errstate(all="ignore"):
+            self._call_costs()
+
+    def _call_costs(self) -> None:
+        """Call each cost once with plain numbers: one that gives no scalar is refused before a method asks for it."""
+        for _, cost, arguments in self._user_costs():
+            cost(*(argument.copy() for argument in arguments))
+        if self.trajectory_cost is not None:
+            self.trajectory_cost(np.tile(self.x0, (self.num_steps + 1, 1)), np.array(self.us))
+
+    def _user_costs(self) -> Iterator[tuple[str, Any, tuple[Array, ...]]]:
+        """The costs of a knot, with their names and the arguments at the first knot."""
+        if self.running_cost is not None:
+            yield "running_cost", cost_at(self.running_cost, 0.0), (self.x0, self.us[0])
+        if self.final_cost is not None:
+            yield "final_cost", self.final_cost, (self.x0,)
+
+    def check_derivatives(self) -> None:
+        """GradientError where a cost of a knot loses its derivatives, whichever method would ask for them."""
+        for name, cost, arguments in self._user_costs():
+            ends = np.cumsum([0, *map(len, arguments)])
+            z = InitializeAutoDiff(np.concatenate(arguments)).ravel()
+            with np.errstate(all="ignore"):
+                result = cost(*(z[a:b] for a, b in pairwise(ends)))
+            if not isinstance(np.asarray(result).item(), AutoDiffXd):
+                raise GradientError(f"{named(name, cost)} lost its derivatives: write it in {ORDINARY}")
 
     def _check_parameter_cost(self, cost: Callable[[Any], Any]) -> None:
         """Call it once, with AutoDiffXd."""
