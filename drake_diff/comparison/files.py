@@ -3,6 +3,7 @@
 With recordings, their arrays and the model file too, so that `verify` compares them and looks for their causes again.
 """
 
+import json
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from hashlib import sha256
@@ -13,18 +14,19 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.files import write_whole
+from drake_diff._base.files import read_plain, write_whole
 from drake_diff.comparison.attribution import Attribution, EngineMotion
 from drake_diff.comparison.recordings import LARGEST, Recording, place_of, size_of, write_arrays
-from drake_diff.comparison.result import JACOBIAN_TOLERANCE, STEP_TOLERANCE, Compared, Comparison, slugs
+from drake_diff.comparison.result import JACOBIAN_TOLERANCE, STEP_TOLERANCE, Compared, Comparison, sentence_of, slugs
 from drake_diff.exceptions import InputError
 from drake_diff.logs.channels import TYPES, input_channel, nanoseconds, state_channel, transform_channel
 from drake_diff.logs.mcap_file import Channel, write_mcap
 from drake_diff.model.model import Model
-from drake_diff.pages.html import Line, Plot, page_data, write_page
+from drake_diff.pages.html import Line, Plot, page_again, page_data, write_page
 from drake_diff.runs import other_records as records
+from drake_diff.runs.differences import Reproduced
 from drake_diff.runs.directory import name_of, written_whole
-from drake_diff.runs.fields import DataBoundary, DataUse, WallClock
+from drake_diff.runs.fields import DataBoundary, DataUse, WallClock, canonical
 from drake_diff.runs.other_records import ComparisonRecord
 from drake_diff.runs.provenance import (
     contract_of,
@@ -35,7 +37,7 @@ from drake_diff.runs.provenance import (
     written_now,
 )
 
-TRACE, REPLAY, PAGE = "trace.mcap", "replay.html", "comparison.html"
+TRACE, REPLAY, PAGE, TEMPLATE = "trace.mcap", "replay.html", "comparison.html", "comparison.html.j2"
 MOTION = "motion"  # among the data: the name of what every engine was given
 # Of ghosts: the second and further colours of the page's plots, the first being the reference's.
 COLOURS = (
@@ -259,9 +261,28 @@ MOST_PLOTS = 12  # of coordinates; those whose motions are furthest apart
 def write_comparison_page(path: Path, comparison: Comparison, record: ComparisonRecord, replay: Path) -> None:
     """Write the page of `comparison` with its `record` and the page `replay`, which has the engines as ghosts."""
     write_page(
-        path, "comparison.html.j2", record=record.model_dump(mode="json"), data=comparison_data(comparison),
+        path, TEMPLATE, record=_fields_of(record), data=comparison_data(comparison),
         view=replay.read_text(encoding="utf-8"), most_plots=MOST_PLOTS,
     )  # fmt: skip
+
+
+def _fields_of(record: ComparisonRecord) -> dict[str, Any]:
+    fields: dict[str, Any] = json.loads(canonical(record.model_dump(mode="json")))
+    return fields  # in the order in which the record is written
+
+
+def made_of_record(folder: Path, record: ComparisonRecord) -> Reproduced:
+    """The sentence and the pages of a record, with the plots and the motion that those in `folder` have."""
+    from drake_diff.pages.meshcat import replay_again
+
+    sentence = {"sentence": sentence_of(record.engines)}
+    made = Reproduced(sentence, {}, written=(TRACE, REPLAY, PAGE), recorded={"sentence": record.sentence})
+    if not {REPLAY, PAGE} <= record.files.keys():
+        return made
+    replay = replay_again(read_plain(folder / REPLAY).decode(errors="replace"), f"{record.name}: {record.verdict}")
+    fields, view = _fields_of(record), replay.decode()
+    page = page_again(folder / PAGE, TEMPLATE, record=fields, view=view, most_plots=MOST_PLOTS)
+    return replace(made, files={REPLAY: replay, PAGE: page})
 
 
 def comparison_data(comparison: Comparison) -> dict[str, Any]:

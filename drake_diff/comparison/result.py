@@ -1,7 +1,7 @@
 """What a comparison found of each engine, what that amounts to, and the same in sentences."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal, NamedTuple
@@ -16,6 +16,7 @@ from drake_diff.engines.contract import UNKNOWN, ContractLine, is_another_model
 from drake_diff.engines.equations import UserFunction
 from drake_diff.engines.interface import Precision
 from drake_diff.model.model import Model
+from drake_diff.runs.other_records import EngineEvidence
 
 Verdict = Literal["same", "other law", "other model", "unexplained"]
 Gradient = Literal["its own step's", "not its own step's", "undecided", "none"]
@@ -249,17 +250,21 @@ class Comparison:
         return preformatted(f"{self!r}\n{self}")
 
     def __str__(self) -> str:
-        """Which engines are the same, which are not, and whose gradients are those of their own steps."""
-        others = self.engines[1:]
-        kinds = {phrase: [e.engine for e in others if e.verdict == v] for v, phrase in PHRASES.items()}
-        parts = [f"{_list(names)}: {phrase}" for phrase, names in kinds.items() if names]
-        trust = {kind: [e.engine for e in self.engines if e.gradient == kind] for kind in TRUST}
-        parts += [f"gradients of {_list(names)}: {TRUST[kind]}" for kind, names in trust.items() if names]
-        after_contact = any(
-            "contact law" in (e.first.responsible, e.largest.responsible) for e in others if e.verdict != "same"
-        )
-        note = " From the first touch on a state is only as good as the contact law: examples/studies/contact_table.py."
-        return f"{'; '.join(parts)}.{note if after_contact else ''}"
+        return sentence_of(self.engines)
+
+
+def sentence_of(engines: Sequence[Compared | EngineEvidence]) -> str:
+    """Which engines are the same as the first, which are not, and whose gradients are those of their own steps."""
+    others = engines[1:]
+    kinds = {phrase: [e.engine for e in others if e.verdict == v] for v, phrase in PHRASES.items()}
+    parts = [f"{_list(names)}: {phrase}" for phrase, names in kinds.items() if names]
+    trust = {kind: [e.engine for e in engines if e.gradient == kind] for kind in TRUST}
+    parts += [f"gradients of {_list(names)}: {TRUST[kind]}" for kind, names in trust.items() if names]
+    after_contact = any(
+        "contact law" in (e.first.responsible, e.largest.responsible) for e in others if e.verdict != "same"
+    )
+    note = " From the first touch on a state is only as good as the contact law: examples/studies/contact_table.py."
+    return f"{'; '.join(parts)}.{note if after_contact else ''}"
 
 
 def _breaks(line: ContractLine, touched: bool) -> bool:

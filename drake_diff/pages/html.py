@@ -22,8 +22,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drake_diff._base.files import write_whole
+from drake_diff._base.files import json_of, read_plain, write_whole
 from drake_diff.certificates.certificate import VERDICTS, Certificate
+from drake_diff.exceptions import ArtifactError
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -35,7 +36,11 @@ APART = ("wall_clock", "files", "record_sha256")
 
 _SCRIPT = re.compile(r"<script(?![^>]*application/json)[^>]*>(.*?)</script>", re.DOTALL)
 _VIEW = re.compile(r'(?<= srcdoc=")[^"]*')
-_COMMAND = re.compile(r'(?<=fetch\("data:application/octet-binary;base64,)[A-Za-z0-9+/=]*(?="\))')
+COMMAND = re.compile(  # to the viewer of a scene
+    r'fetch\("data:application/octet-binary;base64,([A-Za-z0-9+/=]*)"\)\s*\.then\(res => res\.arrayBuffer\(\)\)\s*'
+    r"\.then\(buffer => viewer\.handle_command_bytearray\(new Uint8Array\(buffer\)\)\);\s*"
+)
+_DATA = re.compile(r'(?<=<script type="application/json" id="data">).*?(?=</script>)', re.DOTALL)
 _POLICY = re.compile(r"(?<='sha256-)[A-Za-z0-9+/=]*(?=')")
 
 
@@ -169,18 +174,34 @@ def write_page(
     Raises:
         jinja2.UndefinedError: If the template asks for a name that is not there.
     """
-    embedded = {key: value for key, value in record.items() if key not in APART}
+    write_whole(path, _page(template, record, _pooled(data), view, facts).encode())
+
+
+def _page(template: str, record: Mapping[str, Any], pooled: Mapping[str, Any], view: str, facts: Any) -> str:
     scripts = [asset(name) for name in SCRIPTS]
-    hashes = script_hashes(view, *(f"<script>{script}</script>" for script in scripts))
     values = {
         "record": record,
-        "embedded": embedded,
-        "data": _pooled(data),
+        "embedded": {key: value for key, value in record.items() if key not in APART},
+        "data": pooled,
         "view": view,
         "scripts": scripts,
-        "hashes": hashes,
+        "hashes": script_hashes(view, *(f"<script>{script}</script>" for script in scripts)),
     }
-    write_whole(path, render(template, **values, **facts).encode())
+    return render(template, **values, **facts)
+
+
+def page_again(path: Path, template: str, *, record: Mapping[str, Any], view: str = "", **facts: Any) -> bytes:
+    """What `write_page` writes of `record` and `view`, with the plots that the page at `path` has.
+
+    ArtifactError where that has none, or the template cannot have such a record.
+    """
+    from jinja2 import TemplateError
+
+    match = _DATA.search(read_plain(path).decode(errors="replace"))
+    try:
+        return _page(template, record, json_of(match[0].encode() if match else b""), view, facts).encode()
+    except (ArithmeticError, LookupError, TemplateError, TypeError, ValueError) as error:
+        raise ArtifactError(f"{path.name}: no such page: {type(error).__name__}: {error}") from error
 
 
 def content_policy(page: str) -> str:
@@ -217,8 +238,8 @@ def pieces_of(page: str) -> PagePieces:
     text = _POLICY.sub(lambda match: hashes.get(match[0], match[0]), _SCRIPT.sub("script", outer))
     return PagePieces(
         "".join([*(view.text for view in inner), text]),
-        (*(script for view in inner for script in view.scripts), *(_COMMAND.sub("", script) for script in scripts)),
-        (*(command for view in inner for command in view.scene), *_COMMAND.findall("".join(scripts))),
+        (*(script for view in inner for script in view.scripts), *(COMMAND.sub("", script) for script in scripts)),
+        (*(command for view in inner for command in view.scene), *COMMAND.findall("".join(scripts))),
     )
 
 

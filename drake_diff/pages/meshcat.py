@@ -27,7 +27,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.files import write_whole
 from drake_diff.exceptions import ModelError
 from drake_diff.model.triangles import Triangles, hull_of
-from drake_diff.pages.html import asset, content_policy
+from drake_diff.pages.html import COMMAND, asset, content_policy
 from drake_diff.pages.scene import ARROW_PART, SMALLEST_SIZE, Force, Poses, Scene
 from drake_diff.pages.shapes import Drawn
 
@@ -67,11 +67,23 @@ def write_replay(path: Path, scene: Scene, *, title: str = "") -> None:
     """
     meshcat = Meshcat(MeshcatParams(host="127.0.0.1", show_stats_plot=False))
     draw(meshcat, scene)
+    write_whole(path, _titled(meshcat.StaticHtml(), title).encode())
+
+
+def replay_again(page: str, title: str) -> bytes:
+    """What `write_replay` writes with that title of the scene in `page`, whatever else is in it."""
+    meshcat = Meshcat(MeshcatParams(host="127.0.0.1", show_stats_plot=False))
+    meshcat.SetProperty("/Grid", "visible", False)
+    before, *_, after = COMMAND.split(meshcat.StaticHtml())
+    scene = "".join(match[0] for match in COMMAND.finditer(page))
+    return _titled(before + scene + after, title).encode()
+
+
+def _titled(page: str, title: str) -> str:
     name = f"<title>{html.escape(title)}</title>"
-    page = re.sub(r"<title>.*?</title>", lambda _: name, meshcat.StaticHtml(), count=1)
+    page = re.sub(r"<title>.*?</title>", lambda _: name, page, count=1)
     page = page.replace("</html>", f"<script>{asset('replay.js')}</script>\n</html>", 1)
-    page = page.replace("<head>", f"<head>\n  {VIEWPORT}\n  {content_policy(page)}", 1)
-    write_whole(path, page.encode())
+    return page.replace("<head>", f"<head>\n  {VIEWPORT}\n  {content_policy(page)}", 1)
 
 
 @dataclass(frozen=True, eq=False)

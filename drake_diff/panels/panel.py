@@ -29,6 +29,7 @@ from joblib.externals.loky.process_executor import BrokenProcessPool
 from drake_diff._base.arrays import positive_int
 from drake_diff.exceptions import InputError, MissingDependencyError, UnknownNameError
 from drake_diff.panels.results import (
+    PAGE,
     PanelTable,
     PanelTrial,
     Row,
@@ -37,6 +38,7 @@ from drake_diff.panels.results import (
     expand,
     finished_trials,
     load_panel,
+    write_ranking,
     write_table,
 )
 from drake_diff.runs.provenance import provenance_of
@@ -339,5 +341,7 @@ def run_panel(
                 if progress:
                     progress(len(finished.rows), len(trials), errors)
         table = write_table(directory, trials, finished.rows, made)
-        ended_record(begun, table, time.monotonic() - start).write(directory)
+        record = ended_record(begun, table, time.monotonic() - start)
+        write_ranking(directory / PAGE, table.summary, record)
+        record.write(directory)
         return table

@@ -44,7 +44,7 @@ from drake_diff.runs.differences import Reproduced
 from drake_diff.runs.directory import is_taken, load_record, read_checked, writing
 from drake_diff.runs.fields import FiniteTable, SealedRecord, read_fields
 from drake_diff.runs.other_records import TRIALS, ComparisonRecord, PanelSection, TrialSection, trial_record
-from drake_diff.runs.provenance import header, provenance_of
+from drake_diff.runs.provenance import header
 
 # Names of what drake_diff itself gives each trial; an axis, cell or fixed value cannot have them.
 OURS = ("id", "repeat", "seed")
@@ -287,7 +287,6 @@ def write_table(
     write_whole(directory / TABLE, _csv(rows, {name for row in results.values() for name in row}))
     text = json.dumps(summary, indent=1, allow_nan=False, ensure_ascii=False)
     write_whole(directory / SUMMARY, text.encode() + b"\n")
-    write_ranking(directory / PAGE, summary)
     return PanelTable(directory, rows, summary)
 
 
@@ -350,18 +349,13 @@ def ranked(summary: Mapping[str, Any]) -> tuple[str, list[dict[str, Any]]]:
     return "the fewest errors; no trial says whether it is a success, or has a cost", rows
 
 
-def write_ranking(path: Path, summary: Mapping[str, Any]) -> None:
-    """Write the page of a panel's `summary`."""
+def write_ranking(path: Path, summary: Mapping[str, Any], record: ComparisonRecord) -> None:
+    """Write the page of a panel's `summary` and its `record`."""
     by, rows = ranked(summary)
-    errors = summary["errors"]
-    record = {
-        "name": path.parent.name,
-        "verdict": "fail" if errors else "pass",
-        "sentence": f"{rows[0]['name']} is the best of {len(rows)} cells, by {by}",
-        "provenance": provenance_of().model_dump(mode="json"),
-        **summary,
-    }
-    write_page(path, "panel.html.j2", record=record, data=page_data(0.0, []), rows=rows)
+    stated = record.model_dump(mode="json", include={"name", "verdict", "provenance"})
+    stated = json.loads(canonical(stated))  # in the order in which the record is written
+    shown = {**stated, "sentence": f"{rows[0]['name']} is the best of {len(rows)} cells, by {by}", **summary}
+    write_page(path, "panel.html.j2", record=shown, data=page_data(0.0, []), rows=rows)
 
 
 def _csv(rows: Sequence[Row], answered: set[str]) -> bytes:
@@ -404,8 +398,13 @@ def _cell(cell: dict[str, Any], rows: Sequence[Row], judged: bool) -> dict[str, 
 
 def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Reproduced:
     """What of a panel's directory, or of the record of one trial at `folder`, does not follow from the trials."""
-    problems = _odd_trial(folder) if record.trial is not None else _odd_panel(folder, record)
-    return Reproduced({}, {}, problems=tuple(problems))
+    if record.trial is not None:
+        return Reproduced({}, {}, problems=tuple(_odd_trial(folder)))
+    with TemporaryDirectory() as location:
+        problems = _odd_panel(folder, record, Path(location))
+        files = {path.name: path.read_bytes() for path in Path(location).glob(PAGE)}
+    trials = (name for name in record.files if name.startswith(f"{TRIALS}/"))
+    return Reproduced({}, files, problems=tuple(problems), written=(TABLE, SUMMARY, PAGE, *trials))
 
 
 def _odd_trial(path: Path) -> Iterator[str]:
@@ -421,8 +420,11 @@ def _odd_trial(path: Path) -> Iterator[str]:
         yield f"{path.name}: its result or its panel is not that of {TABLE}"
 
 
-def _odd_panel(folder: Path, record: ComparisonRecord) -> list[str]:
-    """What of the table, the summary and the record of a panel does not come out of the records of its trials again."""
+def _odd_panel(folder: Path, record: ComparisonRecord, again: Path) -> list[str]:
+    """What of the table, the summary and the record of a panel does not come out of the records of its trials again.
+
+    They are made in the folder `again`, and the page with them.
+    """
     if record.panel is None:
         raise ArtifactError(f"{record.FILE}: expected the record of a panel")
     panel, table, summary = record.panel.conditions, _read_table(folder / TABLE), read_fields(folder / SUMMARY)
@@ -440,10 +442,10 @@ def _odd_panel(folder: Path, record: ComparisonRecord) -> list[str]:
         rows[name] = item.result
     if result:
         return result
-    with TemporaryDirectory() as location:
-        made = write_table(Path(location), trials, rows, panel)
-        again = _read_table(Path(location) / TABLE), read_fields(Path(location) / SUMMARY)
-    for name, old, new in zip((TABLE, SUMMARY), (table, summary), again, strict=True):
+    made = write_table(again, trials, rows, panel)
+    write_ranking(again / PAGE, made.summary, record)
+    files = _read_table(again / TABLE), read_fields(again / SUMMARY)
+    for name, old, new in zip((TABLE, SUMMARY), (table, summary), files, strict=True):
         result += [f"{name}: it does not come out of {TRIALS} again"] * (old != new)
     begun = record.panel.model_copy(update={"trials": len(trials)})
     ended = ended_record(record.model_copy(update={"panel": begun}), made, 0.0)

@@ -69,6 +69,7 @@ REPRODUCED_BY = {
     "fit": "drake_diff.identification.files",
     "comparison": "drake_diff.identification.recorded_causes",
     "panel": "drake_diff.panels.results",
+    "robustness": "drake_diff.trials.files",
     "trial": "drake_diff.panels.results",
 }
 NOT_REPEATED = {

@@ -131,9 +131,9 @@ class Verification(ShowsItsRepr):
         if self.verdict == "holds":
             return f"run again, all {self.checked} values came out" + (" but for rounding" if self.rounded else "")
         if self.verdict == "intact":
-            piece = f"all {self.checked} values of the recordings and their causes came out again, "
-            rest = f"{piece}and the engines were not run" if self.checked else "the numbers were not taken again"
-            return f"the files are as they were written; {rest}"
+            why = "" if self.record is None else f": {NOT_RERUN.get(self.record.subject, 'nothing was made again')}"
+            rest = f"; {self.checked} values that follow from others came out again" if self.checked else ""
+            return f"{UNREAD}{why}{rest}"
         return "; ".join(self.complaints or self.undecided)
 
     @property
@@ -380,9 +380,9 @@ def _compared(verification: Verification, record: SealedRecord, again: Reproduce
             names = {metric["name"] for metric in recorded["metrics"]}
             made["metrics"] = [metric for metric in made["metrics"] if metric["name"] in names]
         _compare_records(fields, again.recorded or {key: recorded[key] for key in again.fields}, made)
-    nothing = record.subject in NOT_RERUN and not again.fields
-    why = (f"every number: {NOT_RERUN[record.subject]}",) if nothing else (*UNCHECKED, *_others(record, again.written))
-    compared, unchecked = [fields], [*why, *again.unchecked]
+    nothing = record.subject in NOT_RERUN and not has_recordings(record)
+    why = (f"every number: {NOT_RERUN[record.subject]}",) if nothing else UNCHECKED
+    compared, unchecked = [fields], [*why, *_others(record, again.written or [*record.files]), *again.unchecked]
     unchecked += [f"whatever else schema {SCHEMA_VERSION} has otherwise"] * converted
     for name in dict.fromkeys((*again.files, *again.written)):
         if name not in record.files:
@@ -396,7 +396,8 @@ def _compared(verification: Verification, record: SealedRecord, again: Reproduce
         worded = [d for d in item.differing if d.file.endswith(".html") or d.key.split(".")[-1] in WORDS]
         item.differing = [d for d in item.differing if d not in worded]
         if worded:
-            undecided.append(f"{item.file}: {UNREAD}: schema {record.schema_version} has {worded[0].key} otherwise")
+            reason = f"{item.file}: {UNREAD}: schema {record.schema_version} has {worded[0].key} otherwise"
+            (unchecked if record.subject in NOT_RERUN else undecided).append(reason)
     again = replace(again, undecided=tuple(undecided))
     problems = [*_odd_schema(record), *_odd_bundle(verification.directory, record), *again.problems]
     return _told_of_a_solve(verification, again, problems, compared, unchecked)

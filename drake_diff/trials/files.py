@@ -15,33 +15,33 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.files import make_folder, write_whole
+from drake_diff._base.files import make_folder, read_plain, write_whole
 from drake_diff._base.statistics import ENOUGH
+from drake_diff.exceptions import ArtifactError
 from drake_diff.logs.channels import TYPES, Shown, input_channel, motion_channels, nanoseconds, state_channel
 from drake_diff.logs.mcap_file import Channel, write_mcap
 from drake_diff.loop.run import OK, Hold, Loop
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, select
-from drake_diff.pages.html import Line, Plot, page_data, write_page
+from drake_diff.pages.html import Line, Plot, page_again, page_data, write_page
+from drake_diff.runs.differences import Reproduced
 from drake_diff.runs.directory import load_plan_record, name_of, written_whole
-from drake_diff.runs.fields import DataBoundary, DataUse, WallClock, canonical, evidence, finite, plain
+from drake_diff.runs.fields import DataBoundary, DataUse, WallClock, canonical, evidence, plain, read_fields
 from drake_diff.runs.plan_record import (
-    CellEvidence,
     EventEvidence,
     LoopEvidence,
     Nominal,
-    PerturbationEvidence,
     PlanRecord,
     RobustnessSection,
     RunEvidence,
     TrialEvidence,
 )
 from drake_diff.runs.provenance import header
-from drake_diff.trials.perturbation import Setup, perturbation_for, perturbed
-from drake_diff.trials.run import Cell, Robustness, agrees, sized
+from drake_diff.trials.perturbation import Setup, perturbed
+from drake_diff.trials.run import Robustness, agrees, sentence_of, sized, weakest_of
 from drake_diff.trials.trial import Task, Trial, result_of
 
-PAGE, TABLE, WORST = "robustness.html", "trials.csv", "worst"
+PAGE, TEMPLATE, TABLE = "robustness.html", "robustness.html.j2", "trials.csv"
 PLAIN = Loop()
 SENSED = ("noise", "bias", "delay", "every", "dropout")
 ACTUATED = ("delay", "every", "lower", "upper", "strength", "lag")
@@ -98,25 +98,16 @@ def write_robustness(result: Robustness, folder: Path, run: str | Path | None) -
         seed=result.seed,
         loop=_loop(task),
         nominal=evidence(Nominal, task.nominal, ended=task.nominal.run.ended),
-        perturbations=[
-            evidence(
-                PerturbationEvidence,
-                perturbation_for(name),
-                margin=result.margins[name],
-                cells=[_cell(c) for c in result.of(name)],
-                worst=_folder_of(result.worst(name)),
-            )
-            for name in result.names
-        ],
+        perturbations=list(result.perturbations),
     )
     sections = {"data": _data(result, source), "wall_clock": _times(result, record.wall_clock)}
     record = record.model_copy(update=sections)
-    for name in result.names:
-        worst = result.worst(name)
-        write_trial(folder / _folder_of(worst), task, worst.worst, str(run) if run and _is_repeatable(task) else None)
+    for perturbation in result.perturbations:
+        worst = result.worst(perturbation.name).worst
+        write_trial(folder / perturbation.worst, task, worst, str(run) if run and _is_repeatable(task) else None)
     write_whole(folder / TABLE, _table(result).encode())
-    worst = result.worst(result.weakest)
-    write_robustness_page(folder / PAGE, result, record, folder / _folder_of(worst) / REPLAY)
+    data, facts = robustness_data(result), _page_facts(folder, record)
+    write_page(folder / PAGE, TEMPLATE, data=data, **facts)
     return record.write(folder)
 
 
@@ -139,27 +130,6 @@ def _record(name: str, model: Model, verdict: Any, sentence: str, **trials: Any)
     states, inputs = list(model.state_names), list(model.input_names)
     section = RobustnessSection(state_names=states, input_names=inputs, **trials)
     return PlanRecord(verdict=verdict, sentence=sentence, robustness=section, **header(name, model))
-
-
-def _folder_of(cell: Cell) -> str:
-    return f"{WORST}/{cell.perturbation}_{cell.level:g}"
-
-
-def _cell(c: Cell) -> CellEvidence:
-    return evidence(
-        CellEvidence,
-        c,
-        successes=c.rate.successes,
-        trials=c.rate.trials,
-        rate=c.rate.value,
-        lower_95=c.rate.lower,
-        upper_95=c.rate.upper,
-        distinct=len({e.last.tobytes() for e in c.endings}),
-        labels=dict(c.labels),
-        controller_errors=dict(c.controller_errors),
-        goal_error_median=finite(c.goal_error),
-        goal_error_worst=finite(c.worst_goal_error),
-    )
 
 
 def _loop(task: Task) -> LoopEvidence:
@@ -212,22 +182,42 @@ def _table(result: Robustness) -> str:
 MOST_PLOTS = 12  # of coordinates; those that end furthest from the plan
 
 
-def write_robustness_page(path: Path, result: Robustness, record: PlanRecord, replay: Path) -> None:
-    """Write the page of `result` with its `record` and `replay`, the page of the weakest point's worst trial."""
-    trial = result.worst(result.weakest).worst
-    ((name, level),) = trial.levels.items()
-    reason = trial.reason or "it succeeds, and of all trials it ends furthest from the goal"
-    write_page(
-        path,
-        "robustness.html.j2",
-        record=record.model_dump(mode="json"),
-        data=robustness_data(result),
-        view=replay.read_text(encoding="utf-8"),
-        model=result.task.model.name,
-        caption=f"The worst trial of {name} {sized(name, level)}, with the plan as a ghost: {reason}.",
-        enough=ENOUGH,
-        agrees=agrees,
-    )
+def _page_facts(folder: Path, record: PlanRecord) -> dict[str, Any]:
+    """What the page is written of, but for its plots: the record, and the worst trial of the weakest point."""
+    section: Any = record.robustness
+    worst = weakest_of(section.perturbations).worst
+    trial: Any = read_fields(folder / worst / TRIAL)
+    reason = trial["reason"] or "it succeeds, and of all trials it ends furthest from the goal"
+    much = sized(trial["perturbation"], trial["level"])
+    return {
+        "record": json.loads(canonical(record.model_dump(mode="json"))),  # in the order in which it is written
+        "view": read_plain(folder / worst / REPLAY).decode(errors="replace"),
+        "caption": f"The worst trial of {trial['perturbation']} {much}, with the plan as a ghost: {reason}.",
+        "enough": ENOUGH,
+        "agrees": agrees,
+    }
+
+
+def reproduce(folder: Path, record: PlanRecord, models: Path | None) -> Reproduced:
+    """The sentence and the pages of a robustness record, with the plots and the motions that those in `folder` have."""
+    from drake_diff.pages.meshcat import replay_again
+
+    section, files = record.robustness, dict[str, bytes]()
+    if section is None or section.nominal is None:
+        raise ArtifactError(f"{record.FILE}: expected trials and an unperturbed run")
+    for p in section.perturbations:
+        name = f"{p.worst}/{REPLAY}"
+        if name not in record.files or f"{p.worst}/{TRIAL}" not in record.files:
+            raise ArtifactError(f"{record.FILE}: the worst trial of {p.name} is not where drake_diff writes it")
+        page, trial = read_plain(folder / name).decode(errors="replace"), read_fields(folder / p.worst / TRIAL)
+        title = f"{trial['perturbation']} {trial['level']:g}: {trial['label'] or 'success'}"
+        files[name] = replay_again(page, title + FAR * (f"{title}{FAR}</title>" in page))
+    if PAGE in record.files:
+        files[PAGE] = page_again(folder / PAGE, TEMPLATE, **_page_facts(folder, record))
+    trial = read_fields(folder / weakest_of(section.perturbations).worst / TRIAL)
+    sentence = {"sentence": sentence_of(section.nominal, section.perturbations, trial["reason"])}
+    names = (f"{p.worst}/{name}" for p in section.perturbations for name in (TRIAL, TRACE, REPLAY, LATENCIES))
+    return Reproduced(sentence, files, written=(PAGE, TABLE, *names), recorded={"sentence": record.sentence})
 
 
 def robustness_data(result: Robustness) -> dict[str, Any]:
@@ -317,6 +307,7 @@ def _level_plots(result: Robustness, name: str) -> Iterator[Plot]:
 
 TRIAL, TRACE, REPLAY, LATENCIES = "trial.json", "trace.mcap", "replay.html", "latencies.json"
 FURTHEST = 1e6  # m and rad: what runs away further is drawn here; the trace has it as it was
+FAR = f", drawn up to {FURTHEST:g} only"  # in the title of such a page
 
 
 def write_trial(folder: Path, task: Task, trial: Trial, run: str | None) -> None:
@@ -356,7 +347,7 @@ def write_trial(folder: Path, task: Task, trial: Trial, run: str | None) -> None
         times = np.asarray(model.time_step * np.arange(len(xs)), dtype=float)
         contacts = motion.contacts if len(motion.contacts) == len(xs) - 1 else ()
         scene = scene_of(model, times, xs, us=motion.us, contacts=contacts, ghosts={"plan": (ghost[: len(xs)], BLUE)})
-        far = f", drawn up to {FURTHEST:g} only" if np.any(np.abs(motion.xs) > FURTHEST) else ""
+        far = FAR * bool(np.any(np.abs(motion.xs) > FURTHEST))
         write_replay(folder / REPLAY, scene, title=f"{name} {level:g}: {trial.label or 'success'}{far}")
 
 

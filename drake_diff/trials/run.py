@@ -23,10 +23,12 @@ from drake_diff.model.parameters import applied, select
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.solution import Solution
-from drake_diff.runs.fields import Label
+from drake_diff.runs.fields import Label, evidence, finite
+from drake_diff.runs.plan_record import CellEvidence, Nominal, PerturbationEvidence
 from drake_diff.trials.perturbation import PERTURBATIONS, Levels, levels_named, parameters_of, perturbation_for
 from drake_diff.trials.trial import MakeController, Task, Trial, run_trial
 
+WORST = "worst"  # the folder of the trials that are written in full
 AGREE = 2.0  # a prediction within this factor of what is measured counts as right
 UNIFORM = 1 / np.sqrt(3)  # the standard deviation of a number that is uniform in [-1, 1]
 # Step of the central differences of the controller's answer: about the cube root of rounding, which is best for them.
@@ -176,11 +178,7 @@ class Robustness(ShowsItsRepr):
         fewest trials survive.
         """
 
-        def rank(name: str) -> tuple[float, float]:
-            rates = [c.rate.value for c in self.of(name)]
-            return self.margins[name] / perturbation_for(name).levels[-1], sum(rates) / len(rates)
-
-        return min(self.names, key=rank)
+        return weakest_of(self.perturbations).name
 
     def of(self, name: str) -> list[Cell]:
         """The cells of one perturbation, with increasing levels."""
@@ -191,33 +189,25 @@ class Robustness(ShowsItsRepr):
         cells = self.of(name)
         return next((c for c in cells if c.fails), max(cells, key=lambda c: c.worst_goal_error))
 
+    @cached_property
+    def perturbations(self) -> tuple[PerturbationEvidence, ...]:
+        """The perturbations as a record has them."""
+        return tuple(
+            evidence(
+                PerturbationEvidence,
+                perturbation_for(name),
+                margin=self.margins[name],
+                cells=[_evidence_of(c) for c in self.of(name)],
+                worst=folder_of(name, self.worst(name).level),
+            )
+            for name in self.names
+        )
+
     @property
     def sentence(self) -> str:
         """The verdict in a paragraph: what fails first, whose fault it is, and what the gradients knew."""
-        nominal, name = self.task.nominal, self.weakest
-        cell, margin, labels = (
-            self.worst(name),
-            self.margins[name],
-            sum((Counter(c.labels) for c in self.cells), Counter()),
-        )
-        known = [agrees(c.ratio) for c in self.cells if c.ratio is not None]
-        sentences = ["Unperturbed it succeeds." if nominal.success else f"Unperturbed it fails: {nominal.failures[0]}."]
-        if not labels:
-            sentences += [
-                f"No trial fails: each of {len(self.names)} perturbations is survived up to its largest level."
-            ]
-        else:
-            much = f"with a margin of {sized(name, margin)}" if margin else "with no margin"
-            rate = f"at {sized(name, cell.level)} {cell.rate.successes} of {cell.rate.trials} succeed"
-            causes = ", ".join(f"{count} {label.replace('_', ' ')}" for label, count in labels.most_common())
-            sentences += [f"Weakest point: {name}, {much}: {rate}. What fails first: {cell.worst.reason}."]
-            sentences += [f"Failed trials: {causes}."]
-        if raised := sum((Counter(c.controller_errors) for c in self.cells), Counter()):
-            (error, most), total = raised.most_common(1)[0], sum(raised.values())
-            sentences += [f"In {total} of them the controller itself failed, in {most} with {error}."]
-        within = f"Gradients predict how far the last state moves within a factor of {AGREE:g} in"
-        sentences += [f"{within} {sum(known)} of {len(known)} cells." if known else "Gradients predict none of it."]
-        return " ".join(sentences)
+        nominal = evidence(Nominal, self.task.nominal, ended=self.task.nominal.run.ended)
+        return sentence_of(nominal, self.perturbations, self.worst(self.weakest).worst.reason)
 
     def __repr__(self) -> str:
         name = self.task.controller_name
@@ -233,6 +223,62 @@ class Robustness(ShowsItsRepr):
 
     def __str__(self) -> str:
         return self.sentence
+
+
+def weakest_of(perturbations: Sequence[PerturbationEvidence]) -> PerturbationEvidence:
+    """That with the smallest margin, as a part of its largest usual level; of equals, which fewest trials survive."""
+
+    def rank(p: PerturbationEvidence) -> tuple[float, float]:
+        return p.margin / perturbation_for(p.name).levels[-1], sum(c.rate for c in p.cells) / len(p.cells)
+
+    return min(perturbations, key=rank)
+
+
+def sentence_of(nominal: Nominal, perturbations: Sequence[PerturbationEvidence], reason: str) -> str:
+    """What fails first, whose fault it is, and what the gradients knew; `reason` is of the weakest's worst trial."""
+    weakest, cells = weakest_of(perturbations), [c for p in perturbations for c in p.cells]
+    labels = sum((Counter(c.labels) for c in cells), Counter[str]())
+    known = [agrees(c.ratio) for c in cells if c.ratio is not None]
+    sentences = ["Unperturbed it succeeds." if nominal.success else f"Unperturbed it fails: {nominal.failures[0]}."]
+    if not labels:
+        tried = len(perturbations)
+        sentences += [f"No trial fails: each of {tried} perturbations is survived up to its largest level."]
+    else:
+        name, margin = weakest.name, weakest.margin
+        cell = next(c for c in weakest.cells if folder_of(name, c.level) == weakest.worst)
+        much = f"with a margin of {sized(name, margin)}" if margin else "with no margin"
+        rate = f"at {sized(name, cell.level)} {cell.successes} of {cell.trials} succeed"
+        causes = ", ".join(f"{count} {label.replace('_', ' ')}" for label, count in labels.most_common())
+        sentences += [f"Weakest point: {name}, {much}: {rate}. What fails first: {reason}."]
+        sentences += [f"Failed trials: {causes}."]
+    if raised := sum((Counter(c.controller_errors) for c in cells), Counter[str]()):
+        (error, most), total = raised.most_common(1)[0], sum(raised.values())
+        sentences += [f"In {total} of them the controller itself failed, in {most} with {error}."]
+    within = f"Gradients predict how far the last state moves within a factor of {AGREE:g} in"
+    sentences += [f"{within} {sum(known)} of {len(known)} cells." if known else "Gradients predict none of it."]
+    return " ".join(sentences)
+
+
+def folder_of(name: str, level: float) -> str:
+    """Where the worst trial of a perturbation is written, at the level that its cell has."""
+    return f"{WORST}/{name}_{level:g}"
+
+
+def _evidence_of(c: Cell) -> CellEvidence:
+    return evidence(
+        CellEvidence,
+        c,
+        successes=c.rate.successes,
+        trials=c.rate.trials,
+        rate=c.rate.value,
+        lower_95=c.rate.lower,
+        upper_95=c.rate.upper,
+        distinct=len({e.last.tobytes() for e in c.endings}),
+        labels=dict(c.labels),
+        controller_errors=dict(c.controller_errors),
+        goal_error_median=finite(c.goal_error),
+        goal_error_worst=finite(c.worst_goal_error),
+    )
 
 
 def trial_seed(seed: int, index: int) -> int:

@@ -482,7 +482,8 @@ def test_a_panel_whose_files_do_not_follow_from_its_trials_is_broken(write, tmp_
            of=in_trials)  # fmt: skip
     ranking = [{**row, "place": 1} for row in dd.load_record(made).panel.ranking]
     broken(lambda d: sealed_again(d / "record.json", ranking=ranking), "record.json: panel is not what the table says")
-
+    page = (made / "panel.html").read_text().replace("<h2>Ranking", "<h2>Ranking of experts")
+    broken(lambda d: (d / "panel.html").write_text(page), "panel.html: the text from")
     broken(lambda d: (d / in_trials).unlink(), "only one of them has trial")
     plain = tmp_path / "changed"
     shutil.copytree(made, plain)

@@ -462,9 +462,9 @@ def test_every_kind_of_directory_is_known_read_and_listed(kinds):
     assert {kind: dd.load_record(kinds / kind).subject for kind in KINDS} == {kind: kind for kind in KINDS}
     assert {line.name: line.kind for line in list_runs(kinds)} == {kind: kind for kind in KINDS}
     found = dd.verify(kinds / "comparison")
-    assert str(found) == "intact: the files are as they were written; the numbers were not taken again"
+    assert str(found).startswith("intact: hashes match, contents not checked: the engines were not run again; ")
     assert found.unchecked == ("every number: the engines were not run again",)
-    with pytest.raises(ArtifactError, match="were not taken again"):
+    with pytest.raises(ArtifactError, match="contents not checked"):
         found.require()
 
 
@@ -481,6 +481,36 @@ def test_a_changed_directory_of_any_kind_is_refused_and_the_file_named(kinds, ki
     directory = Path(shutil.copytree(kinds / kind, tmp_path / "edited"))
     corrupt(directory, directory, "number", record.FILE, seed=1)
     assert any(f"{record.FILE}: its content does not match" in words for words in dd.verify(directory).complaints)
+
+
+@each_row("kind", ["comparison", "robustness"])
+def test_pages_and_sentences_of_what_is_not_run_again_follow_from_the_record(kinds, kind, tmp_path):
+    """Plots and scenes do not: the verdict says that contents are not checked."""
+    copy = Path(shutil.copytree(kinds / kind, tmp_path / kind))
+    fields = json.loads((copy / "record.json").read_text())
+
+    def verified():
+        seal(copy, json.loads(json.dumps(fields)), attach=False)
+        return verify_own(copy)
+
+    for path in sorted(copy.rglob("*.html")):
+        honest, name = path.read_text(), path.relative_to(copy).as_posix()
+        words = "No connection" if path.name == "replay.html" else "Versions and machine"
+        for forged in (honest.replace(words, "All is well"), with_scripts(honest, lambda script: script + " ")):
+            assert forged != honest
+            path.write_text(forged)
+            found = verified()
+            assert found.verdict == "broken"
+            assert any(line.startswith(f"{name}: ") for line in found.complaints)
+        path.write_text(honest)
+    fields["sentence"] = "it is safe for people"
+    assert any("record.json: sentence: recorded it is safe" in line for line in verified().complaints)
+    fields["sentence"] = dd.load_record(kinds / kind).sentence
+    for path in copy.rglob("*.html"):
+        path.write_text(with_commands(path.read_text(), lambda _, data: data))
+    assert str(verified()).startswith("intact: hashes match, contents not checked: ")
+    (copy / "safe.pdf").write_text("it is safe")
+    assert "safe.pdf: nothing that drake_diff writes there" in verified().unchecked
 
 
 def test_a_certification_that_lies_is_found_by_certifying_again(kinds, tmp_path):

@@ -171,10 +171,10 @@ def test_the_page_opens_without_a_network_and_without_an_error(saved, browser, t
 def test_what_is_begun_and_not_ended_says_so_beside_the_one_before(result, tmp_path, monkeypatch):
     before = save_robustness(result, tmp_path / "out")
 
-    def fails(*_):
+    def fails(*_, **__):
         raise OSError("no space left")
 
-    monkeypatch.setattr(robustness_page, "write_robustness_page", fails)
+    monkeypatch.setattr(robustness_page, "write_page", fails)
     with pytest.raises(OSError, match="no space"):
         save_robustness(result, tmp_path / "out")
     (left,) = tmp_path.glob("out.partial-*")
