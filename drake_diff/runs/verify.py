@@ -388,7 +388,7 @@ def _compared(verification: Verification, record: SealedRecord, again: Reproduce
         if name not in record.files:
             unchecked += [f"{name}: the directory has none"] * (name in again.files)
         elif name not in again.files:
-            unchecked += [f"{name}: it has what was not run again"] * bool(again.files)
+            unchecked += [f"{name}: it has what was not run again"] * (bool(again.files) and not nothing)
         else:
             compared.append(_compared_file(verification.directory, name, again))
     undecided = list(again.undecided)
