@@ -96,7 +96,7 @@ def script(page, _, rng):
 
 
 def words(page, _, rng):
-    read = [m for m in re.finditer(r"(?<=>)[^<>]*\w[^<>]*(?=<)", page) if len(m[0]) < 300]
+    read = [m for m in re.finditer(r"(?<=>)[^<>]{2,200}(?=<)", page) if re.search(r"\w", m[0])]
     match = read[rng.integers(len(read))]
     return page[: match.start()] + match[0].rstrip() + " or better" + page[match.end() :]
 
