@@ -7,9 +7,12 @@ written. Every line keeps its number, so that messages name lines of the file it
 
 import logging
 import re
+import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -31,7 +34,26 @@ from drake_diff.model.xml_text import XmlText
 
 OF_SIMULATORS = {"gazebo": "what only Gazebo reads", "contact": "friction and the like that only PyBullet reads"}
 MOST_NODES = 100_000  # of a YAML file, its aliases written out
+TESTED = re.compile(r"([\w-]+)<([\d.]+) ?; extra == .tested.")
 IN_CPP = re.compile(r"Failure at \S+ in \w+\(\): ")
+
+
+@cache
+def warn_of_newer_versions() -> None:
+    """Warn once where a package is newer than the newest one that the tests ran with, by the extra `tested`."""
+    newer = []
+    for name, bound in TESTED.findall("\n".join(requires("drake-diff") or ())):
+        with suppress(PackageNotFoundError):
+            if _numbers(version(name)) >= _numbers(bound):
+                newer.append(f"{name} {version(name)} (tested: below {bound})")
+    if newer:
+        advice = "pip install 'drake-diff[tested]' installs tested versions"
+        warnings.warn(f"newer than what drake_diff was tested with: {', '.join(newer)}; {advice}", stacklevel=3)
+
+
+def _numbers(text: str) -> list[int]:
+    """The numbers that a version begins with."""
+    return [int(number) for number in re.split(r"[^\d.]", text)[0].split(".") if number]
 
 
 def text_of(path: Path, notes: list[str]) -> XmlText | None:

@@ -31,7 +31,7 @@ from drake_diff.model.contact_geometry import (
 from drake_diff.model.contract import Contract, read_contract
 from drake_diff.model.file_facts import FileFacts, Mimic
 from drake_diff.model.inputs import TIMES, BodyForce, add_body_forces, check_body_forces, read_inputs
-from drake_diff.model.load_file import DRAKES_REFUSALS, as_packages, read_into
+from drake_diff.model.load_file import DRAKES_REFUSALS, as_packages, read_into, warn_of_newer_versions
 from drake_diff.model.meshes import TREATMENTS
 from drake_diff.model.plant import (
     actuators,
@@ -506,6 +506,7 @@ def load_model(
         Model 'pendulum': nq=1, nv=1, nu=1, time step 0.01 s
     """
     options = {option: value for option, value in locals().items() if option not in ("path", "isolated")}
+    warn_of_newer_versions()
     time_step = seconds("time_step [s]", time_step)
     _check_choice("contact_model", contact_model, CONTACT_MODELS)
     _check_choice("contact_approximation", contact_approximation, CONTACT_APPROXIMATIONS)

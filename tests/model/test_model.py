@@ -15,6 +15,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError, ModelWarning, ShapeError, UnknownNameError
+from drake_diff.model import load_file
 
 NAMES = sorted(p.name for p in MODELS.iterdir())
 
@@ -324,3 +325,17 @@ def test_a_change_that_load_model_does_not_know_is_refused(load):
 def test_a_change_that_has_no_hash_is_refused_by_name(load, change, words):
     with pytest.raises(InputError, match=words):
         load("pendulum.urdf").changed(**change)
+
+
+@pytest.mark.parametrize(("bound", "warns"), [("0.5", True), ("1", True), ("9999", False)])
+def test_a_package_newer_than_tested_is_named_once(monkeypatch, bound, warns):
+    lines = ["numpy>=2.2", f'numpy<{bound}; extra == "tested"', 'absent<1; extra == "tested"']
+    monkeypatch.setattr(load_file, "requires", lambda name: lines)
+    load_file.warn_of_newer_versions.cache_clear()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            dd.load_model(MODELS / "pendulum.urdf", time_step=0.01)
+    expected = f"newer than what drake_diff was tested with: numpy {np.__version__} (tested: below {bound})"
+    assert [str(w.message).startswith(expected) for w in caught] == [True] * warns
+    load_file.warn_of_newer_versions.cache_clear()
