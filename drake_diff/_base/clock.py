@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from importlib.machinery import ExtensionFileLoader
 from types import FrameType
 from typing import Any
 
@@ -84,6 +85,7 @@ class Pace:
 
 INTERRUPTED = 130  # the exit status, as shells have it after Ctrl-C
 ALIKE = (signal.SIGTERM, signal.SIGHUP)
+AGAIN = 0.05  # [s] after which a signal that came amid an import is sent again
 # Called by C or by the garbage collector, which print what is raised in them and go on.
 PRINTS_WHAT_IS_RAISED = {
     *("__del__", "on_disposal", "_object_compiled_hook", "_object_getbuffer_hook"),
@@ -91,19 +93,32 @@ PRINTS_WHAT_IS_RAISED = {
 }
 
 
-def interrupt(number: int, frame: Any) -> None:
-    """A handler that does what Python does at Ctrl-C; amid an import it ends the process.
+def interrupt(number: int, frame: FrameType | None) -> None:
+    """A handler that does what Python does at Ctrl-C, once no extension is being imported.
 
     Extensions in C++ print what is raised while they are imported and go on, or abort.
     """
     global _interrupted
     _interrupted = True
     _hush(number)
-    while frame is not None:
-        if frame.f_globals.get("__name__") == "importlib._bootstrap":
-            os._exit(INTERRUPTED)
-        frame = frame.f_back
+    if frame is not None and _is_imported_in(frame):
+        later = threading.Timer(AGAIN, os.kill, (os.getpid(), number))
+        later.daemon = True
+        later.start()
+        return
     raise KeyboardInterrupt
+
+
+def _is_imported_in(frame: FrameType) -> bool:
+    """Whether an extension is being imported, or the innermost function is of the import system."""
+    if frame.f_globals.get("__name__") == "importlib._bootstrap":
+        return True
+    caller: FrameType | None = frame
+    while caller is not None:
+        if isinstance(caller.f_locals.get("self"), ExtensionFileLoader):
+            return True
+        caller = caller.f_back
+    return False
 
 
 def was_interrupted() -> bool:
