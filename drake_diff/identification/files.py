@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.files import make_folder, read_plain, write_whole
+from drake_diff._base.files import make_folder, write_whole
 from drake_diff.comparison.recordings import (
     ARRAYS,
     LARGEST,
@@ -263,8 +263,7 @@ def reproduce(folder: Path, record: FitRecord, models: Path | None) -> Reproduce
     if record.inputs.parameters == [] or not record.recordings:
         raise ArtifactError(f"{record.FILE}: it names no parameters or no recordings")
     carried = "" if record.model.file is None else record.model.file.path
-    attachments = {carried: read_plain(folder / carried)} if carried in record.files else None
-    with rebuilt(folder, record, attachments, models) as model:
+    with rebuilt(folder, record, models) as model:
         given, files = zip(*(_stored(folder, record, i, model) for i in range(len(record.recordings))), strict=True)
         again = identify(model, given, record.inputs.parameters, **_options(record.inputs))
         again = replace(again, asked=replace(_asked(again), files=files))

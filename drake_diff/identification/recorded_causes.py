@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.files import read_plain
 from drake_diff.comparison.files import MOTION, PAGE, REPLAY, TRACE, hash_of_arrays, made_of_record, row_of
 from drake_diff.comparison.recordings import Recording, place_of, read_arrays
 from drake_diff.comparison.result import slug
@@ -59,8 +58,7 @@ def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Re
     if problems:
         return Reproduced({}, {}, problems=tuple(problems), written=written)
     given = [read_arrays(folder / r.path, r.name, r.version, r.facts) for r in record.recordings]
-    attachments = {carried: read_plain(folder / carried)} if carried in record.files else None
-    with rebuilt(folder, record, attachments, models) as model:
+    with rebuilt(folder, record, models) as model:
         compared = compare_recordings(model, given)
         rows = [e for e in record.engines if not e.jacobians]
         names = [[e.engine for e in engines] for engines in (rows, compared.engines)]

@@ -4,7 +4,6 @@ A name can lead anywhere (`../../etc/passwd`), and a robot file may be a strange
 robot file is not opened at all. The licence that is nearest above a file goes with it.
 """
 
-import json
 import os
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -13,6 +12,7 @@ from pathlib import Path, PurePosixPath
 
 from pydrake.multibody.parsing import PackageMap
 
+from drake_diff._base.files import GIB, json_of
 from drake_diff.exceptions import ArtifactError, ModelError
 from drake_diff.model.file_facts import with_includes
 from drake_diff.model.load_file import FORMATS, add_packages, files_of_directives
@@ -70,35 +70,41 @@ def _named(
     before, there = "".join(f"{name}: " for name, _ in above), dict[str, Path]()
     inside = {path.resolve(), *(file.resolve() for _, file in above)}
 
-    def place(name: str, location: Path) -> None:
+    def put_file(name: str, location: Path) -> None:
         put(before + name, location)
 
     try:
-        for name, location in _names(path, first, packages, place):
+        for name, location in _names(path, first, packages, put_file):
             if location is not None:
-                place(name, location)
+                put_file(name, location)
             if not name.lower().endswith(READABLE):
                 yield NamedFile(before + name, None, "not read: its name is not that of a mesh or a robot file")
                 continue
-            found = _found(location)
-            yield NamedFile(before + name, found, None if found else "no such file")
-            if found is None or location is None:
+            target = _existing(location)
+            yield NamedFile(before + name, target, None if target else "no such file")
+            if target is None or location is None:
                 continue
             there[name] = location
-            if found.resolve() not in inside and not (path.name.endswith(OF_MJCF) and name.endswith(FORMATS)):
-                start = first if path.suffix == found.suffix == ".sdf" else found  # as Drake has it
-                yield from _named(found, start, packages, put, (*above, (name, found)))
+            if target.resolve() not in inside and not (path.name.endswith(OF_MJCF) and name.endswith(FORMATS)):
+                start = first if path.suffix == target.suffix == ".sdf" else target  # as Drake has it
+                yield from _named(target, start, packages, put, (*above, (name, target)))
     except _NotListedError as error:
         yield NamedFile(before + path.name, None, f"the files that it names cannot be listed: {error}", is_list=True)
     if path.name.endswith(FORMATS):
-        for name, location in _licences(first, packages, place, there):
+        for name, location in _licences(first, packages, put_file, there):
             yield NamedFile(before + name, location)
 
 
-def _found(location: Path | None) -> Path | None:
+def is_portable(name: str) -> bool:
+    """Whether a name leads below the folder of a copy of its robot file, as none does that is the path of a file."""
+    paths = (part.removeprefix("file://") for part in name.split(": "))
+    return name.count("../") < LEVELS and not any(path.startswith("/") for path in paths)
+
+
+def _existing(location: Path | None) -> Path | None:
     """The file there, called as there where it is a link: what that leads to need not have an ending."""
-    found = file_at(location)
-    return location if location is not None and found == location.resolve() else found
+    target = file_at(location)
+    return location if location is not None and target == location.resolve() else target
 
 
 class _NotListedError(Exception):
@@ -108,22 +114,22 @@ class _NotListedError(Exception):
 Names = Iterator[tuple[str, Path | None]]  # each once, and where it leads, letter by letter; None: not on this disk
 
 
-def _names(path: Path, first: Path, packages: PackageMap, place: Put) -> Names:
+def _names(path: Path, first: Path, packages: PackageMap, put_file: Put) -> Names:
     try:
-        yield from _all_names(path, first, packages, place)
+        yield from _all_names(path, first, packages, put_file)
     except (AttributeError, OSError, TypeError, ValueError, ModelError) as error:  # Drake's parser forgives more
         raise _NotListedError(str(error).replace(str(path), path.name)) from error
 
 
-def _all_names(path: Path, first: Path, packages: PackageMap, place: Put) -> Names:
+def _all_names(path: Path, first: Path, packages: PackageMap, put_file: Put) -> Names:
     kind, folders = path.name.lower(), set[str]()
     if kind.endswith(".dmd.yaml"):
         names = files_of_directives(path)
     elif kind.endswith(".obj"):  # of which the list of materials beside it is read
-        words = re.findall(rb"^\s*mtllib\s+(.*\S)", path.read_bytes(), re.MULTILINE)
+        words = re.findall(rb"^[ \t]*mtllib[ \t]+(.*\S)", path.read_bytes(), re.MULTILINE)
         names = [Path(word.decode(errors="replace")).name for word in words]
     elif kind.endswith(".gltf"):
-        document = json.loads(path.read_bytes())
+        document = json_of(path.read_bytes())
         parts = [part for key in ("buffers", "images") for part in document.get(key, ())]
         names = [str(part["uri"]) for part in parts if not str(part.get("uri", "data:")).startswith("data:")]
     elif kind.endswith(FORMATS):
@@ -142,13 +148,13 @@ def _all_names(path: Path, first: Path, packages: PackageMap, place: Put) -> Nam
             location = resolve_uri(name, first, packages)
             yield name, location
             if location is not None and name in folders and not name.endswith(FORMATS):
-                yield from _names_of_folder(name, location, place)
+                yield from _names_of_folder(name, location, put_file)
 
 
-def _names_of_folder(name: str, location: Path, place: Put) -> Names:
+def _names_of_folder(name: str, location: Path, put_file: Put) -> Names:
     """Of a folder that SDF includes: the list of its models, and these."""
     listed = location / LIST_OF_MODELS
-    place(f"{name}/{LIST_OF_MODELS}", listed)
+    put_file(f"{name}/{LIST_OF_MODELS}", listed)
     if listed.is_file():
         yield f"{name}/{LIST_OF_MODELS}", listed
         files = {model.text.strip() for model in XmlText(listed.read_bytes()).root.iter("sdf")}
@@ -169,19 +175,19 @@ def _names_of_mjcf(xml: XmlText, path: Path) -> Names:
     yield from sorted({element.get("file"): asset_of(whole, element, path) for element in elements}.items())
 
 
-def _licences(first: Path, packages: PackageMap, place: Put, there: Mapping[str, Path]) -> Iterator[tuple[str, Path]]:
+def _licences(first: Path, packages: PackageMap, put_file: Put, there: Mapping[str, Path]) -> Names:
     """The nearest licence above each file, in its package, or as far as a folder above the one of `first`."""
     seen: dict[str, Path] = {}
     for name, location in there.items():
         package = PACKAGE.match(name)
         start, inner = (f"{package[1]}/", package[3]) if package else ("", os.path.relpath(location, first.parent))
-        if inner.count("../") > LEVELS or PurePosixPath(name).is_absolute():
+        if not is_portable(inner) or not is_portable(name):
             continue
         folders = [str(folder) for folder in PurePosixPath(inner).parents] + [".."] * (not package)
         for candidate in (start + os.path.normpath(f"{folder}/{file}") for folder in folders for file in LICENCES):
             target = resolve_uri(candidate, first, packages)
             if target is not None:
-                place(candidate, target)
+                put_file(candidate, target)
                 if target.is_file():
                     seen[candidate] = target
                     break
@@ -214,6 +220,7 @@ def lay_out(
     for inner in (path.parent, *map(Path, packages.values())):
         inner.mkdir(parents=True)
     path.write_bytes(data)
+    left = GIB
 
     def put(label: str, location: Path) -> None:
         if not Path(os.path.normpath(location)).is_relative_to(root):
@@ -221,6 +228,10 @@ def lay_out(
         wanted = content(label) if label in names else None
         if wanted is None:
             return
+        nonlocal left
+        left -= len(wanted)
+        if left < 0:
+            raise ModelError(f"{name}: what it names has more than {GIB} bytes")
         if location.is_file() and location.read_bytes() != wanted:
             raise ArtifactError(f"record.json: {label} is where another file is")
         location.parent.mkdir(parents=True, exist_ok=True)

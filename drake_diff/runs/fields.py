@@ -29,7 +29,7 @@ READING = (
     "known here. Records of versions 2 and 3 are converted. Another major version is refused by name."
 )
 SCHEMAS = Path(__file__).parent.parent / "schema"
-MOST_NAMES = 5  # of files, in a printed record
+MOST_NAMES = 6  # of files, in a printed record
 BUNDLE = "model"  # the folder of a run directory with what the model file names
 APART = ("wall_clock", "files", "record_sha256")  # of what is the same, byte for byte, in every run
 Passed = Literal["pass", "fail", "incomplete"]

@@ -21,7 +21,7 @@ from drake_diff._base.sandbox import LARGEST_ANSWER
 from drake_diff.certificates.certificate import VERDICTS, Certificate
 from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model, said
-from drake_diff.model.named_files import NamedFile, named_files
+from drake_diff.model.named_files import NamedFile, is_portable, named_files
 from drake_diff.runs.fields import (
     BUNDLE,
     Certified,
@@ -128,14 +128,14 @@ def _evidence(file: NamedFile) -> FileEvidence:
 def write_bundle(folder: Path, *models: Model | None, meshes: bool = True) -> None:
     """Copy what the files of `models` name into the run directory `folder`, its meshes only where they are wanted.
 
-    What is larger than MOST_BUNDLED stays where it is.
+    What is larger than MOST_BUNDLED, or called by an absolute path, stays where it is.
     """
     for file in (file for model in models if model is not None for file in _files_of(model)):
         described = _evidence(file)
         size, target = described.bytes, folder / BUNDLE / str(described.sha256)
-        if file.path is None or size is None or size > MOST_BUNDLED or (file.is_mesh and not meshes):
+        if file.path is None or size is None or size > MOST_BUNDLED or not is_portable(file.name):
             continue
-        if not target.exists():
+        if not target.exists() and (meshes or not file.is_mesh):
             make_folder(target.parent)
             write_whole(target, file.path.read_bytes())
 

@@ -24,7 +24,7 @@ from drake_diff._base.files import arrays_of, read_plain, write_whole
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, ModelError, ModelWarning
 from drake_diff.model.load_file import FORMATS
 from drake_diff.model.model import Model, load_model
-from drake_diff.model.named_files import lay_out
+from drake_diff.model.named_files import is_portable, lay_out
 from drake_diff.optimize.options import Options
 from drake_diff.optimize.phased import PhasedSolution
 from drake_diff.optimize.problem.fixed_contacts import FixedContacts, Impact
@@ -34,7 +34,7 @@ from drake_diff.optimize.program import Iteration, Multipliers
 from drake_diff.optimize.solution import Search, Solution, Status
 from drake_diff.optimize.solve import solve
 from drake_diff.runs.directory import load_plan_record
-from drake_diff.runs.fields import BUNDLE, SealedRecord, file_evidence
+from drake_diff.runs.fields import BUNDLE, FileEvidence, SealedRecord, file_evidence
 from drake_diff.runs.plan_record import PhasesSection, PlanRecord
 from drake_diff.runs.provenance import MOST_BUNDLED, evidence_of
 from drake_diff.runs.sections import rebuild_problem
@@ -110,24 +110,27 @@ def plan_fields(plan: dict[str, Array]) -> dict[str, Any]:
 
 
 @contextmanager
-def rebuilt(
-    folder: Path, record: SealedRecord, attachments: dict[str, bytes] | None, models: Path | None
-) -> Iterator[Model]:
-    """The model of the record in `folder`, for as long as the block runs, from the model file in `attachments`.
+def rebuilt(folder: Path, record: SealedRecord, models: Path | None) -> Iterator[Model]:
+    """The model of the record in `folder`, for as long as the block runs, from the files there.
 
-    Where there is none, or the directory lacks a file that it names, it is built where it was, if that is below the
-    folder `models` and all of them are unchanged.
+    Where one is missing, it is built where it was, if that is below the folder `models` and all files are unchanged.
 
     Raises ModelError, saying why, where it cannot be built again, ArtifactError where the artifact is damaged.
     """
     given = record.model
     if given.file is None or given.options is None:
         raise ModelError("the system is a user's own diagram or function, which no artifact can hold")
-    if attachments is None or (given.named and not _is_bundled(folder, record)):
-        yield _load(*_source_if_unchanged(record, models))
+    name, data = given.file.path, b""
+    if name in record.files:
+        data = read_plain(folder / name)
+    elif TRACE in record.files:
+        data = read_trace(folder / TRACE).attachments.get(name, b"")
+    lacking = [] if {name, TRACE} & record.files.keys() else [name]
+    lacking += [file.path for file in given.named if record.is_before(4, 1) or not _is_here(folder, file)]
+    if lacking:
+        yield _load(*_source_if_unchanged(record, lacking, models))
         return
-    name, data = given.file.path, attachments.get(given.file.path)
-    if data is None or sha256(data).hexdigest() != given.file.sha256:
+    if sha256(data).hexdigest() != given.file.sha256:
         raise ArtifactError(f"{TRACE}: the model file {name} in it is not the one that the record describes")
     if Path(name).name != name or not name.endswith(FORMATS):
         raise ArtifactError(f"record.json: {name!r} is not the name of a model file")
@@ -142,10 +145,9 @@ def rebuilt(
         yield _load(path, {**given.options, "packages": packages})
 
 
-def _is_bundled(folder: Path, record: SealedRecord) -> bool:
-    """Whether the directory has what the model file names; before version 4.1 none has."""
-    needed = [file.sha256 for file in record.model.named if file.sha256 is not None]
-    return not record.is_before(4, 1) and all(_place_of(folder, sha) is not None for sha in needed)
+def _is_here(folder: Path, file: FileEvidence) -> bool:
+    """Whether the directory has what the model file names, if there was such a file."""
+    return is_portable(file.path) and (file.sha256 is None or _place_of(folder, file.sha256) is not None)
 
 
 def _place_of(folder: Path, sha: str) -> Path | None:
@@ -156,23 +158,23 @@ def _place_of(folder: Path, sha: str) -> Path | None:
 
 
 def _bundled(folder: Path, sha: str) -> bytes:
-    place = _place_of(folder, sha)
-    data = b"" if place is None else read_plain(place, MOST_BUNDLED)
+    path = _place_of(folder, sha)
+    data = b"" if path is None else read_plain(path, MOST_BUNDLED)
     if sha256(data).hexdigest() != sha:
         raise ArtifactError(f"{BUNDLE}/{sha}: it is not the file that the record describes")
     return data
 
 
-def _source_if_unchanged(record: SealedRecord, models: Path | None) -> tuple[Path, dict[str, Any]]:
+def _source_if_unchanged(record: SealedRecord, lacking: list[str], models: Path | None) -> tuple[Path, dict[str, Any]]:
     """The model file where it stood, and its options; ModelError where a file is not the recorded one."""
     given, was, options = record.model, record.provenance, dict(record.model.options or {})
     folders, location = options.pop("packages", was.model_packages), was.model_file
     if location is None:  # before version 4.1, which has packages among the options too
         location = record.model_dump()["contract"].get("source")
     if models is None:
-        what = f"names {len(given.named)} files, which the artifact does not hold" if given.named else "is not in it"
+        what = f"{lacking[0]}{f' and {len(lacking) - 1} more' * (len(lacking) > 1)}, which the artifact does not hold"
         raise ModelError(
-            f"the model {what}: models=FOLDER, or --models, lets them be read below a folder that you give"
+            f"the model needs {what}: models=FOLDER, or --models, lets them be read below a folder that you give"
         )
     source = _below(models, str(location), "the model's file")
     if given.file is None or not (source.name.endswith(FORMATS) and source.is_file()):
@@ -243,8 +245,7 @@ def recorded_solution(folder: Path, record: PlanRecord, models: Path | None) -> 
     with ExitStack() as stack:
         phases = []
         for inner, phase in phase_records(folder, record):
-            attachments = read_trace(inner / TRACE).attachments
-            model = stack.enter_context(rebuilt(inner, phase, attachments, models))
+            model = stack.enter_context(rebuilt(inner, phase, models))
             phases.append(resolve(phase, model, read_plan(inner / PLAN)))
         if record.phases is None:
             yield phases[0]

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
-from drake_diff._base.files import read_plain
 from drake_diff.optimize.phased import PhasedSolution
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.replay import OPEN_LOOP
@@ -135,9 +134,8 @@ def contradictions(folder: Path, record: PlanRecord) -> Iterator[str]:
 def _certified(folder: Path, record: PlanRecord, section: CertificationSection, models: Path | None) -> Reproduced:
     """The same states from the same seed, each certified again."""
     carried = record.model.file.path if record.model.file is not None else ""
-    attachments = {carried: read_plain(folder / carried)} if carried in record.files else None
     asked = {name: getattr(section, name) for name in ("seed", "parameters", "method")}
-    with rebuilt(folder, record, attachments, models) as model:
+    with rebuilt(folder, record, models) as model:
         made = _as_given(certify_model(model, states=len(section.states), **asked), record)
     return Reproduced(made.model_dump(mode="json"), {}, written=(carried,))
 
@@ -220,10 +218,10 @@ def _written(solution: Solution, folder: Path, records: Mapping[Path, PlanRecord
             return again
 
         def dump(again: PlanRecord, made: Path) -> dict[str, Any]:
-            place = made.relative_to(location)
-            if records[place].is_before(OFFSETS_SINCE):
+            inner = made.relative_to(location)
+            if records[inner].is_before(OFFSETS_SINCE):
                 return fields_of(again)
-            return as_written(fields_of(again), read_fields(folder / place / PlanRecord.FILE))
+            return as_written(fields_of(again), read_fields(folder / inner / PlanRecord.FILE))
 
         fields: dict[str, Any] = {}
         if _unknown_resets(records[Path()]):  # what leads from one phase to the next is not here

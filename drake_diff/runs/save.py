@@ -414,7 +414,7 @@ def _measured(folder: Path, record: PlanRecord, target: Path) -> PlanRecord:
         )
         raise ArtifactError(f"{folder}: {content}")
     plan = read_plan(folder / PLAN, partial=True)
-    with rebuilt(folder, record, None, ANYWHERE) as model, written_whole(target) as whole:
+    with rebuilt(folder, record, ANYWHERE) as model, written_whole(target) as whole:
         measurement = measure(resolve(record, model, plan).told(iterations=rows_of(plan)))
         made = _with_the_search(record_of(measurement, whole), record)
         write_files(whole, measurement, fields_of(made))

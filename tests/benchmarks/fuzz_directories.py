@@ -246,7 +246,9 @@ def model_changed(folder, rng, canaries):
         name = f"robot.{ending}"
     _with_model(folder, fields, name, data)
     if rng.random() < 0.3:  # one that is to be read where it stood
-        fields["contract"]["source"] = str(rng.choice([str(canaries.folder / f"secret.{e}") for e in ("urdf", "xml")]))
+        fields["provenance"]["model_file"] = str(
+            rng.choice([str(canaries.folder / f"secret.{e}") for e in ("urdf", "xml")])
+        )
         fields["model"]["named"] = [{"path": "x.obj", "bytes": 1, "sha256": "0" * 64, "reason": None}]
     _sealed(folder, fields)
     return f"model: {name}, {how}"

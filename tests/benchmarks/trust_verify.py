@@ -24,7 +24,7 @@ import drake_diff as dd
 
 COUNT = 1000
 # By the words of `Verification.unchecked`: what nothing can make again, and what was asked.
-UNCHECKED = ("wall_clock", "provenance", "name", "contract.source")
+UNCHECKED = ("wall_clock", "provenance", "name")
 ASKED = ("problem.", "model.", "inputs.search.")
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 

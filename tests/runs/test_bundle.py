@@ -277,6 +277,15 @@ def test_another_mesh_in_a_whole_run_is_another_claim(run, tmp_path):
     assert all("far.urdf" in line and "with 4 files (" in line for line in lines)
 
 
+def test_a_mesh_that_is_named_by_its_path_stays_where_it_is(tmp_path):
+    root = robots(tmp_path / "there")
+    path = root / "robot" / "urdf" / "far.urdf"
+    path.write_text(path.read_text().replace("package://robot", str(root / "robot")))
+    dd.save(solved(load(path, root, base="weld")), tmp_path / "run")
+    assert f"needs {root}/robot/meshes/a.obj and 2 more, which the artifact" in str(dd.verify(tmp_path / "run"))
+    assert dd.verify(tmp_path / "run", models=root).holds
+
+
 @each_row("name", ["/etc/robots/a.obj", "file:///etc/robots/a.obj", "../" * 40 + "etc/a.obj"])
 def test_no_name_leads_out_of_the_copy(tmp_path, name):
     data = URDF.format(LINK.format("a", name), LINK.format("b", name)).encode()
