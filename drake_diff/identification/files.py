@@ -51,8 +51,8 @@ MOST_PLOTS = 12  # of coordinates
 MOST_COLUMNS = 16  # of the table of correlations
 
 
-def save_identification(identification: Identification, directory: str | Path, *, meshes: bool = True) -> FitRecord:
-    """Write the directory of an identification: record, recordings, model file, trace and report; see `save`.
+def save(identification: Identification, directory: str | Path, *, meshes: bool = True) -> FitRecord:
+    """Write the directory of an identification: record, recordings, model file, trace and report; see `runs.save`.
 
     Raises InputError where it did not come from `identify`, ArtifactError where a recording's file has changed since.
     """
@@ -61,7 +61,7 @@ def save_identification(identification: Identification, directory: str | Path, *
 
 
 def write_identification(identification: Identification, folder: Path, *, meshes: bool = True) -> FitRecord:
-    """Write what `save_identification` does into `folder`, which `written_whole` gave."""
+    """Write what `save` does into `folder`, which `written_whole` gave."""
     asked, name = _asked(identification), name_of(folder)
     stored = (folder.with_name(name) / RECORDINGS).resolve()
     for recording, given in zip(asked.recordings, asked.files, strict=True):

@@ -84,6 +84,10 @@ MESSAGES: dict[str, dict[str, tuple[tuple[str, bool], str]]] = {
     },
     "Event": {"time": (NUMBER, "s"), **dict.fromkeys(("kind", "failure_label", "code", "message"), (TEXT, ""))},
 }
+# In a file of their own: what is added to the file of the others changes the schemas in every trace.
+LOOP_MESSAGES: dict[str, dict[str, tuple[tuple[str, bool], str]]] = {
+    "Deadline": {**dict.fromkeys(("time", "latency", "budget"), (NUMBER, "s")), "missed": (FLAG, "1")},
+}
 
 
 @dataclass(frozen=True)
@@ -94,9 +98,9 @@ class MessageType:
     units: dict[str, str]
 
 
-def _build() -> dict[str, MessageType]:
-    file = FileDescriptorProto(name="drake_diff.proto", package="drake_diff", syntax="proto3")
-    for name, fields in MESSAGES.items():
+def _build(file_name: str, messages: dict[str, Any]) -> dict[str, MessageType]:
+    file = FileDescriptorProto(name=file_name, package="drake_diff", syntax="proto3")
+    for name, fields in messages.items():
         message = file.message_type.add(name=name)
         for number, (field, ((kind, repeated), _)) in enumerate(fields.items(), start=1):
             label = FieldDescriptorProto.LABEL_REPEATED if repeated else FieldDescriptorProto.LABEL_OPTIONAL
@@ -105,13 +109,13 @@ def _build() -> dict[str, MessageType]:
     pool = DescriptorPool()
     pool.Add(file)
     result = {}
-    for name, fields in MESSAGES.items():
+    for name, fields in messages.items():
         units = {field: unit for field, (_, unit) in fields.items() if unit}
         result[name] = MessageType(GetMessageClass(pool.FindMessageTypeByName(f"drake_diff.{name}")), units)
     return result
 
 
-TYPES = _build()
+TYPES = _build("drake_diff.proto", MESSAGES) | _build("drake_diff_loop.proto", LOOP_MESSAGES)
 
 ARROW_LENGTH_PER_NEWTON = 0.02  # [m/N]
 GHOST = "planned/"  # before a body's name: its frame as planned

@@ -160,6 +160,11 @@ class MPC:
         return frozen(self._last.xs), frozen(self._last.us)
 
     @property
+    def reference(self) -> tuple[Array, Array]:
+        """xs (N+1, nx), us (N, nu): the plan of the whole problem, made before the first call."""
+        return frozen(self._reference.xs), frozen(self._reference.us)
+
+    @property
     def gains(self) -> Array | None:
         """(n, nu, nx) K: about `plan`, us[k] + K[k] (x - xs[k]) is what would be planned from x nearby at each step.
 

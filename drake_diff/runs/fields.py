@@ -142,7 +142,7 @@ class Failure(Fields):
 class Event(Fields):
     """Something that happened; `t_s` [s] is simulated time, null for what happens before or after the motion.
 
-    No solver here reports a "recovery" yet; observations and actions, step by step, are in trace.mcap.
+    "fallback", "recovery", "push" and "late" are of a closed loop; no solver here reports a "recovery" yet.
     """
 
     t_s: float | None
@@ -153,7 +153,10 @@ class Event(Fields):
         "contact_broken",
         "saturation_begins",
         "saturation_ends",
+        "fallback",
         "recovery",
+        "push",
+        "late",
         "failure",
     ]
     message: str

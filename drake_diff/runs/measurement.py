@@ -146,7 +146,7 @@ def measure(solution: Solution) -> Measurement:
     limit, thinnest = math.inf, ""
     if problem.has_model:
         metrics += _metrics_of_the_replay(solution, motion, states, positions)
-        invariants += _invariants(solution.vector, motion, _unit(positions), ON_THE_PLANT[problem.motion])
+        invariants += invariants_of(solution.vector, motion, _unit(positions), ON_THE_PLANT[problem.motion])
         limit, thinnest = thinnest_geometry(problem.model)
     failures = tuple(_failures(solution, metrics))
     return Measurement(
@@ -255,16 +255,16 @@ def _failures(solution: Solution, metrics: Sequence[Metric]) -> Iterator[Failure
     if not solution.success:
         label, code = FAILURES[solution.status]
         found_by = "the solver's status, measured again"
-        yield _failure(label, code, solution.message, found_by, "solver, metrics, replays")
+        yield failure(label, code, solution.message, found_by, "solver, metrics, replays")
         bad = next((c for c in solution.certificates if c.verdict != "agree"), None)
         if bad is not None:
             message = f"{bad.subject}: {bad}"
-            yield _failure("planning_error", "gradient_mismatch", message, "certificate", "gradient.certificates")
+            yield failure("planning_error", "gradient_mismatch", message, "certificate", "gradient.certificates")
         return
     broken = [metric.name for metric in metrics if metric.verdict in ("fail", "undecided")]
     if broken:
         message = f"{', '.join(broken)}: the solution says success, its metrics do not hold"
-        yield _failure("evaluation_error", "metric_does_not_hold", message, "metrics", "metrics")
+        yield failure("evaluation_error", "metric_does_not_hold", message, "metrics", "metrics")
 
 
 def gradient_norms(solution: Solution) -> tuple[Array | None, Array | None]:
@@ -292,10 +292,10 @@ def failure_of(error: BaseException) -> Failure:
         label = "state_error" if isinstance(error, SimulationError) else "planning_error"
     code = "refused" if isinstance(error, DrakeDiffError) else "exception"
     message = f"{type(error).__name__}: {error}".encode("utf-8", "replace").decode()
-    return _failure(label, code, message, "the exception that ended the run", None)
+    return failure(label, code, message, "the exception that ended the run", None)
 
 
-def _failure(label: Label, code: str, message: str, detected_by: str, section: str | None) -> Failure:
+def failure(label: Label, code: str, message: str, detected_by: str, section: str | None) -> Failure:
     return Failure(label=label, code=code, message=message, detected_by=detected_by, evidence=section)
 
 
@@ -305,13 +305,13 @@ def _events(solution: Solution, motion: Rollout | None, failures: Sequence[Failu
     end = f"{solution.status.value} after {len(solution.iterations)} iterations: {solution.solver_message}"
     yield Event(t_s=None, kind="solver_ended", message=end)
     if motion is not None:
-        along = [*_contact_events(motion), *_saturation_events(solution, motion)]
+        along = [*contact_events(motion), *_saturation_events(solution, motion)]
         yield from sorted(along, key=lambda event: event.t_s or 0.0)
     for f in failures:
         yield Event(t_s=f.t_s, kind="failure", message=f"{f.label}, {f.code}: {f.message}")
 
 
-def _contact_events(motion: Rollout) -> Iterator[Event]:
+def contact_events(motion: Rollout) -> Iterator[Event]:
     """Each pair of bodies that begins or ceases to push each other."""
     before: set[tuple[str, str]] = set()
     for time, contacts in zip(motion.times, motion.contacts, strict=False):
@@ -369,7 +369,7 @@ def measured(
     )
 
 
-def _invariants(vector: ParameterVector, motion: Rollout | None, unit: str, here: str) -> Iterator[Metric]:
+def invariants_of(vector: ParameterVector, motion: Rollout | None, unit: str, here: str) -> Iterator[Metric]:
     """Each invariant along the replay; null with a reason where it does not apply.
 
     `vector` has the parameters' values that the motion is of, `unit` is that of the positions, `here` says which it is.

@@ -65,6 +65,11 @@ def _of_a_plan(record: PlanRecord) -> Iterator[str]:
             yield f"{ends}: {link.told}, {shown(link.reset)}, within {link.tolerance:g}"
         yield f"in all {shown(record.phases.horizon_s)} s"
         yield f"by solve with {_table(record.phases.search)}"
+    elif record.closed_loop is not None:
+        loop = record.closed_loop.loop.model_dump(mode="json")
+        yield f"closed loop, seed {record.closed_loop.seed}: {_table(loop)}"
+        if record.problem:
+            yield from _of_a_problem(dict(record.problem))
     elif record.subject == "plan":
         yield from _of_a_problem(dict(record.problem))
         for e in record.parameters:

@@ -15,6 +15,7 @@ from drake_diff.runs.fields import (
     Inputs,
     Label,
     Metric,
+    ModelInput,
     ParameterEvidence,
     ReplayEvidence,
     SealedRecord,
@@ -259,8 +260,16 @@ class Nominal(Fields):
     ended: str
 
 
+class PushEvidence(Fields):
+    """A blow at the centre of mass of a body; `impulse` in the world frame [N s]."""
+
+    body: str
+    impulse: list[float]
+    at_s: float
+
+
 class LoopEvidence(Fields):
-    """What is around the controller in every trial; numbers are for all coordinates, or one each."""
+    """What is around the controller; numbers are for all coordinates, or one each."""
 
     controller: str
     period_s: float
@@ -268,8 +277,13 @@ class LoopEvidence(Fields):
     judged_by: str
     sensor: dict[str, float | list[float | None] | None]
     estimator: str
+    estimator_delay: int | None = None  # of a Predictor, in steps of the controller
+    estimator_model: Literal["the plant's", "the controller's"] | None = None  # of a Predictor; null: another
     actuator: dict[str, float | list[float | None] | None]
     fallback: str | None
+    fallback_patience: int | None = None
+    fallback_damping: float | list[float | None] | None = None
+    pushes: list[PushEvidence] = Field(default_factory=list)
     latency_budget_s: float
     latency_budget_is: Literal["stated", "the controller's period"]
 
@@ -297,14 +311,48 @@ class RobustnessSection(Fields):
         return {p.name: f"survived up to {p.margin:g} {p.unit}" for p in self.perturbations}
 
 
-Section = PhasesSection | CertificationSection | RolloutSection | RobustnessSection
+class PredictiveControl(Fields):
+    """MPC of the record's `problem` on `model`; its plan, and what that was made from, are in plan.npz."""
+
+    model: ModelInput
+    horizon: int
+    iterations: int
+    replan_every: int
+
+
+class ClosedLoopSection(Fields):
+    """A controller on the plant; what was measured, estimated, commanded and applied, and when, is in trace.mcap.
+
+    `given` are the rows that a user's code made, or a clock decided: they are data, and nothing can make them again.
+    """
+
+    seed: int
+    loop: LoopEvidence
+    mpc: PredictiveControl | None = None
+    given: list[Literal["observations", "estimates", "commands", "applied"]]
+    ended: str
+    failed_part: str
+    controller_error: str
+
+    def broken(self) -> Iterator[str]:
+        """Why the run is no success, but for the metrics."""
+        if self.ended:
+            yield "a run that broke off"
+
+    def facts(self) -> dict[str, str]:
+        """The controller, and how long it ran."""
+        return {"controller": self.loop.controller, "steps": f"{self.loop.steps} of {self.loop.period_s:g} s"}
+
+
+Section = PhasesSection | CertificationSection | RolloutSection | RobustnessSection | ClosedLoopSection
+SECTIONS = ("phases", "certification", "rollout", "robustness", "closed_loop")
 
 
 class PlanRecord(SealedRecord):
     """Everything that it takes to judge one solve; the motion is in plan.npz and trace.mcap.
 
-    At most one of `phases`, `certification`, `rollout` and `robustness` is there: the record is then of that, and the
-    fields of a solve are empty but for what it states itself.
+    At most one of `phases`, `certification`, `rollout`, `robustness` and `closed_loop` is there: the record is then of
+    that, and the fields of a solve are empty but for what it states itself.
     """
 
     KIND: ClassVar[str] = "plan"
@@ -325,18 +373,17 @@ class PlanRecord(SealedRecord):
     certification: CertificationSection | None = None
     rollout: RolloutSection | None = None
     robustness: RobustnessSection | None = None
+    closed_loop: ClosedLoopSection | None = None
 
     @property
     def section(self) -> Section | None:
         """The section that the record is of; None of a solve in one phase."""
-        sections = (self.phases, self.certification, self.rollout, self.robustness)
-        return next((section for section in sections if section is not None), None)
+        return next((getattr(self, name) for name in SECTIONS if getattr(self, name) is not None), None)
 
     @property
     def subject(self) -> str:
         """What the record is of: "plan", or the name of its section."""
-        names = ("phases", "certification", "rollout", "robustness")
-        return next((name for name in names if getattr(self, name) is not None), self.kind)
+        return next((name for name in SECTIONS if getattr(self, name) is not None), self.kind)
 
     @model_validator(mode="after")
     def _passes_only_what_holds(self) -> "PlanRecord":

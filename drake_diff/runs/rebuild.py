@@ -22,6 +22,7 @@ import numpy as np
 from drake_diff._base.arrays import Array, positive_float
 from drake_diff._base.files import arrays_of, read_plain, write_whole
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, ModelError, ModelWarning
+from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.model.load_file import FORMATS
 from drake_diff.model.model import Model, load_model
 from drake_diff.model.named_files import is_portable, lay_out
@@ -38,7 +39,6 @@ from drake_diff.runs.fields import BUNDLE, FileEvidence, SealedRecord, file_evid
 from drake_diff.runs.plan_record import PhasesSection, PlanRecord
 from drake_diff.runs.provenance import MOST_BUNDLED, evidence_of
 from drake_diff.runs.sections import rebuild_problem
-from drake_diff.runs.trace import read_trace
 
 ANYWHERE = Path("/")  # the folder of models of a directory that is one's own
 PLAN = "plan.npz"
@@ -124,7 +124,7 @@ def rebuilt(folder: Path, record: SealedRecord, models: Path | None) -> Iterator
     if name in record.files:
         data = read_plain(folder / name)
     elif TRACE in record.files:
-        data = read_trace(folder / TRACE).attachments.get(name, b"")
+        data = read_mcap(folder / TRACE, links=False).attachments.get(name, b"")
     lacking = [] if {name, TRACE} & record.files.keys() else [name]
     lacking += [file.path for file in given.named if record.is_before(4, 1) or not _is_here(folder, file)]
     if lacking:

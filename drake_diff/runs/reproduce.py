@@ -70,6 +70,7 @@ REPRODUCED_BY = {
     "panel": "drake_diff.panels.results",
     "robustness": "drake_diff.trials.files",
     "trial": "drake_diff.panels.results",
+    "closed_loop": "drake_diff.loop.files",
 }
 NOT_REPEATED = {
     Status.TIME_LIMIT: "how far a search gets within its time limit is another on every run",
@@ -136,7 +137,7 @@ def _certified(folder: Path, record: PlanRecord, section: CertificationSection, 
     carried = record.model.file.path if record.model.file is not None else ""
     asked = {name: getattr(section, name) for name in ("seed", "parameters", "method")}
     with rebuilt(folder, record, models) as model:
-        made = _as_given(certify_model(model, states=len(section.states), **asked), record)
+        made = as_given(certify_model(model, states=len(section.states), **asked), record)
     return Reproduced(made.model_dump(mode="json"), {}, written=(carried,))
 
 
@@ -206,7 +207,7 @@ def _written(solution: Solution, folder: Path, records: Mapping[Path, PlanRecord
 
         def amend(again: PlanRecord, folder: Path) -> PlanRecord:
             recorded = records[folder.relative_to(location)]
-            again, lacking = _but_for_simulators(_as_given(again, recorded), recorded)
+            again, lacking = _but_for_simulators(as_given(again, recorded), recorded)
             unchecked.extend(lacking)
             if recorded.is_before(OFFSETS_SINCE):
                 then = {metric.name: metric.tolerance for metric in recorded.metrics}  # some were absolute
@@ -256,7 +257,7 @@ def _open_loop_alone(again: Sequence[Any], recorded: Sequence[Any]) -> list[Any]
     return [taken.get(r.variant, r) if r.control == OPEN_LOOP else r for r in recorded]
 
 
-def _as_given(again: PlanRecord, record: PlanRecord) -> PlanRecord:
+def as_given(again: PlanRecord, record: PlanRecord) -> PlanRecord:
     """With what nothing can make again as `record` says it."""
     given = {name: getattr(record, name) for name in GIVEN}
     if not record.is_before(OFFSETS_SINCE):  # an earlier minor version has no more than less

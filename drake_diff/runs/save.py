@@ -45,7 +45,6 @@ from drake_diff.runs.fields import (
     reproducible,
 )
 from drake_diff.runs.measurement import Measurement, failure_of, measure, replay_evidence
-from drake_diff.runs.other_records import FitRecord
 from drake_diff.runs.plan_record import ChainEvidence, LinkEvidence, PhaseEvidence, PhasesSection, PlanRecord
 from drake_diff.runs.provenance import gradient_evidence, header, write_bundle
 from drake_diff.runs.rebuild import (
@@ -135,6 +134,8 @@ def chain_evidence(chain: Check) -> ChainEvidence:
 
 
 REPLAY, REPORT = "replay.html", "report.html"
+# Of packages above this one, which are not loaded to save a solve.
+SAVED_BY = {"Identification": "drake_diff.identification.files", "ClosedLoop": "drake_diff.loop.files"}
 UNDER_WAY = "the run has started and not finished: it is still running, or it was killed or broke off"
 BEFORE_THE_SEARCH = "the run was interrupted before the search began: there is no plan"
 NOT_MEASURED = "the search has ended, and its plan is not measured yet"
@@ -150,8 +151,8 @@ def begin(folder: Path, problem: Problem | PhasedProblem, sentence: str = UNDER_
 @overload
 def save(solution: Solution | PhasedSolution, directory: str | Path, *, meshes: bool = True) -> PlanRecord: ...
 @overload
-def save(solution: Any, directory: str | Path, *, meshes: bool = True) -> FitRecord: ...
-def save(solution: Any, directory: str | Path, *, meshes: bool = True) -> PlanRecord | FitRecord:
+def save(solution: Any, directory: str | Path, *, meshes: bool = True) -> Any: ...
+def save(solution: Any, directory: str | Path, *, meshes: bool = True) -> Any:
     """Measure a solution and write its directory: record, plan, trace, replay and report.
 
     All of it is written beside `directory`, in a folder that is called `directory`.partial-..., and takes its place at
@@ -162,7 +163,10 @@ def save(solution: Any, directory: str | Path, *, meshes: bool = True) -> PlanRe
         solution: A result of `solve`, of any status. Of one in phases, record.json says how they are linked, and each
             phase has a directory phase_0, phase_1, ... of its own with all these files; there is no page of the whole.
             Or a result of `identify`: record.json, the recordings, the model file, trace.mcap and report.html
-            are written, and "pass" says that the values found explain the recordings.
+            are written, and "pass" says that the values found explain the recordings. Or one of `closed_loop`, whose
+            record says what was around the controller, and whose trace has what was measured, estimated, commanded and
+            applied, and when; "pass" says that it ran to its end, that every row follows from those before, and
+            that goal and bounds of an MPC's problem are kept.
         directory: Where to write record.json, record.schema.json, plan.npz, trace.mcap, replay.html and report.html.
             It is made where there is none, and replaced where a run wrote it. Plain dynamics have nothing to draw in
             3D, and so no replay.html. What the model file names (meshes, included files, their licences) is copied to
@@ -193,12 +197,11 @@ def save(solution: Any, directory: str | Path, *, meshes: bool = True) -> PlanRe
         return write_run(solution, folder, meshes=meshes)
 
 
-def _save_other(result: Any, directory: str | Path, meshes: bool) -> FitRecord:
-    fits = import_module("drake_diff.identification.files")  # above this package, and not loaded to save a solve
-    if not isinstance(result, fits.Identification):
-        raise InputError("solution", got=type(result).__name__, expected="a result of solve or of identify")
-    record: FitRecord = fits.save_identification(result, directory, meshes=meshes)
-    return record
+def _save_other(result: Any, directory: str | Path, meshes: bool) -> Any:
+    kind = type(result).__name__
+    if kind not in SAVED_BY:
+        raise InputError("solution", got=kind, expected="a result of solve, identify or closed_loop")
+    return import_module(SAVED_BY[kind]).save(result, directory, meshes=meshes)
 
 
 def write_run(solution: Solution | PhasedSolution, folder: Path, *, meshes: bool = True) -> PlanRecord:

@@ -176,8 +176,10 @@ def verify(
 
     A solve is run again as its record says `solve` was called; its plan is measured again, and record, trace and pages
     are written again and compared, texts exactly and numbers as far as machines round alike. A certification is taken
-    again. So whoever changes a value and all hashes with it is found, and the message names the value. A record of an
-    easier task is as true as any: `claimed` says what was asked.
+    again. Each part of a closed loop is given its recorded inputs again: the plant, the sensor, the estimator, the
+    actuator, and MPC of a recorded problem; what a user's code made is data, and is not executed. So whoever changes a
+    value and all hashes with it is found, and the message names the value. A record of an easier task is as true as
+    any: `claimed` says what was asked.
 
     Comparisons, robustness trials, panels and rollouts' certificates are not run again: their verdict is at best
     "intact". But recordings that were compared are compared again, and their causes looked for; table, summary and
@@ -436,6 +438,8 @@ def _odd_bundle(folder: Path, record: SealedRecord) -> Iterator[str]:
     """What is beside the files that the model names, or is not what its name says."""
     phases = phase_records(folder, record) if isinstance(record, PlanRecord) else []
     named = {file.sha256 for _, phase in phases for file in phase.model.named} | {f.sha256 for f in record.model.named}
+    mpc = record.closed_loop.mpc if isinstance(record, PlanRecord) and record.closed_loop is not None else None
+    named |= set() if mpc is None else {file.sha256 for file in mpc.model.named}
     for name, file in record.files.items():
         if name.startswith(f"{BUNDLE}/") and not (file.sha256 in named and name == f"{BUNDLE}/{file.sha256}"):
             yield f"{name}: it is no file that the model names"

@@ -136,7 +136,7 @@ def _line(path: Path) -> RunLine:
     except ArtifactError:
         return RunLine(path, path.name, "", "unreadable", "", None, "", "")
     cost, status, model = None, "-", record.model.file.path if record.model.file else ""
-    if isinstance(record, PlanRecord) and record.subject in ("plan", "phases"):
+    if isinstance(record, PlanRecord) and record.subject in ("plan", "phases", "closed_loop"):
         cost = next((m.value for m in record.metrics if m.name == "cost"), None)
         status = record.solver.status if record.solver else "-"
         model = str(record.contract.get("name", ""))

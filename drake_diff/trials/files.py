@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +18,16 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.files import make_folder, read_plain, write_whole
 from drake_diff._base.statistics import ENOUGH
 from drake_diff.exceptions import ArtifactError
-from drake_diff.logs.channels import TYPES, Shown, input_channel, motion_channels, nanoseconds, state_channel
-from drake_diff.logs.mcap_file import Channel, write_mcap
-from drake_diff.loop.run import OK, Hold, Loop
+from drake_diff.logs.channels import TYPES, Shown, motion_channels, state_channel
+from drake_diff.logs.mcap_file import write_mcap
+from drake_diff.loop.files import FURTHEST, latency_times, loop_channels, loop_evidence, loop_plots
+from drake_diff.loop.run import Hold, Loop
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, select
 from drake_diff.pages.html import Line, Plot, page_again, page_data, write_page
 from drake_diff.runs.differences import Reproduced
 from drake_diff.runs.directory import load_plan_record, name_of, written_whole
-from drake_diff.runs.fields import DataBoundary, DataUse, WallClock, canonical, evidence, plain, read_fields
+from drake_diff.runs.fields import DataBoundary, DataUse, WallClock, canonical, evidence, read_fields
 from drake_diff.runs.plan_record import (
     EventEvidence,
     LoopEvidence,
@@ -43,8 +44,6 @@ from drake_diff.trials.trial import Task, Trial, result_of
 
 PAGE, TEMPLATE, TABLE = "robustness.html", "robustness.html.j2", "trials.csv"
 PLAIN = Loop()
-SENSED = ("noise", "bias", "delay", "every", "dropout")
-ACTUATED = ("delay", "every", "lower", "upper", "strength", "lag")
 
 
 def save_robustness(result: Robustness, directory: str | Path, run: str | Path | None = None) -> PlanRecord:
@@ -133,37 +132,13 @@ def _record(name: str, model: Model, verdict: Any, sentence: str, **trials: Any)
 
 
 def _loop(task: Task) -> LoopEvidence:
-    loop, period = task.loop, task.loop.substeps * task.model.time_step
-    sensor, actuator = loop.sensor, loop.actuator
-    seen = {n: plain(np.asarray(getattr(sensor, n), dtype=float)[()]) for n in SENSED}
-    done = {n: plain(np.asarray(getattr(actuator, n), dtype=float)[()]) for n in ACTUATED}
-    return LoopEvidence(
-        controller=task.controller_name,
-        period_s=period,
-        steps=len(task.us),
-        judged_by=task.judged_by,
-        sensor=seen,
-        estimator=type(loop.estimator).__name__,
-        actuator=done,
-        fallback=None if loop.fallback is None else loop.fallback.mode,
-        latency_budget_s=period if loop.latency_budget is None else loop.latency_budget,
-        latency_budget_is="the controller's period" if loop.latency_budget is None else "stated",
-    )
+    return loop_evidence(task.loop, task.controller_name, task.model, len(task.us), task.judged_by)
 
 
 def _times(result: Robustness, clock: WallClock) -> WallClock:
     runs = [result.task.nominal.run, *(c.worst.outcome.run for c in result.cells)]
-    latencies = np.concatenate([run.latencies for run in runs])
-    if not len(latencies):
-        return clock
-    changes = {
-        "latency_median_s": float(np.median(latencies)),
-        "latency_99_percent_s": float(np.quantile(latencies, 0.99)),
-        "latency_largest_s": float(np.max(latencies)),
-        "late": int(np.sum(latencies > _loop(result.task).latency_budget_s)),
-        "controller_steps": len(latencies),
-    }
-    return clock.model_copy(update=changes)
+    budget = _loop(result.task).latency_budget_s
+    return clock.model_copy(update=latency_times([run.latencies for run in runs], budget))
 
 
 def _table(result: Robustness) -> str:
@@ -177,9 +152,6 @@ def _table(result: Robustness) -> str:
             judgement = [int(e.label is None), e.label or "", e.reason, e.goal_error]
             rows.writerow([c.perturbation, c.level, e.seed, *judgement, *map(float, e.last)])
     return text.getvalue()
-
-
-MOST_PLOTS = 12  # of coordinates; those that end furthest from the plan
 
 
 def _page_facts(folder: Path, record: PlanRecord) -> dict[str, Any]:
@@ -231,46 +203,10 @@ def robustness_data(result: Robustness) -> dict[str, Any]:
 
 def _trial_plots(task: Task, trial: Trial) -> Iterator[Plot]:
     """Of one trial: each coordinate as it was, seen, estimated and planned; the inputs; the controller's status."""
-    run, contract, bounds = trial.outcome.run, task.model.contract, task.plan.problem.bounds
-    setup = perturbed(task.setup, trial.levels, trial.seed)
+    run, setup = trial.outcome.run, perturbed(task.setup, trial.levels, trial.seed)
     planned = planned_states(task, setup)
-    count = len(planned)
-    times = setup.model.time_step * np.arange(count)
-
-    def of_plant(rows: Array) -> Array:
-        """Rows of the controller's steps as rows of the plant's."""
-        return _padded(np.repeat(rows, setup.loop.substeps, axis=0), count)
-
-    def lines(i: int, rows: Sequence[tuple[str, Array]], plan: Array, **options: Any) -> list[Line]:
-        made = [Line(label, values[:, i], held=label != "true") for label, values in rows]
-        return [*made, Line("plan", plan[:, i], dashed=True, **options)]
-
-    true = _padded(run.motion.xs, count)
-    states = ("true", true), ("observed", of_plant(run.observations)), ("estimated", of_plant(run.estimates))
-    off = np.nanmax(np.abs(true - planned), axis=0) / task.plan.scale
-    units = [c.unit for c in (*contract.positions, *contract.velocities)]
-    for i in sorted(np.argsort(-off, kind="stable")[:MOST_PLOTS]):
-        limits = (bounds.x_lower[i], bounds.x_upper[i])
-        name = task.model.state_names[i]
-        yield Plot(name, units[i], times, lines(i, states, planned), limits=limits, group="States")
-    planned_us = _padded(np.repeat(task.us, (count - 1) // len(task.us), axis=0), count)
-    inputs = ("command", of_plant(run.commands)), ("applied", of_plant(run.applied))
-    for i, c in enumerate(contract.inputs):
-        limits = (bounds.u_lower[i], bounds.u_upper[i])
-        rows = lines(i, inputs, planned_us, held=True)
-        yield Plot(f"input {c.name}", c.unit, times, rows, limits=limits, percent=True, group="Inputs")
-    others = list(dict.fromkeys(status for status in run.controller_status if status != OK))
-    events = [f"{e.t:.4g} s: {e.message}" for e in run.events]
-    note = "; ".join([*others[:3], *events[:6]]) or "nothing happened"
-    ok = of_plant(np.array([[float(status == OK)] for status in run.controller_status]).reshape(-1, 1))
-    status = [Line("status", ok[:, 0], held=True)]
-    yield Plot("controller status", "1: ok", times, status, range=[-0.1, 1.1], note=note, group="Inputs")
-
-
-def _padded(rows: Array, count: int) -> Array:
-    """`rows` (n, m) as (count, m): NaN below, but a held row lasts to the end where only one is missing."""
-    rows = np.vstack([rows, rows[-1:]]) if len(rows) == count - 1 else rows[:count]
-    return np.vstack([rows, np.full((count - len(rows), rows.shape[1]), np.nan)])
+    planned_us = np.repeat(task.us, (len(planned) - 1) // len(task.us), axis=0)
+    yield from loop_plots(run, len(planned), (planned, planned_us), task.plan.problem.bounds, task.plan.scale)
 
 
 def _level_plots(result: Robustness, name: str) -> Iterator[Plot]:
@@ -306,7 +242,6 @@ def _level_plots(result: Robustness, name: str) -> Iterator[Plot]:
 
 
 TRIAL, TRACE, REPLAY, LATENCIES = "trial.json", "trace.mcap", "replay.html", "latencies.json"
-FURTHEST = 1e6  # m and rad: what runs away further is drawn here; the trace has it as it was
 FAR = f", drawn up to {FURTHEST:g} only"  # in the title of such a page
 
 
@@ -359,26 +294,16 @@ def planned_states(task: Task, setup: Setup) -> Array:
 
 def _write_trace(path: Path, shown: Shown, trial: Trial) -> None:
     """`shown` has the motion of the trial and the plan. Latencies differ each time and are not in it."""
-    run, contract, event = trial.outcome.run, shown.model.contract, TYPES["Event"].cls
-    states, planned = (contract.positions, contract.velocities), shown.planned_xs
-    seen = ~np.isnan(run.observations).any(axis=1)
-    statuses = [
-        event(time=t, kind="controller", code=OK if status == OK else "other", message=status)
-        for t, status in zip(run.times.tolist(), run.controller_status, strict=True)
-    ]
+    run, event, planned = trial.outcome.run, TYPES["Event"].cls, shown.planned_xs
+    contract = shown.model.contract
     events = [event(time=e.t, kind=e.kind, message=e.message) for e in run.events]
     if trial.label is not None:
         code, end = trial.label, shown.time_step * (len(shown.xs) - 1)
         events.append(event(time=end, kind="failure", failure_label=code, code=code, message=trial.reason))
     channels = [
         *motion_channels(shown),
-        state_channel("/planned/state", shown.times(len(planned)), planned, *states),
-        state_channel("/observation", run.times[seen], run.observations[seen], *states),
-        state_channel("/estimate", run.times, run.estimates, *states),
-        input_channel("/command", run.times, run.commands, contract.inputs),
-        input_channel("/applied", run.times, run.applied, contract.inputs),
-        _events("/controller/status", statuses),
-        _events("/events", events),
+        state_channel("/planned/state", shown.times(len(planned)), planned, contract.positions, contract.velocities),
+        *loop_channels(run, events),
     ]
     metadata = {
         "model": shown.model.name,
@@ -387,9 +312,3 @@ def _write_trace(path: Path, shown: Shown, trial: Trial) -> None:
         "label": trial.label or "success",
     }
     write_mcap(path, channels, metadata, {})
-
-
-def _events(topic: str, events: Sequence[Any]) -> Channel:
-    kind = TYPES["Event"]
-    ordered = sorted(((nanoseconds(e.time), e) for e in events), key=lambda row: row[0])
-    return Channel(topic, kind.cls, ordered, {"units": kind.units})

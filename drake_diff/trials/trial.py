@@ -26,6 +26,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, UnknownNameError
+from drake_diff.loop.files import RAISED
 from drake_diff.loop.mpc import MPC
 from drake_diff.loop.run import Actuator, ClosedLoop, Controller, Hold, Loop, OpenLoop, Sensor, closed_loop
 from drake_diff.model.model import Model
@@ -44,9 +45,6 @@ from drake_diff.trials.perturbation import Setup, perturbation_for, perturbed
 
 CONTROLLERS = ("tvlqr", "mpc", "open_loop")
 MPC_HORIZON = 20  # steps
-RAISED: Mapping[str, Label] = {
-    "sensor": "perception_error", "estimator": "state_error", "controller": "control_error"
-}  # fmt: skip
 MakeController = Callable[[ReplayPlan, Model, Array, Array], Controller]
 
 
