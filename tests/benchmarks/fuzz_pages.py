@@ -106,9 +106,9 @@ def picture(page, _, rng):
 
 
 def plot(page, _, rng):
-    """A digit of what a page plots."""
+    """A digit of what a page plots, of a number that is no millionth."""
     start = page.find('id="data">')
-    digits = [m.start() for m in re.finditer(r"(?<=[\[,])\d(?=\.\d)", page)] if start > 0 else []
+    digits = [m.start() for m in re.finditer(r"(?<=[\[,])\d(?=\.\d+[,\]])", page)] if start > 0 else []
     digits = [at for at in digits if start < at < page.index("</script>", start)]
     if not digits:
         return page
@@ -151,7 +151,8 @@ def altered(folder, other, rng):
     if new == page:
         return None
     path.write_text(new)
-    for sealed in [f for f in path.parents if (f / "record.json").is_file()]:
+    inside = [parent for parent in path.parents if parent.is_relative_to(folder)]
+    for sealed in [parent for parent in inside if (parent / "record.json").is_file()]:
         seal(sealed, json.loads((sealed / "record.json").read_text()), attach=False)
     return name
 
