@@ -132,12 +132,7 @@ def gradient_of(f: Callable[[Any], Any], z: Array) -> tuple[float, Array]:
         variables = np.array([AutoDiffXd(entry) for entry in z])
         variables[active] = InitializeAutoDiff(z[active]).ravel()
         with np.errstate(all="ignore"):  # what is not finite is refused below, whole
-            try:
-                result = np.asarray(f(variables)).ravel()
-            except TypeError as error:
-                if "AutoDiffXd" not in str(error):
-                    raise
-                raise GradientError(f"the loss lost its derivatives: {error}") from error
+            result = np.asarray(carrying("function", f, variables)).ravel()
         if result.shape != (1,):
             raise InputError("loss", got=f"{len(result)} values", expected="one scalar")
         if not isinstance(result[0], AutoDiffXd):

@@ -5,7 +5,7 @@ Differences of states are small motions [position; velocity], where a free body 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from hashlib import sha256
+from hashlib import file_digest, sha256
 from math import comb
 from pathlib import Path
 from typing import Any
@@ -189,7 +189,8 @@ def read_given(
 def hash_of(path: Path) -> str:
     """The hash of a file; of a directory, that of the names and hashes of its files."""
     if path.is_file():
-        return sha256(path.read_bytes()).hexdigest()
+        with path.open("rb") as file:
+            return file_digest(file, "sha256").hexdigest()
     names = sorted(p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file())
     return sha256("".join(f"{hash_of(path / name)} {name}\n" for name in names).encode()).hexdigest()
 

@@ -21,7 +21,7 @@ from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
 from pydrake.systems.controllers import DiscreteTimeLinearQuadraticRegulator
 
 from drake_diff._base.arrays import Array, finite_array, frozen, scale
-from drake_diff._base.autodiff import called, gradient_rows
+from drake_diff._base.autodiff import called, carrying, gradient_rows
 from drake_diff.derivatives.sources import PARITY_TOLERANCE
 from drake_diff.derivatives.step import differentiate_step, linearize
 from drake_diff.exceptions import GradientError, InputError
@@ -290,7 +290,8 @@ def differentiate_policy(policy: Any, x: Array, t: float, nu: int) -> tuple[Arra
     variables = InitializeAutoDiff(np.concatenate([x, parameters[active]])).ravel()
     moved = parameters.astype(object)
     moved[active] = variables[len(x) :]
-    result = _call_with_derivatives(policy, variables[: len(x)], t, moved)
+    with np.errstate(all="ignore"):  # what is not finite is refused by _check, whole
+        result = np.asarray(_call(policy, variables[: len(x)], t, moved), dtype=object)
     plain = np.array([not isinstance(entry, AutoDiffXd) for entry in result], dtype=bool)
     if plain.any():  # which must be a constant: else its derivatives were thrown away
         near = finite_array("policy(x, t)", _call(policy, x + NUDGE, t, parameters + NUDGE, nu), (nu,))
@@ -322,22 +323,11 @@ def recording_choice(policy: Any, model: Model, feedback: list[Feedback]) -> Cal
 
 
 def _call(policy: Any, x: Any, t: float, parameters: Any, nu: int | None = None) -> Any:
-    """What it gives; of plain numbers, where `nu` is given, checked."""
+    """What it gives for AutoDiffXd, or where `nu` is given for plain numbers."""
     arguments = (x, t, parameters) if hasattr(policy, "parameters") else (x, t)
-    return policy(*arguments) if nu is None else called("policy", policy, *arguments, shape=(nu,))
-
-
-def _call_with_derivatives(policy: Any, x: Any, t: float, parameters: Any) -> Any:
-    try:
-        with np.errstate(all="ignore"):  # what is not finite is refused by _check, whole
-            return np.asarray(_call(policy, x, t, parameters), dtype=object)
-    except (TypeError, AttributeError) as error:
-        if not ("AutoDiffXd" in str(error) or "dtype('O')" in str(error)):
-            raise
-        raise GradientError(
-            f"the policy lost its derivatives: {error}; write it with ordinary arithmetic and NumPy functions, "
-            "without float() and without putting results into an array of floats"
-        ) from error
+    if nu is None:
+        return carrying("policy", policy, *arguments)
+    return called("policy", policy, *arguments, shape=(nu,))
 
 
 def _check(numbers: Any, rows: Array, u: Array) -> None:

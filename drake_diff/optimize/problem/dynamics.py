@@ -49,14 +49,9 @@ class Pointwise:
         self.subject, self.f, self.nx, self.shape = subject, f, nx, shape
         self.rows = int(np.prod(shape))
         self.takes_columns = False
-        try:
-            with np.errstate(all="ignore"):
-                single = self.values(probe)
-                carried_values, slopes = self.linearize(probe)
-        except (TypeError, ValueError, IndexError, AttributeError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(subject, got=f"{type(error).__name__}: {error}", expected=ORDINARY) from error
+        with np.errstate(all="ignore"):
+            single = self.values(probe)
+            carried_values, slopes = self.linearize(probe)
         terms = np.einsum("kri,ki->kr", np.abs(slopes), np.abs(probe))  # they may cancel, and be infinite at a root
         largest = SAME_VALUES * float(np.max(np.nan_to_num([np.abs(single), terms], posinf=0.0), initial=0.0))
         if not np.allclose(carried_values, single, rtol=0, atol=largest, equal_nan=True):
