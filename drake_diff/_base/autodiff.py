@@ -101,6 +101,9 @@ class UserFunction:
         update_wrapper(self, function, updated=())
         self.subject, self.function, self.shape, self.ndim = subject, function, shape, ndim
 
+    def __repr__(self) -> str:
+        return repr(self.function)
+
     def __call__(self, *arguments: Any) -> Any:
         x = arguments[0]
         if isinstance(x, np.ndarray) and x.ndim == self.ndim:

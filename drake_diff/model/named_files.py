@@ -29,6 +29,7 @@ LIST_OF_MODELS = "model.config"  # of a folder that SDF includes
 READABLE = (*MESHES, *FORMATS, LIST_OF_MODELS)
 LICENCES = ("LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "LICENCE.txt", "COPYING", "NOTICE")
 PACKAGE = re.compile(r"((?:package|model)://+([^/]+))/([^:]*)")
+LAID_OUT = "drake_diff_model_"  # of the names of temporary folders with the files of a run
 LEVELS = 16  # folders above a copy of a robot file, into which its names may lead
 
 Put = Callable[[str, Path], None]

@@ -21,7 +21,7 @@ from drake_diff._base.sandbox import LARGEST_ANSWER
 from drake_diff.certificates.certificate import VERDICTS, Certificate
 from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model, said
-from drake_diff.model.named_files import NamedFile, is_portable, named_files
+from drake_diff.model.named_files import LAID_OUT, NamedFile, is_portable, named_files
 from drake_diff.runs.fields import (
     BUNDLE,
     Certified,
@@ -158,6 +158,8 @@ def provenance_of(model: Model | None = None) -> Provenance:
     """With which versions, from which commit and by which command something is made, and where its model is."""
     words = (Path(sys.argv[0]).name, *sys.argv[1:])
     source, options = (None, None) if model is None else (model.source, model.options)
+    if source is not None and any(part.startswith(LAID_OUT) for part in source.parts):
+        source, options = None, None  # the temporary files of a run that was recalled
     return Provenance(
         model_file=None if source is None else _text(str(source)),
         model_packages=dict((options or {}).get("packages") or {}),

@@ -25,7 +25,7 @@ from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, Mod
 from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.model.load_file import FORMATS
 from drake_diff.model.model import Model, load_model
-from drake_diff.model.named_files import is_portable, lay_out
+from drake_diff.model.named_files import LAID_OUT, is_portable, lay_out
 from drake_diff.optimize.options import Options
 from drake_diff.optimize.phased import PhasedSolution
 from drake_diff.optimize.problem.fixed_contacts import FixedContacts, Impact
@@ -140,7 +140,7 @@ def rebuilt(folder: Path, record: SealedRecord, models: Path | None) -> Iterator
         sha = hashes[label]
         return None if sha is None else _bundled(folder, sha)
 
-    with TemporaryDirectory() as location:
+    with TemporaryDirectory(prefix=LAID_OUT) as location:
         path, packages = lay_out(Path(location), name, data, hashes, content)
         yield _load(path, {**given.options, "packages": packages})
 

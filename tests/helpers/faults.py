@@ -131,7 +131,7 @@ def quick_pages(monkeypatch):
     """Pages of a word each, and versions that are looked up once: what is written is as much, what is computed less."""
     monkeypatch.setattr(page, "write_pages", lambda *words: [files.write_whole(path, b"a page") for path in words[:2]])
     known = provenance.provenance_of()
-    monkeypatch.setattr(provenance, "provenance_of", lambda: known)
+    monkeypatch.setattr(provenance, "provenance_of", lambda *_: known)
 
 
 def goal_of(directory):

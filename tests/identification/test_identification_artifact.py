@@ -217,7 +217,7 @@ def test_a_recording_that_changed_since_is_not_saved(tmp_path):
 
 
 def test_what_is_no_result_is_not_saved(tmp_path):
-    with pytest.raises(InputError, match="a result of solve or of identify"):
+    with pytest.raises(InputError, match="a result of solve, identify or closed_loop"):
         dd.save(io.BytesIO(), tmp_path)
 
 
