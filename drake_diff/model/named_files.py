@@ -56,11 +56,15 @@ class NamedFile:
 def named_files(path: Path, packages: Mapping[str, str] | None = None, put: Put | None = None) -> list[NamedFile]:
     """What the robot file at `path` names, sorted; `packages` are folders by name, as `load_model` takes them.
 
-    `put` is called with each name and where it leads, before that is looked at. Raises ModelError where a file includes
-    itself.
+    `put` is called with each name and where it leads, before that is looked at; then `packages` are all that there are.
+    Raises ModelError where a file includes itself.
     """
-    known = PackageMap()
-    add_packages(known, path, packages)
+    known = PackageMap() if put is None else PackageMap.MakeEmpty()
+    if put is None:
+        add_packages(known, path, packages)
+    else:  # no included file is read before `put` is called with its name
+        for name, folder in (packages or {}).items():
+            known.Add(name, folder)
     return sorted(_named(path, path, known, put or (lambda name, location: None), ()), key=lambda file: file.name)
 
 

@@ -145,7 +145,7 @@ def test_the_commands_print_and_exit_as_they_should(runs, tmp_path, monkeypatch,
 
 
 @pytest.mark.slow
-def test_an_exception_in_the_solve_leaves_a_labelled_record_and_exits_with_4(tmp_path):
+def test_an_exception_in_the_solve_leaves_a_labelled_record_and_names_the_function(tmp_path):
     (tmp_path / "task.py").write_text(
         f"""
 import numpy as np
@@ -168,10 +168,12 @@ solve_options = {{"method": "shooting"}}
     )
     dd.save(solve(), tmp_path / "run")
     done = drake_diff("run", tmp_path / "task.py", "--out", tmp_path / "run", cwd=tmp_path)
-    assert done.returncode == 4, done.stdout
+    assert done.returncode == 2, done.stdout
+    assert "cost (task.py:7): expected" in done.stderr
+    assert "ZeroDivisionError: late" in done.stderr
     assert dd.verify(tmp_path / "run").complaints == ()  # the earlier one
     (left,) = tmp_path.glob("run.partial-*")
     assert str(left) in done.stderr
     record = dd.load_record(left)
-    assert (record.verdict, record.failures[0].code) == ("incomplete", "exception")
+    assert (record.verdict, record.failures[0].code) == ("incomplete", "refused")
     assert "late" in record.sentence
