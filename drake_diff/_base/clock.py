@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib.machinery import ExtensionFileLoader
+from traceback import walk_stack
 from types import FrameType
 from typing import Any
 
@@ -111,14 +112,8 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 
 def _is_imported_in(frame: FrameType) -> bool:
     """Whether an extension is being imported, or the innermost function is of the import system."""
-    if frame.f_globals.get("__name__") == "importlib._bootstrap":
-        return True
-    caller: FrameType | None = frame
-    while caller is not None:
-        if isinstance(caller.f_locals.get("self"), ExtensionFileLoader):
-            return True
-        caller = caller.f_back
-    return False
+    loaders = (isinstance(caller.f_locals.get("self"), ExtensionFileLoader) for caller, _ in walk_stack(frame))
+    return frame.f_globals.get("__name__") == "importlib._bootstrap" or any(loaders)
 
 
 def was_interrupted() -> bool:
@@ -198,8 +193,13 @@ def _hush(number: int) -> None:
     """A terminal that has hung up takes no more words: they go nowhere, where else each would be an error."""
     if number != signal.SIGHUP:
         return
-    nowhere = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         if stat.S_ISCHR(os.fstat(stream).st_mode):  # isatty says no of one that has hung up
-            os.dup2(nowhere, stream)
+            discard(stream)
+
+
+def discard(descriptor: int) -> None:
+    """Let a file descriptor lead to os.devnull: what is written to it goes nowhere."""
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    os.dup2(nowhere, descriptor)
     os.close(nowhere)

@@ -4,7 +4,6 @@ Exit status: 0 what was asked for holds, 1 a check failed, 2 wrong usage or inpu
 4 an internal error, 130 ended by Ctrl-C, SIGTERM or SIGHUP. A reader of the output that goes away changes nothing.
 """
 
-import os
 import sys
 import traceback
 from collections.abc import Callable
@@ -12,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from drake_diff._base.clock import INTERRUPTED, interrupt_alike, was_interrupted
+from drake_diff._base.clock import INTERRUPTED, discard, interrupt_alike, was_interrupted
 from drake_diff.cli import models, plans, runs
 from drake_diff.exceptions import DrakeDiffError, MissingDependencyError
 
@@ -74,9 +73,7 @@ class _Output:
             action(*given)
         except OSError as error:
             self.error = error
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self.stream.fileno())
-            os.close(nowhere)
+            discard(self.stream.fileno())
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_diff._base.arrays import Array, array_with_gaps, finite_array
+from drake_diff._base.arrays import MOST_STEPS, Array, array_with_gaps, finite_array
 from drake_diff.comparison.recordings import Recording, check_sizes, read_recording
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.mechanics.coordinates import Coordinates
@@ -91,7 +91,6 @@ def _product(a: Array, b: Array) -> Array:
 
 
 LEAST = 8  # samples of a piece
-MOST_STEPS = 10_000_000  # of the model, over a recording
 WINDOW = 9  # samples that a cubic is laid through, at least
 WINDOW_TIME = 0.05  # [s] and over this time at least
 ORDERS = 8  # of differences of neighbouring samples that tell the noise

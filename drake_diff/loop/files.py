@@ -75,11 +75,10 @@ PLAN_ARRAYS = ("xs", "us", f"{GUESS}xs", f"{GUESS}us")
 NOT_MEASURED = "the loop has run, and is not measured yet"
 FURTHEST = 1e6  # m and rad: what runs away further is drawn here; the trace has it as it was
 MOST_PLOTS = 12  # of coordinates; those that end furthest from the plan
-ROUNDED = 1e-9  # of the largest number of its kind: what a step of a plant differs by on another machine
+ROUNDED = 1e-9  # of a column's largest number: what a step of a plant differs by on another machine
+COUPLED = 1e-5  # of the largest number of all columns: rounding reaches from one column to the others
 PARTS = ("xs", "us", "observations", "estimates", "applied")  # what the parts of a loop make of the rows before
-RAISED: Mapping[str, Label] = {
-    "sensor": "perception_error", "estimator": "state_error", "controller": "control_error"
-}  # fmt: skip
+RAISED: Mapping[str, Label] = {"sensor": "perception_error", "estimator": "state_error", "controller": "control_error"}
 DEADLINES = "/deadlines: how long the controller took is for who ran it; what follows from it was made again"
 HERE = "along the run"
 
@@ -240,7 +239,7 @@ def _loop_of(evidence: LoopEvidence, model: Model, controlled: Model) -> Loop:
 def _with_given(loop: Loop, rows: LoopRows, given: Sequence[str]) -> Loop:
     """The loop with what is `given` in the place of the parts that made it."""
     parts: dict[str, Any] = {"sensor": "observations", "estimator": "estimates", "actuator": "applied"}
-    changes: dict[str, Any] = {part: Recorded(getattr(rows, row)) for part, row in parts.items() if row in given}
+    changes: dict[str, Any] = {name: Recorded(getattr(rows, row)) for name, row in parts.items() if row in given}
     return replace(loop, **changes)
 
 
@@ -302,11 +301,7 @@ def _events(topic: str, events: Sequence[Any]) -> Channel:
 
 
 def _write_trace(
-    path: Path,
-    run: ClosedLoop,
-    record: PlanRecord,
-    followed: "_Followed | None",
-    files: Mapping[str, bytes],
+    path: Path, run: ClosedLoop, record: PlanRecord, followed: "_Followed | None", files: Mapping[str, bytes]
 ) -> None:
     """The motion, all that the loop saw and did, and how long the controller took in each step."""
     model, deadline, loop = run.model, TYPES["Deadline"], _section(record).loop
@@ -323,9 +318,8 @@ def _write_trace(
     ]
     if followed is not None:
         planned = followed.arrays["xs"]
-        channels.append(
-            state_channel("/planned/state", _times(followed.problem.time_step, len(planned)), planned, *states)
-        )
+        times = _times(followed.problem.time_step, len(planned))
+        channels.append(state_channel("/planned/state", times, planned, *states))
     metadata = {
         "model": model.name,
         "controller": loop.controller,
@@ -384,27 +378,34 @@ def _judged(asked: PlanRecord, rows: LoopRows, again: ClosedLoop, followed: _Fol
 def _metrics_of_the_loop(rows: LoopRows, again: ClosedLoop, budget: float) -> Iterator[Metric]:
     definition = (
         "largest difference of a state, measurement, estimate or applied input from what plant, sensor, estimator and "
-        "actuator make of the rows before it, as a part of the largest number of its kind"
+        "actuator make of the rows before it, as a part of the largest number of its column"
     )
-    apart = max(_apart(getattr(rows, name), getattr(again, name)) for name in PARTS)
-    yield measured("loop error", definition, apart, "1", ROUNDED, reason="rows are missing, or are no numbers")
+    error = max(_relative_difference(getattr(rows, name), getattr(again, name)) for name in PARTS)
+    yield measured("loop error", definition, error, "1", ROUNDED, reason="rows are missing, or are no numbers")
     definition = f"answers of the controller that took longer than {budget:.6g} s"
     yield measured("deadline misses", definition, float(np.sum(rows.latencies > budget)), "1")
 
 
-def _apart(recorded: Array, made: Array) -> float:
-    """The largest difference of two arrays, as a part of the largest number; inf where gaps or shapes differ."""
+def _relative_difference(recorded: Array, made: Array) -> float:
+    """The largest difference of two arrays (n, m), each column's as a part of its largest number.
+
+    Of a column that is nearly zero it is a part of COUPLED times the largest number of all: what a step is rounded to.
+    It is inf where gaps or shapes differ.
+    """
     if recorded.shape != made.shape or not np.array_equal(np.isfinite(recorded), np.isfinite(made)):
         return np.inf
     if np.array_equal(recorded, made, equal_nan=True):
         return 0.0
-    return float(np.nanmax(np.abs(recorded - made)) / max(float(np.nanmax(np.abs(recorded))), 1e-300))
+    sizes = np.max(np.abs(recorded), axis=0, initial=0.0, where=np.isfinite(recorded))
+    differences = np.max(np.abs(recorded - made), axis=0, initial=0.0, where=np.isfinite(recorded))
+    return float(np.max(differences / np.maximum(sizes, max(COUPLED * np.max(sizes), 1e-300))))
 
 
 def _metrics_of_the_motion(run: ClosedLoop) -> Iterator[Metric]:
-    motion, told = run.motion, penetration_check(run.model, run.motion)
-    definition = f"largest overlap of two geometries {HERE}, of {told.where}"
-    yield measured("penetration", definition, told.value, "m", told.tolerance if np.isfinite(told.tolerance) else None)
+    motion, deepest = run.motion, penetration_check(run.model, run.motion)
+    definition = f"largest overlap of two geometries {HERE}, of {deepest.where}"
+    tolerance = deepest.tolerance if np.isfinite(deepest.tolerance) else None
+    yield measured("penetration", definition, deepest.value, "m", tolerance)
     pushed = " and pushes" if run.loop.pushes else ""
     definition = f"lasting energy that no force explains (actuators, damping, contact, limits){pushed}, {HERE}"
     explained = not run.loop.pushes and bool(np.all(np.isfinite(motion.constraint_violation)))
@@ -425,20 +426,20 @@ def _metrics_of_the_problem(
         yield measured("cost", definition, cost, "1")
     if count == parts * problem.num_steps:
         if not np.all(np.isnan(problem.goal)):
-            told = goal_check(plan, problem.goal_error(rows.xs[-1]))
-            definition = f"distance of the last state from the problem's goal, of {told.where}"
-            yield measured("goal error", definition, told.value, told.unit, told.tolerance)
+            check = goal_check(plan, problem.goal_error(rows.xs[-1]))
+            definition = f"distance of the last state from the problem's goal, of {check.where}"
+            yield measured("goal error", definition, check.value, check.unit, check.tolerance)
         if not has_functions and (problem.kept or problem.waypoints):
             excess = problem.constraint_excess(rows.xs[: count + 1 : parts], rows.us[:count:parts])
             worst = max(excess, key=lambda name: excess[name][0])
             definition = f"largest excess over a bound of a constraint or distance from a waypoint, of {worst}"
             yield measured("constraint violation", definition, excess[worst][0], "1")
-    told = bounds_check(plan, again.motion)
-    definition = f"largest excess of a state over a bound of the problem, of {told.where}"
-    yield measured("bound violation", definition, told.value, told.unit, told.tolerance)
-    for i, told in enumerate(clearance_checks(plan, again.motion)):
-        definition = f"what lacks of the margin of an obstacle, of {told.where}"
-        yield measured(f"clearance {i}", definition, told.value, told.unit, told.tolerance)
+    check = bounds_check(plan, again.motion)
+    definition = f"largest excess of a state over a bound of the problem, of {check.where}"
+    yield measured("bound violation", definition, check.value, check.unit, check.tolerance)
+    for i, check in enumerate(clearance_checks(plan, again.motion)):
+        definition = f"what lacks of the margin of an obstacle, of {check.where}"
+        yield measured(f"clearance {i}", definition, check.value, check.unit, check.tolerance)
     excess_of_inputs = np.maximum(problem.bounds.u_lower - rows.us, rows.us - problem.bounds.u_upper)
     definition = "largest excess of an applied input over a bound of the problem"
     units = " or ".join(dict.fromkeys(c.unit for c in again.model.contract.inputs))
@@ -500,7 +501,7 @@ def _checks_of(record: PlanRecord, run: ClosedLoop) -> list[PageCheck]:
     """What was checked of a run, for the first screen."""
     section, metrics = _section(record), {m.name: m for m in record.metrics}
     loop, error = section.loop, metrics["loop error"]
-    result = [PageCheck("Run", "fail" if section.ended else "pass", _told_of_end(record))]
+    result = [PageCheck("Run", "fail" if section.ended else "pass", _end_sentence(record))]
     given = " and ".join(section.given)
     text = "plant, sensor, estimator and actuator make the same rows again" + f"; {given}: data" * bool(given)
     if error.verdict != "pass":
@@ -522,7 +523,7 @@ def _checks_of(record: PlanRecord, run: ClosedLoop) -> list[PageCheck]:
     return result
 
 
-def _told_of_end(record: PlanRecord) -> str:
+def _end_sentence(record: PlanRecord) -> str:
     section = _section(record)
     ran = f"{section.loop.steps} steps of {section.loop.period_s:.4g} s"
     return f"{ran}, then it broke off {section.ended}" if section.ended else f"ran to its end: {ran}"
@@ -559,14 +560,8 @@ def loop_plots(
     units = [c.unit for c in (*contract.positions, *contract.velocities)]
     lower, upper = (np.full(model.nx, np.nan) if b is None else b for b in (bounds.x_lower, bounds.x_upper))
     for i in sorted(order[:MOST_PLOTS]):
-        yield Plot(
-            model.state_names[i],
-            units[i],
-            times,
-            lines(i, states, plan_xs),
-            limits=(lower[i], upper[i]),
-            group="States",
-        )
+        rows = lines(i, states, plan_xs)
+        yield Plot(model.state_names[i], units[i], times, rows, limits=(lower[i], upper[i]), group="States")
     inputs = ("command", of_plant(run.commands)), ("applied", of_plant(run.applied))
     lower, upper = (np.full(model.nu, np.nan) if b is None else b for b in (bounds.u_lower, bounds.u_upper))
     for i, c in enumerate(contract.inputs):
@@ -626,10 +621,13 @@ def _compared(rows: LoopRows, again: ClosedLoop, mpc: MPC, followed: _Followed) 
     They are doubts where this machine rounds otherwise: then optimization may take other steps.
     """
     exact = all(np.array_equal(getattr(rows, name), getattr(again, name), equal_nan=True) for name in PARTS)
-    plan = max(_apart(followed.arrays[name], made) for name, made in zip(("xs", "us"), mpc.reference, strict=True))
+    plan = max(
+        _relative_difference(followed.arrays[name], made)
+        for name, made in zip(("xs", "us"), mpc.reference, strict=True)
+    )
     odd = [f"{PLAN}: MPC plans otherwise from the recorded guess, {plan:.2g} of the largest number away"]
     odd = odd if plan > RELATIVE else []
-    commands = _apart(rows.commands, again.commands)
+    commands = _relative_difference(rows.commands, again.commands)
     if exact:
         return odd, []
     doubts = [f"MPC, run again, commands otherwise, {commands:.2g} of the largest command away"]
@@ -654,8 +652,8 @@ def reproduce(folder: Path, record: PlanRecord, models: Path | None) -> Reproduc
             if set(arrays) != set(PLAN_ARRAYS):
                 raise ArtifactError(f"{PLAN}: expected the arrays {', '.join(PLAN_ARRAYS)}, got {', '.join(arrays)}")
             if mpc is not None and mpc.model != record.model:
-                its_own = record.model_copy(update={"model": mpc.model})
-                controlled = stack.enter_context(rebuilt(folder, its_own, models))
+                controller_record = record.model_copy(update={"model": mpc.model})
+                controlled = stack.enter_context(rebuilt(folder, controller_record, models))
             followed = _Followed(rebuild_problem(record, controlled, arrays["us"], None), arrays)
         if mpc is not None and followed is not None and "commands" not in section.given:
             plan = followed.arrays[GUESS + "xs"], followed.arrays[GUESS + "us"]

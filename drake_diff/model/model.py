@@ -64,6 +64,7 @@ from drake_diff.model.repairs import (
 )
 from drake_diff.model.twin import AddedForce, OfThread, SharedPlant, Twin
 
+WITHOUT_EFFECT = (None, (), "skip")  # options of `load_model` that change nothing
 T = TypeVar("T")
 CONTACT_APPROXIMATIONS = ("sap", "similar", "lagged")
 OTHERS_KEPT = 128  # how many rebuilt models are kept: a certificate by the time step needs 91
@@ -539,7 +540,7 @@ def load_model(
         "body_forces": body_forces,
     }
     if isolated:
-        check_apart(source, options)
+        check_in_child_process(source, options)
     read = read_into(plant, source, options["packages"], meshes)
     repairs, mimics = _repaired(plant, scene_graph, source, read.facts, options)
     notes = read.notes + repairs
@@ -585,21 +586,18 @@ def _as_path(path: Any) -> Path:
         raise InputError("model file", got=repr(path), expected="a path") from error
 
 
-def check_apart(source: Path, options: Mapping[str, Any]) -> None:
+def check_in_child_process(source: Path, options: Mapping[str, Any]) -> None:
     """ModelError where a limited process that loads the file and makes a step crashes, or reaches a limit."""
     folders = {name: str(Path(folder).absolute()) for name, folder in (options["packages"] or {}).items()}
-    given = {"path": str(source.absolute()), "options": said({**options, "packages": folders or None})}
+    given = {"path": str(source.absolute()), "options": stated_options({**options, "packages": folders or None})}
     outcome = call("drake_diff.model.step:try_to_read", given)
     if outcome.error:
         raise ModelError(f"{source}: {outcome.error}")
 
 
-UNSAID = (None, (), "skip")  # options of `load_model` that change nothing
-
-
-def said(options: Mapping[str, Any]) -> dict[str, Any]:
+def stated_options(options: Mapping[str, Any]) -> dict[str, Any]:
     """The options of a model that say something, for JSON; `load_model` takes them."""
-    return {key: _plain(value) for key, value in options.items() if value not in UNSAID}
+    return {key: _plain(value) for key, value in options.items() if value not in WITHOUT_EFFECT}
 
 
 def _plain(value: Any) -> Any:

@@ -102,7 +102,7 @@ def _named(
 
 def is_portable(name: str) -> bool:
     """Whether a name leads below the folder of a copy of its robot file, as none does that is the path of a file."""
-    paths = (part.removeprefix("file://") for part in name.split(": "))
+    paths = (segment.removeprefix("file://") for segment in name.split(": "))
     return name.count("../") < LEVELS and not any(path.startswith("/") for path in paths)
 
 
@@ -135,8 +135,8 @@ def _all_names(path: Path, first: Path, packages: PackageMap, put_file: Put) -> 
         names = [Path(word.decode(errors="replace")).name for word in words]
     elif kind.endswith(".gltf"):
         document = json_of(path.read_bytes())
-        parts = [part for key in ("buffers", "images") for part in document.get(key, ())]
-        names = [str(part["uri"]) for part in parts if not str(part.get("uri", "data:")).startswith("data:")]
+        entries = [entry for key in ("buffers", "images") for entry in document.get(key, ())]
+        names = [str(entry["uri"]) for entry in entries if not str(entry.get("uri", "data:")).startswith("data:")]
     elif kind.endswith(FORMATS):
         xml = XmlText(path.read_bytes())
         if xml.root.tag == "mujoco":
@@ -175,9 +175,9 @@ def _names_of_mjcf(xml: XmlText, path: Path) -> Names:
             yield name, path.parent.absolute() / name
             if name.endswith(OF_MJCF) and (path.parent / name).is_file():
                 waiting.append(XmlText((path.parent / name).read_bytes()))
-    whole = with_includes(XmlText(path.read_bytes()), path)
-    elements = [element for element in whole.root.iter() if element.get("file") and element.get("file") not in seen]
-    yield from sorted({element.get("file"): asset_of(whole, element, path) for element in elements}.items())
+    merged = with_includes(XmlText(path.read_bytes()), path)
+    elements = [element for element in merged.root.iter() if element.get("file") and element.get("file") not in seen]
+    yield from sorted({element.get("file"): asset_of(merged, element, path) for element in elements}.items())
 
 
 def _licences(first: Path, packages: PackageMap, put_file: Put, there: Mapping[str, Path]) -> Names:

@@ -563,8 +563,11 @@ def closest_to(problem: Problem, plan: Solution) -> Problem:
     Q = np.diag(1 / plan.plan.scale**2)
     R = np.diag(1 / problem.input_scales(us) ** 2)
     reference = plan.time_step * np.arange(len(xs)), xs, np.vstack([us, us[-1:]])
-    values = plan.step_vector.values
-    weights = plan.time_step * len(us) / np.maximum(np.abs(values), np.finfo(float).tiny) ** 2
+    values, sizes = plan.step_vector.values, np.ones(len(plan.step_vector.values))
+    for _, entries in plan.step_vector.pairs:
+        largest = np.max(np.abs(values[entries]))
+        sizes[entries] = largest if largest > 0 else 1.0  # as in the coordinates in which the solver moves it
+    weights = plan.time_step * len(us) / sizes**2
     return dataclasses.replace(
         problem,
         parameter_cost=(lambda p: weights @ (p - values) ** 2) if problem.optimizes_parameters else None,

@@ -20,7 +20,7 @@ from drake_diff._base.files import make_folder, write_whole
 from drake_diff._base.sandbox import LARGEST_ANSWER
 from drake_diff.certificates.certificate import VERDICTS, Certificate
 from drake_diff.exceptions import InputError
-from drake_diff.model.model import Model, said
+from drake_diff.model.model import Model, stated_options
 from drake_diff.model.named_files import LAID_OUT, NamedFile, is_portable, named_files
 from drake_diff.runs.fields import (
     BUNDLE,
@@ -73,7 +73,7 @@ def model_input(model: Model | None) -> ModelInput:
     return ModelInput(
         file=file_evidence(model.source, _checked_name("model file", model.source.name)),
         named=evidence_of(model.source, model.options["packages"]),
-        options=said(options),
+        options=stated_options(options),
     )
 
 
@@ -158,7 +158,7 @@ def provenance_of(model: Model | None = None) -> Provenance:
     """With which versions, from which commit and by which command something is made, and where its model is."""
     words = (Path(sys.argv[0]).name, *sys.argv[1:])
     source, options = (None, None) if model is None else (model.source, model.options)
-    if source is not None and any(part.startswith(LAID_OUT) for part in source.parts):
+    if source is not None and any(name.startswith(LAID_OUT) for name in source.parts):
         source, options = None, None  # the temporary files of a run that was recalled
     return Provenance(
         model_file=None if source is None else _text(str(source)),

@@ -129,8 +129,8 @@ def sentence_changed(folder, rng):
     fields["sentence"] = f"{old} It was checked on the robot."
     for path in folder.rglob("*.html"):
         page = path.read_text()
-        for one, two in ((json.dumps(old)[1:-1], json.dumps(fields["sentence"])[1:-1]), (old, fields["sentence"])):
-            page = page.replace(str(escape(one)), str(escape(two))).replace(one, two)
+        for text, other in ((json.dumps(old)[1:-1], json.dumps(fields["sentence"])[1:-1]), (old, fields["sentence"])):
+            page = page.replace(str(escape(text)), str(escape(other))).replace(text, other)
         path.write_text(page)
     seal(folder, fields, attach=(folder / "trace.mcap").is_file())
 

@@ -111,10 +111,10 @@ def test_a_chain_of_many_links_is_audited_within_a_limit_of_memory():
         link = plant.plant.AddRigidBody(f"link_{i}", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
         add_slide(plant.plant, f"slide_{i}", parent, link, "xyz"[i % 3])
         parent = link.body_frame()
-    model, kept = plant.model(), resource.getrlimit(resource.RLIMIT_DATA)
+    model, limits = plant.model(), resource.getrlimit(resource.RLIMIT_DATA)
     with memory_at_most(3 * 2**30):
         assert "2.4 GiB" in only(audit(model), "too_large").message
-    assert resource.getrlimit(resource.RLIMIT_DATA) == kept
+    assert resource.getrlimit(resource.RLIMIT_DATA) == limits
     with pytest.raises(GradientError, match="of 400 degrees of freedom"):
         dd.differentiate_step(model, model.default_state, [], method="autodiff")
 

@@ -7,14 +7,11 @@ from typer.testing import CliRunner
 import drake_diff as dd
 from drake_diff.cli.main import app
 from drake_diff.exceptions import InputError
-from drake_diff.logs.channels import TYPES
 from drake_diff.optimize.solution import Solution
 from drake_diff.runs import measure
 from drake_diff.runs.trace import write_trace
 
 pytestmark = pytest.mark.solve
-
-STATE = TYPES["State"]
 
 
 def drake_diff(*words):

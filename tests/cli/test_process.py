@@ -5,11 +5,11 @@ import subprocess
 import sys
 
 import pytest
+from helpers.command import drake_diff
 from helpers.models import MODELS
 
 pytestmark = pytest.mark.solve
 
-COMMAND = [sys.executable, "-P", "-m", "drake_diff.cli.main"]
 PROBLEM = f"""import drake_diff as dd
 def problem():
     model = dd.load_model({str(MODELS / "pendulum.urdf")!r}, time_step=0.05)
@@ -61,12 +61,11 @@ def test_a_run_is_written_although_its_output_is_not(tmp_path, reader, status):
         os.close(end)
     else:
         file = os.open(reader, os.O_WRONLY)
-    command = [*COMMAND, "run", "problem.py", "--out", "run"]
-    done = subprocess.run(command, cwd=tmp_path, stdout=file, stderr=subprocess.PIPE, text=True, timeout=300)
+    done = drake_diff("run", "problem.py", "--out", "run", cwd=tmp_path, stdout=file)
     os.close(file)
     assert done.returncode == status, done.stderr
     assert ("the output could not be written: [Errno 28]" in done.stderr) == (status == 2)
-    assert subprocess.run([*COMMAND, "verify", "run"], cwd=tmp_path, capture_output=True).returncode == 0
+    assert drake_diff("verify", "run", cwd=tmp_path).returncode == 0
 
 
 def test_names_that_are_no_text_are_refused_by_name(tmp_path):
@@ -77,7 +76,7 @@ def test_names_that_are_no_text_are_refused_by_name(tmp_path):
         (("certify", name), "model file"),
         (("run", "problem.py", "--out", os.fsdecode(b"\xff")), "name"),
     ):
-        done = subprocess.run([*COMMAND, *words], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+        done = drake_diff(*words, cwd=tmp_path)
         assert done.returncode == 2
         assert f"{subject}: expected a name in UTF-8, got '\\udcff" in done.stderr
-    assert subprocess.run([*COMMAND, "audit", name], cwd=tmp_path, capture_output=True).returncode == 0
+    assert drake_diff("audit", name, cwd=tmp_path).returncode == 0

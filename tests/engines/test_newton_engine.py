@@ -19,10 +19,9 @@ needs("newton")
 
 pytestmark = pytest.mark.slow
 G = 9.81
+
+
 # What no engine but Drake has as Drake has it, and Newton's damping, which is explicit.
-OWN = {"limit law", "solver tolerance", "integrator", "scalar type"}
-
-
 def newton(model):
     return dd.engines.load_engine("newton", model)
 

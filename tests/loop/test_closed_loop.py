@@ -372,8 +372,8 @@ def test_a_run_that_broke_off_breaks_off_again(cart):
         run = closed_loop(cart, controller, [0.0, 0.0], 20, Loop(**parts))
         loop = Loop(estimator=Recorded(run.estimates))
         made = replayed(run, cart, None, loop, 0)
-        told = [(r.ended, r.failed_part, r.controller_error, r.events, r.controller_status) for r in (made, run)]
-        assert told[0] == told[1]
+        endings = [(r.ended, r.failed_part, r.controller_error, r.events, r.controller_status) for r in (made, run)]
+        assert endings[0] == endings[1]
         assert run.ended
 
 

@@ -79,9 +79,9 @@ def test_mpc_of_a_furuta_pendulum_is_saved_and_comes_out_again_to_the_last_bit(s
     assert metrics["cost"].value == pytest.approx(0.02 * np.sum(swing_up.us[:75] ** 2), rel=1e-12)
     assert metrics["penetration"].value == metrics["bound violation"].value == 0
     assert record.closed_loop.given == []
-    found = dd.verify(saved).require()
-    assert (found.verdict, found.rounded) == ("holds", ())
-    assert any(line.startswith("/deadlines") for line in found.unchecked)
+    verification = dd.verify(saved).require()
+    assert (verification.verdict, verification.rounded) == ("holds", ())
+    assert any(line.startswith("/deadlines") for line in verification.unchecked)
     (line,) = [line for line in list_runs(saved.parent) if line.name == "swing_up"]
     assert (line.kind, line.verdict, line.cost) == ("closed_loop", "pass", metrics["cost"].value)
 
@@ -122,8 +122,8 @@ def test_a_perturbed_and_a_late_run_hold_too(mpc, folder):
         record = dd.save(made, folder / name)
         assert record.closed_loop.given == []
         assert {"push": "pushed", "late": "late"}[record.events[0].kind] == name
-        found = dd.verify(folder / name).require()
-        assert found.rounded == ()
+        verification = dd.verify(folder / name).require()
+        assert verification.rounded == ()
     loops = [dd.load_record(folder / name).closed_loop.loop for name in others]
     assert (loops[0].sensor["noise"], loops[0].estimator_model) == (0.002, "the controller's")
     assert (loops[1].latency_budget_is, loops[1].fallback_patience) == ("stated", 3)
@@ -152,11 +152,11 @@ def test_what_a_users_code_made_is_data_and_is_not_executed(folder):
     run = closed_loop(model, Counted(), [0.1, 0.0], 40, Loop(estimator=Counted()))
     calls = Counted.calls
     record = dd.save(run, folder / "counted")
-    found = dd.verify(folder / "counted").require()
+    verification = dd.verify(folder / "counted").require()
     assert Counted.calls == calls == 80
     assert (record.closed_loop.given, record.problem) == (["estimates", "commands"], {})
     assert {"commands: data, as Counted is not executed", "estimates: data, as Counted is not executed"} < set(
-        found.unchecked
+        verification.unchecked
     )
     with pytest.raises(InputError, match="a result of solve, identify or closed_loop"):
         dd.save(run.motion, folder / "motion")
@@ -184,12 +184,9 @@ def test_a_killed_save_leaves_a_directory_that_says_so_with_all_that_was_recorde
     assert left.name.startswith("killed.partial-")
     assert json.loads((left / "record.json").read_text())["verdict"] == "incomplete"
     assert np.array_equal(read_mcap(left / "trace.mcap").arrays("/input")["u"], swing_up.us)
-    found = dd.verify(left)
-    assert (found.verdict, found.holds) == ("undecided", False)
-    assert "incomplete" in str(found)
-
-
-PENDULUM = {"substeps": 2, "seed": 5}
+    verification = dd.verify(left)
+    assert (verification.verdict, verification.holds) == ("undecided", False)
+    assert "incomplete" in str(verification)
 
 
 @pytest.fixture(scope="module")
@@ -216,10 +213,10 @@ def altered(run, how, seed):
         statuses[chance.randrange(len(statuses))] = chance.choice(["late", "nothing was seen for 3 steps", "fine"])
         return dataclasses.replace(run, controller_status=tuple(statuses))
     rows = np.array(getattr(run, how))
-    place = tuple(chance.randrange(n) for n in rows.shape)
+    entry = tuple(chance.randrange(n) for n in rows.shape)
     largest = -2 if how == "times" else 0  # times still rise: else no trace could be written
     change = chance.choice([-1, 1]) * 10 ** chance.uniform(-5, largest) * np.abs(rows).max()
-    rows[place] += 2.0 if how == "latencies" else change
+    rows[entry] += 2.0 if how == "latencies" else change
     if how == "us":  # as if the actuator had done it
         return dataclasses.replace(run, us=rows, motion=dataclasses.replace(run.motion, us=rows))
     if how == "xs":
@@ -254,9 +251,9 @@ def test_altered_runs_are_broken_although_everything_written_of_them_agrees(smal
             if how == "metric":
                 forger.setattr(files, "_judged", forged_metric(seed))
             assert dd.save(run, folder / "forged").verdict == "pass"
-        found = dd.verify(folder / "forged")
-        if found.verdict != "broken":
-            missed.append((how, seed, str(found)))
+        verification = dd.verify(folder / "forged")
+        if verification.verdict != "broken":
+            missed.append((how, seed, str(verification)))
     assert missed == []
 
 
@@ -274,3 +271,16 @@ def test_the_report_opens_without_a_network_and_without_an_error(saved, browser,
     for words in ("under MPC of furuta", "Deadlines", "ran to its end", "Measures of the run", "goal error"):
         assert words in text
     assert browser.execute_script("return document.documentElement.scrollWidth <= window.innerWidth")
+
+
+def test_a_small_state_beside_a_fast_wheel_is_compared_by_its_own_size():
+    """A slide of 1e-6 m beside a wheel that has turned by 1e5 rad: 1 % of the slide is no rounding."""
+    recorded = np.column_stack([np.linspace(0, 1e5, 11), np.linspace(0, 1e-6, 11), np.full(11, 1e-17)])
+    other = recorded * [1, 1 + 1e-2, 1]
+    assert files._relative_difference(recorded, other) > files.ROUNDED
+    assert files._relative_difference(recorded, recorded * [1 + 1e-12, 1, 2]) < files.ROUNDED  # rounding of a zero
+    assert files._relative_difference(recorded, recorded[1:]) == np.inf
+    gap = np.where(np.arange(11)[:, None] == 3, np.nan, recorded)
+    assert files._relative_difference(recorded, gap) == np.inf
+    assert files._relative_difference(gap, gap * [1, 1 + 1e-2, 1]) > files.ROUNDED
+    assert files._relative_difference(np.zeros((3, 2)), np.ones((3, 2))) > files.ROUNDED

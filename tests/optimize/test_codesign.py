@@ -409,8 +409,11 @@ def test_parameters_are_near_a_plan_where_the_nearest_motion_in_steps_is_searche
     searched = closest_to(problem, plan)
     assert searched.cost_of_parameters(np.array([mass])) == 0.0
     assert searched.cost_of_parameters(np.array([1.1 * mass])) == pytest.approx(0.01 * 0.6)  # the horizon
+    damped = dataclasses.replace(problem, parameters=("hinge.damping",), parameter_bounds=None)
+    without = closest_to(damped, dataclasses.replace(plan, problem=damped, parameters=np.zeros(1)))
+    assert [without.cost_of_parameters(np.array([d])) for d in (0.0, 0.1)] == [0, pytest.approx(0.01 * 0.6)]
     monkeypatch.setattr(solve, "REFINING", 1)
-    found = dd.solve(problem)
-    assert [link["ended"] for link in found.options["chain"]] == ["converged", "iteration_limit", "converged"]
-    assert found.parameters[0] == pytest.approx(mass, rel=0.02)
-    assert found.scheme == "step"
+    stepped = dd.solve(problem)
+    assert [link["ended"] for link in stepped.options["chain"]] == ["converged", "iteration_limit", "converged"]
+    assert stepped.parameters[0] == pytest.approx(mass, rel=0.02)
+    assert stepped.scheme == "step"

@@ -70,9 +70,6 @@ def everything(**changes):
     return pendulum(**given | changes)
 
 
-JOINED = {"trajectory_cost": lambda xs, us: xs[3, 0] * xs[9, 1] + us[2, 0] ** 3}
-
-
 @pytest.mark.parametrize("error", [GradientError, SimulationError])
 def test_a_point_without_a_derivative_is_a_step_that_was_too_long(monkeypatch, error):
     """A swing-up whose trial points go faster than guess and optimum ever do: halfway there derivatives end."""

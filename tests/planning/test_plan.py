@@ -1,10 +1,10 @@
 """`drake-diff plan`: from a file to a verified plan; what is wrong is one sentence and a status."""
 
-import subprocess
 import sys
 
 import numpy as np
 import pytest
+from helpers.command import drake_diff
 from helpers.models import MODELS
 from helpers.table import each_row
 
@@ -18,16 +18,6 @@ from drake_diff.planning.robot import load_robot
 from drake_diff.runs import read_trace
 
 pytestmark = pytest.mark.solve
-
-
-def command(*words, cwd):
-    return subprocess.run(
-        [sys.executable, "-m", "drake_diff.cli.main", "plan", *map(str, words)],
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-        timeout=300,
-    )
 
 
 ARM = """<robot name="arm"><link name="base"/>
@@ -55,7 +45,7 @@ def arm(tmp_path):
 
 
 def test_a_textbook_arm_is_mended_planned_for_and_verified(arm, tmp_path):
-    done = command(arm, "--goal", "elbow=0.5", "--out", "out", cwd=tmp_path)
+    done = drake_diff("plan", arm, "--goal", "elbow=0.5", "--out", "out", cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "actuators='all'" in done.stdout
     assert "base='weld'" in done.stdout
@@ -84,7 +74,7 @@ def test_a_robot_that_is_not_fully_driven_goes_where_its_motors_can_bring_it(tmp
 def test_a_goal_that_cannot_be_reached_in_time_is_not_called_a_plan(tmp_path):
     """At 0.05 m/s a slide moves 0.3 m in the longest motion that is tried, and it is asked for 0.9."""
     (tmp_path / "slide.urdf").write_text(SLIDE)
-    done = command("slide.urdf", "--goal", "slide=0.9", "--out", "out", cwd=tmp_path)
+    done = drake_diff("plan", "slide.urdf", "--goal", "slide=0.9", "--out", "out", cwd=tmp_path)
     assert done.returncode == 1, done.stdout + done.stderr
     assert "Traceback" not in done.stderr
 

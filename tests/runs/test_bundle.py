@@ -143,8 +143,8 @@ def test_a_run_is_verified_and_shown_where_the_robot_is_not(tmp_path, name):
         run,
     )
     shutil.move(root, tmp_path / "gone")
-    found = dd.verify(run).require()
-    assert (found.complaints, found.rounded) == ((), ())
+    verification = dd.verify(run).require()
+    assert (verification.complaints, verification.rounded) == ((), ())
     assert scene_of_run(run).shapes
 
 
@@ -174,8 +174,8 @@ def test_a_record_is_the_same_wherever_the_model_lies_and_however_its_path_is_wr
             dd.save(solved(load(path, root, base="weld")), tmp_path / f"run{i}{j}" / "run")
             records.append(json.loads((tmp_path / f"run{i}{j}" / "run" / "record.json").read_text()))
             assert records[-1]["provenance"].pop("model_file") == str(path)
-    apart = ("provenance", "wall_clock", "files", "record_sha256")
-    texts = {canonical({key: value for key, value in record.items() if key not in apart}) for record in records}
+    skipped = ("provenance", "wall_clock", "files", "record_sha256")
+    texts = {canonical({key: value for key, value in record.items() if key not in skipped}) for record in records}
     assert len(texts) == 1
     assert str(tmp_path) not in texts.pop()
     shutil.rmtree(tmp_path / "one")
@@ -260,8 +260,8 @@ def missing(named, bundle):
     ],
 )
 def test_a_changed_file_of_the_model_is_found_although_all_seals_are_right(arm, tmp_path, change, verdict, words):
-    found = forged(arm, tmp_path / "run", change)
-    assert (found.verdict, words in str(found)) == (verdict, True), found.lines
+    verification = forged(arm, tmp_path / "run", change)
+    assert (verification.verdict, words in str(verification)) == (verdict, True), verification.lines
 
 
 def test_another_mesh_in_a_whole_run_is_another_claim(run, tmp_path):
@@ -319,7 +319,7 @@ def test_a_run_written_before_has_no_copy_and_is_verified_with_the_folder_of_its
     write_files(folder, measure(arm), fields)
     fields["files"] = {name: file.model_dump() for name, file in files_below(folder, "record.json").items()}
     (folder / "record.json").write_text(canonical({**fields, "record_sha256": own_sha256(fields)}))
-    found = dd.verify(folder)
-    assert (found.verdict, "models=FOLDER" in str(found)) == ("undecided", True)
-    found = dd.verify(folder, models=model.source.parents[2])
-    assert (found.holds, found.notes) == (True, ()), found.lines
+    verification = dd.verify(folder)
+    assert (verification.verdict, "models=FOLDER" in str(verification)) == ("undecided", True)
+    verification = dd.verify(folder, models=model.source.parents[2])
+    assert (verification.holds, verification.notes) == (True, ()), verification.lines

@@ -1,13 +1,12 @@
 """Runs side by side, and the commands verify, list and compare-runs: what they print and their exit status."""
 
-import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from helpers.models import MODELS, ROOT
+from helpers.command import drake_diff
+from helpers.models import MODELS
 
 import drake_diff as dd
 from drake_diff.cli.main import main
@@ -40,12 +39,6 @@ def runs(tmp_path_factory):
     (folder / "odd" / "record.json").write_text("{}")
     (folder / "empty").mkdir()
     return folder
-
-
-def drake_diff(*words, cwd):
-    command = [sys.executable, "-m", "drake_diff.cli.main", *map(str, words)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300, env=environment)
 
 
 def test_a_line_for_each_run_with_what_its_record_says(runs):

@@ -75,17 +75,17 @@ def copy(run, tmp_path):
 
 
 def test_a_run_holds_and_comes_out_again_to_the_last_bit(run):
-    found = dd.verify(run).require()
-    assert (found.verdict, found.rounded) == ("holds", ())
-    assert found.checked > 700
+    result = dd.verify(run).require()
+    assert (result.verdict, result.rounded) == ("holds", ())
+    assert result.checked > 700
 
 
 def test_the_reference_run_of_this_repository_holds():
     """On other versions of Drake or NumPy it is not called a lie: `notes` says which it was recorded with."""
-    found = dd.verify(ROOT / "artifacts" / "pendulum_swing_up")
-    assert found.complaints == ()
-    assert found.holds or found.notes
-    assert found.record.verdict == "pass"
+    result = dd.verify(ROOT / "artifacts" / "pendulum_swing_up")
+    assert result.complaints == ()
+    assert result.holds or result.notes
+    assert result.record.verdict == "pass"
 
 
 def corruptions(count):
@@ -147,9 +147,9 @@ def test_corruptions_are_found_and_the_message_names_the_file(run, other_run, tm
     for how, name, seed in corruptions(count):
         directory = Path(shutil.copytree(run, tmp_path / str(seed)))
         corrupt(directory, other_run, how, name, seed)
-        found = dd.verify(directory)
-        if found.verdict != "broken" or not any(name in complaint for complaint in found.complaints):
-            missed.append((how, name, seed, str(found)))
+        result = dd.verify(directory)
+        if result.verdict != "broken" or not any(name in complaint for complaint in result.complaints):
+            missed.append((how, name, seed, str(result)))
         shutil.rmtree(directory)
     assert missed == []
 
@@ -159,10 +159,10 @@ def test_a_number_edited_and_hashed_again_is_not_what_the_trace_carries(run, cop
     lie = record.metrics[9].model_copy(update={"value": 1e-7})
     changed = record.model_copy(update={"metrics": [*record.metrics[:9], lie, *record.metrics[10:]]})
     changed.write(copy)
-    found = dd.verify(copy)
-    assert found.verdict == "broken"
-    assert any("trace.mcap: the record that it carries" in problem for problem in found.complaints)
-    assert any("metrics[half-step end error].value: recorded 1e-07" in problem for problem in found.complaints)
+    result = dd.verify(copy)
+    assert result.verdict == "broken"
+    assert any("trace.mcap: the record that it carries" in problem for problem in result.complaints)
+    assert any("metrics[half-step end error].value: recorded 1e-07" in problem for problem in result.complaints)
 
 
 def lying(section, change):
@@ -212,9 +212,9 @@ def test_a_whole_artifact_that_lies_is_found_by_running_it_again(
     monkeypatch.setattr(evidence, "record_of", lying(section, change))
     dd.save(solution, tmp_path / "run")
     monkeypatch.undo()
-    found = dd.verify(tmp_path / "run")
-    assert found.verdict == "broken"
-    assert any(words in complaint for complaint in found.complaints), found.complaints
+    result = dd.verify(tmp_path / "run")
+    assert result.verdict == "broken"
+    assert any(words in complaint for complaint in result.complaints), result.complaints
 
 
 @pytest.mark.parametrize("row", slow_after(1, [0, 7, 20]))
@@ -247,10 +247,10 @@ def test_a_run_that_stopped_far_from_its_goal_cannot_say_that_it_converged(solut
     monkeypatch.setattr(evidence, "record_of", forged)
     assert dd.save(stopped, tmp_path / "run").verdict == "pass"
     monkeypatch.undo()
-    found = dd.verify(tmp_path / "run")
-    assert found.verdict == "broken"
+    result = dd.verify(tmp_path / "run")
+    assert result.verdict == "broken"
     for words in ("metrics: recorded", "solver.status: recorded converged", "verdict: recorded pass", "failures"):
-        assert any(f"record.json: {words}" in complaint for complaint in found.complaints), found.complaints
+        assert any(f"record.json: {words}" in complaint for complaint in result.complaints), result.complaints
 
 
 def test_exchanged_pages_are_found_although_all_hashes_are_right_and_a_file_more_is_told(run, other_run, copy):
@@ -262,9 +262,9 @@ def test_exchanged_pages_are_found_although_all_hashes_are_right_and_a_file_more
             assert forged != honest
             (copy / name).write_bytes(forged)
             dd.load_record(copy).write(copy)
-            found = dd.verify(copy)
-            assert found.verdict == "broken"
-            assert {line.split(":")[0] for line in found.complaints} == {name}
+            result = dd.verify(copy)
+            assert result.verdict == "broken"
+            assert {line.split(":")[0] for line in result.complaints} == {name}
         (copy / name).write_bytes(honest)
     (copy / "certificate.pdf").write_text("all is well")
     dd.load_record(copy).write(copy)
@@ -304,9 +304,9 @@ def test_a_scene_that_is_not_the_runs_is_found_although_all_hashes_are_right(run
         (copy / name).write_text(forge(honest, (other_run / name).read_text()))
         names += [name] * ((copy / name).read_text() != honest)
     dd.load_record(copy).write(copy)
-    found = verify_own(copy)
-    assert (found.verdict, names != []) == (verdict, True), found.lines
-    differing = found.complaints if verdict == "broken" else found.rounded
+    result = verify_own(copy)
+    assert (result.verdict, names != []) == (verdict, True), result.lines
+    differing = result.complaints if verdict == "broken" else result.rounded
     assert list(dict.fromkeys(line.split(":")[0] for line in differing)) == names
 
 
@@ -314,15 +314,15 @@ def test_an_older_schema_is_no_excuse_for_another_page_or_sentence(run, other_ru
     """What versions word otherwise cannot be told from a forgery: it is not checked, and does not hold."""
     record = dd.load_record(copy).model_copy(update={"schema_version": "3.1.0"})
     seal(copy, record.model_dump(mode="json"))
-    found = verify_own(copy)
-    assert found.verdict == "holds", found.lines
+    result = verify_own(copy)
+    assert result.verdict == "holds", result.lines
     seal(copy, {**record.model_dump(mode="json"), "sentence": "it is safe for people"})
     assert verify_own(copy).verdict == "undecided"
     (copy / "replay.html").write_text((other_run / "replay.html").read_text())
     seal(copy, record.model_dump(mode="json"))
-    found = verify_own(copy)
-    assert found.verdict == "undecided"
-    assert any("replay.html: hashes match, contents not checked" in line for line in found.undecided), found.lines
+    result = verify_own(copy)
+    assert result.verdict == "undecided"
+    assert any("replay.html: hashes match, contents not checked" in line for line in result.undecided), result.lines
 
 
 @pytest.mark.parametrize(
@@ -340,9 +340,9 @@ def test_a_trace_with_something_left_out_is_found(copy, change, told):
     """Written again by the mcap package alone, as whole as before."""
     rewrite(copy / "trace.mcap", **change)
     dd.load_record(copy).write(copy)
-    found = dd.verify(copy)
-    assert found.verdict == "broken"
-    assert any(line.startswith(f"trace.mcap: {told}") for line in found.complaints), found.complaints
+    result = dd.verify(copy)
+    assert result.verdict == "broken"
+    assert any(line.startswith(f"trace.mcap: {told}") for line in result.complaints), result.complaints
 
 
 def test_another_version_of_drake_is_a_reason_for_doubt_not_a_lie(run, copy):
@@ -351,19 +351,19 @@ def test_another_version_of_drake_is_a_reason_for_doubt_not_a_lie(run, copy):
     metric = record.metrics[0].model_copy(update={"value": 1.0})
     changes = {"provenance": older, "metrics": [metric, *record.metrics[1:]]}
     record.model_copy(update=changes).write(copy)
-    found = dd.verify(copy)
-    assert (found.verdict, found.complaints) == ("undecided", ())
-    assert found.undecided[0].startswith("recorded with drake 1.40.0, run again with")
-    assert any("metrics[cost].value: recorded 1, again" in line for line in found.undecided)
+    result = dd.verify(copy)
+    assert (result.verdict, result.complaints) == ("undecided", ())
+    assert result.undecided[0].startswith("recorded with drake 1.40.0, run again with")
+    assert any("metrics[cost].value: recorded 1, again" in line for line in result.undecided)
 
 
 @pytest.mark.slow
 def test_a_search_that_a_time_limit_or_the_user_ended_cannot_be_found_again(solution, tmp_path):
     for status in (dd.Status.TIME_LIMIT, dd.Status.INTERRUPTED):
         dd.save(solution.told(status=status), tmp_path / status.value)
-        found = dd.verify(tmp_path / status.value)
-        assert (found.verdict, found.complaints) == ("undecided", ())
-        assert "the search was not run again" in str(found)
+        result = dd.verify(tmp_path / status.value)
+        assert (result.verdict, result.complaints) == ("undecided", ())
+        assert "the search was not run again" in str(result)
 
 
 @each_row(
@@ -400,8 +400,8 @@ def test_a_millionth_is_what_machines_round_differently(recorded, again, near):
 def test_a_plan_of_another_run_is_found_although_all_hashes_are_right(run, other_run, copy):
     shutil.copy(other_run / "plan.npz", copy / "plan.npz")
     dd.load_record(copy).write(copy)
-    found = dd.verify(copy)
-    assert any("/planned/state is not what plan.npz has" in problem for problem in found.complaints)
+    result = dd.verify(copy)
+    assert any("/planned/state is not what plan.npz has" in problem for problem in result.complaints)
 
 
 def test_links_and_files_outside_are_not_followed(run, copy, tmp_path):
@@ -461,11 +461,11 @@ def test_every_kind_of_directory_is_known_read_and_listed(kinds):
     assert verdicts == {"plan": "holds", "comparison": "intact", "robustness": "intact", "certification": "holds"}
     assert {kind: dd.load_record(kinds / kind).subject for kind in KINDS} == {kind: kind for kind in KINDS}
     assert {line.name: line.kind for line in list_runs(kinds)} == {kind: kind for kind in KINDS}
-    found = dd.verify(kinds / "comparison")
-    assert str(found).startswith("intact: hashes match, contents not checked: the engines were not run again; ")
-    assert found.unchecked == ("every number: the engines were not run again",)
+    result = dd.verify(kinds / "comparison")
+    assert str(result).startswith("intact: hashes match, contents not checked: the engines were not run again; ")
+    assert result.unchecked == ("every number: the engines were not run again",)
     with pytest.raises(ArtifactError, match="contents not checked"):
-        found.require()
+        result.require()
 
 
 @each_row("kind", KINDS)
@@ -475,9 +475,9 @@ def test_a_changed_directory_of_any_kind_is_refused_and_the_file_named(kinds, ki
         for how in ("flip", "delete", "extra"):
             directory = Path(shutil.copytree(kinds / kind, tmp_path / f"{how}_{Path(name).name}"))
             corrupt(directory, directory, how, name, seed=1)
-            found = dd.verify(directory)
-            assert found.verdict == "broken", (name, how)
-            assert any(name in complaint for complaint in found.complaints), (name, how, found.complaints)
+            result = dd.verify(directory)
+            assert result.verdict == "broken", (name, how)
+            assert any(name in complaint for complaint in result.complaints), (name, how, result.complaints)
     directory = Path(shutil.copytree(kinds / kind, tmp_path / "edited"))
     corrupt(directory, directory, "number", record.FILE, seed=1)
     assert any(f"{record.FILE}: its content does not match" in words for words in dd.verify(directory).complaints)
@@ -499,9 +499,9 @@ def test_pages_and_sentences_of_what_is_not_run_again_follow_from_the_record(kin
         for forged in (honest.replace(words, "All is well"), with_scripts(honest, lambda script: script + " ")):
             assert forged != honest
             path.write_text(forged)
-            found = verified()
-            assert found.verdict == "broken"
-            assert any(line.startswith(f"{name}: ") for line in found.complaints)
+            result = verified()
+            assert result.verdict == "broken"
+            assert any(line.startswith(f"{name}: ") for line in result.complaints)
         path.write_text(honest)
     fields["sentence"] = "it is safe for people"
     assert any("record.json: sentence: recorded it is safe" in line for line in verified().complaints)
@@ -525,9 +525,9 @@ def test_a_certification_that_lies_is_found_by_certifying_again(kinds, tmp_path)
         states = [state.model_copy(update=lie), *record.certification.states[1:]]
         section = record.certification.model_copy(update={"states": states})
         record.model_copy(update={"certification": section}).write(directory)
-        found = dd.verify(directory)
-        assert found.verdict == "broken"
-        assert any("record.json" in complaint and words in complaint for complaint in found.complaints)
+        result = dd.verify(directory)
+        assert result.verdict == "broken"
+        assert any("record.json" in complaint and words in complaint for complaint in result.complaints)
 
 
 def test_a_pass_with_an_engine_or_a_perturbation_that_does_not_hold_is_refused(kinds):
@@ -552,9 +552,9 @@ def test_a_pass_of_a_state_that_does_not_agree_is_no_certification(kinds):
 def test_a_model_from_a_diagram_cannot_be_run_again(solution, tmp_path):
     model = dd.model_from_diagram(dd.load_model(MODELS / "pendulum.urdf", time_step=0.02).diagram)
     dd.save(swing_up(model), tmp_path / "run")
-    found = dd.verify(tmp_path / "run")
-    assert found.verdict == "undecided"
-    assert "not run again: the system is a user's own diagram" in str(found)
+    result = dd.verify(tmp_path / "run")
+    assert result.verdict == "undecided"
+    assert "not run again: the system is a user's own diagram" in str(result)
 
 
 @pytest.mark.slow
@@ -563,20 +563,20 @@ def test_a_users_constraint_or_cost_is_undecided_and_what_rests_on_it_is_told(tm
         return x[1]
 
     dd.save(swing_up(constraints=dd.Constraint(slow, upper=20.0)), tmp_path / "a")
-    found = dd.verify(tmp_path / "a")
-    assert (found.verdict, found.complaints) == ("undecided", ())
-    assert "slow is a user's function" in str(found)
-    assert any("metrics[constraint violation]" in line for line in found.unchecked)
+    result = dd.verify(tmp_path / "a")
+    assert (result.verdict, result.complaints) == ("undecided", ())
+    assert "slow is a user's function" in str(result)
+    assert any("metrics[constraint violation]" in line for line in result.unchecked)
     broken = swing_up(constraints=dd.Constraint(slow, upper=20.0))
     broken = dataclasses.replace(broken, xs=np.add(broken.xs, [0.0, 30.0]))  # in the plan and in every replay
     dd.save(broken, tmp_path / "c")
-    found = dd.verify(tmp_path / "c")
-    assert (found.verdict, found.complaints) == ("undecided", ())
+    result = dd.verify(tmp_path / "c")
+    assert (result.verdict, result.complaints) == ("undecided", ())
     dd.save(swing_up(final_cost=lambda x: x[0] ** 2), tmp_path / "b")
-    found = dd.verify(tmp_path / "b")
-    assert (found.verdict, found.complaints) == ("undecided", ())
-    assert "final_cost" in str(found)
-    assert any("metrics[cost]" in line for line in found.unchecked)
+    result = dd.verify(tmp_path / "b")
+    assert (result.verdict, result.complaints) == ("undecided", ())
+    assert "final_cost" in str(result)
+    assert any("metrics[cost]" in line for line in result.unchecked)
 
 
 @pytest.mark.slow

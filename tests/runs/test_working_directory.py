@@ -3,9 +3,9 @@
 import os
 import shutil
 import subprocess
-import sys
 
 import pytest
+from helpers.command import drake_diff
 from helpers.engines import needs
 from helpers.models import MODELS
 
@@ -29,13 +29,8 @@ def here(tmp_path, monkeypatch):
 def git(*words):
     if shutil.which("git") is None:
         pytest.skip("git is not installed")
-    whole = ["git", "-c", "user.name=a", "-c", "user.email=a@b", *words]
-    return subprocess.run(whole, check=True, capture_output=True, text=True).stdout.strip()
-
-
-def command(*words):
-    arguments = [sys.executable, "-P", "-m", "drake_diff.cli.main", *words]
-    return subprocess.run(arguments, capture_output=True, text=True, timeout=300)
+    command_line = ["git", "-c", "user.name=a", "-c", "user.email=a@b", *words]
+    return subprocess.run(command_line, check=True, capture_output=True, text=True).stdout.strip()
 
 
 def commit(text):
@@ -72,7 +67,7 @@ def test_the_commit_of_a_checkout_and_whether_it_differs(here):
     assert provenance_of().git == {"commit": head, "dirty": True}
 
 
-def test_settings_of_a_checkout_run_no_command(here):
+def test_settings_of_a_checkout_run_no_drake_diff(here):
     folder, sprung = here
     git("init", "-q")
     (folder / ".gitattributes").write_text("* filter=trap diff=trap\n")
@@ -93,7 +88,7 @@ def test_settings_of_a_checkout_run_no_command(here):
 def test_ipopt_reads_no_options(here):
     folder, sprung = here
     (folder / "ipopt.opt").write_text(f"output_file {sprung}\n")
-    done = command("plan", str(MODELS / "pendulum.urdf"), "--goal", "hinge=0.1", "--out", "run")
+    done = drake_diff("plan", str(MODELS / "pendulum.urdf"), "--goal", "hinge=0.1", "--out", "run")
     assert done.returncode == 0, done.stderr
     assert not sprung.exists()
 
@@ -101,7 +96,7 @@ def test_ipopt_reads_no_options(here):
 def test_numba_loads_nothing_from_where_the_directory_says(here):
     folder, sprung = here
     (folder / ".numba_config.yaml").write_text(f"cache_dir: {sprung}\n")
-    done = command("certify", str(MODELS / "pendulum.urdf"))
+    done = drake_diff("certify", str(MODELS / "pendulum.urdf"))
     assert done.returncode == 2
     assert ".numba_config.yaml: expected none" in done.stderr
     assert not sprung.exists()
@@ -112,6 +107,6 @@ def test_processes_of_libraries_import_nothing_from_the_directory(here):
     folder, sprung = here
     for name in ("ctypes", "numpy", "glfw"):
         (folder / f"{name}.py").write_text(TRAP.format(str(sprung)))
-    done = command("compare", str(MODELS / "pendulum.urdf"), "--engines", "mujoco", "--out", "run")
+    done = drake_diff("compare", str(MODELS / "pendulum.urdf"), "--engines", "mujoco", "--out", "run")
     assert done.returncode in (0, 1), done.stderr
     assert not sprung.exists()
