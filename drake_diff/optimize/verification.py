@@ -147,10 +147,10 @@ def _by_our_measures(draft: Solution, result: NlpResult) -> tuple[Outcome, tuple
 
 def not_in_steps(plan: Solution, refined: Solution) -> Solution:
     """A collocated plan that no motion in the model's own steps repeats, with the steps in which it holds."""
-    holding = (f"it holds {messages.under(t.feedback)} {t.plant}" for t in map(_trial, plan.replays) if t.holds)
-    where = next(holding, "it holds in no steps that were tried")
+    holding = (f"this plan holds {messages.under(t.feedback)} {t.plant}" for t in map(_trial, plan.replays) if t.holds)
+    where = next(holding, "this plan holds in no steps that were tried")
     step = messages.in_milliseconds(plan.time_step)
-    text = f"in continuous time alone: at {step} no plan was verified; {where}"
+    text = f"in continuous time alone: no plan in steps of {step} was verified; {where}"
     return ended(plan, Status.CONVERGED_NOT_VERIFIED, text, plan.message, refined.message, *refined.notes)
 
 
