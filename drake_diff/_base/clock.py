@@ -20,7 +20,7 @@ LONGEST_PIECE = 0.4  # of what the pieces before it took, as CasADi's take on ch
 DEADLINE: ContextVar[float | None] = ContextVar("DEADLINE", default=None)  # of `now`
 STOP: ContextVar[threading.Event | None] = ContextVar("STOP", default=None)
 _uncounted = 0.0  # [s]
-_interrupted = False
+INTERRUPTIONS: list[int] = []  # the signals that `interrupt` handled
 
 
 def uncounted(seconds: float = 0.0) -> float:
@@ -99,8 +99,7 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 
     Extensions in C++ print what is raised while they are imported and go on, or abort.
     """
-    global _interrupted
-    _interrupted = True
+    INTERRUPTIONS.append(number)
     _hush(number)
     if frame is not None and _is_imported_in(frame):
         later = threading.Timer(AGAIN, os.kill, (os.getpid(), number))
@@ -114,11 +113,6 @@ def _is_imported_in(frame: FrameType) -> bool:
     """Whether an extension is being imported, or the innermost function is of the import system."""
     loaders = (isinstance(caller.f_locals.get("self"), ExtensionFileLoader) for caller, _ in walk_stack(frame))
     return frame.f_globals.get("__name__") == "importlib._bootstrap" or any(loaders)
-
-
-def was_interrupted() -> bool:
-    """Whether a signal has interrupted this process."""
-    return _interrupted
 
 
 class _Flag(threading.Event):
@@ -151,6 +145,7 @@ def _handled(handler: Any, numbers: Iterable[int]) -> Iterator[None]:
 
 def interrupt_alike() -> None:
     """From here on `interrupt` handles Ctrl-C, and SIGTERM and SIGHUP where they would have ended the process."""
+    INTERRUPTIONS.clear()  # of an earlier command in this process, such as a notebook or a suite of tests
     for number in (signal.SIGINT, *ALIKE):
         if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
             signal.signal(number, interrupt)

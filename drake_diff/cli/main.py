@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from drake_diff._base.clock import INTERRUPTED, discard, interrupt_alike, was_interrupted
+from drake_diff._base.clock import INTERRUPTED, INTERRUPTIONS, discard, interrupt_alike
 from drake_diff.cli import models, plans, runs
 from drake_diff.exceptions import DrakeDiffError, MissingDependencyError
 
@@ -83,7 +83,7 @@ def main() -> None:
     sys.stdout, sys.stderr = output, _Output(sys.stderr)
     status = _status_of_app()
     output.flush()
-    if was_interrupted() and status == 1:  # as Typer has it
+    if INTERRUPTIONS and status == 1:  # as Typer has it
         status = INTERRUPTED
     if output.error is not None and not isinstance(output.error, BrokenPipeError):
         print(f"drake-diff: the output could not be written: {output.error}", file=sys.stderr)

@@ -19,10 +19,8 @@ def problem():
 
 @pytest.fixture
 def python(tmp_path):
-    def run(code):
-        return subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
-
-    return run
+    options = {"cwd": tmp_path, "capture_output": True, "text": True, "timeout": 60}
+    return lambda code: subprocess.run([sys.executable, "-c", code], **options)
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
@@ -34,33 +32,36 @@ interrupt_alike()
 def trace(frame, event, argument):
     if "enum" in frame.f_code.co_filename and any("pydrake" in name for name in sys.modules):
         sys.settrace(None)
-        print("sent")
+        sys.stdout.write("sent ")
         os.kill(os.getpid(), signal.{name})
 sys.settrace(trace)
 try:
     import pydrake.common
-    print("imported")
+    sys.stdout.write("imported ")  # not print, which the signal may part from its newline
     while True: pass
 except KeyboardInterrupt:
-    print("interrupted")""")
+    sys.stdout.write("interrupted")""")
     assert (done.stdout.split(), done.stderr) == (["sent", "imported", "interrupted"], "")
 
 
-def test_ctrl_c_in_any_command_is_status_130(python):
-    code = "import sys\nfrom drake_diff.cli import main\n@main.app.command()\ndef trap():\n    {}\n"
-    code += "sys.argv = ['drake-diff', 'trap']\nmain.main()"
-    assert python(code.format("import os; os.kill(os.getpid(), 2)")).returncode == 130
-    assert python(code.format("sys.exit(1)")).returncode == 1
+def test_ctrl_c_in_any_command_is_status_130_and_a_later_command_has_its_own_status(python):
+    code = """import os, sys
+from drake_diff.cli import main
+@main.app.command()
+def trap(): os.kill(os.getpid(), 2) if first else sys.exit(1)
+sys.argv = ["drake-diff", "trap"]
+for first in (True, False):
+    try: main.main()
+    except SystemExit as end: sys.__stdout__.write(f"{end.code} ")"""
+    assert python(code).stdout.split() == ["130", "1"]
 
 
 @pytest.mark.parametrize(("reader", "status"), [("pipe", 0), ("/dev/full", 2)])
 def test_a_run_is_written_although_its_output_is_not(tmp_path, reader, status):
     (tmp_path / "problem.py").write_text(PROBLEM)
-    if reader == "pipe":
-        end, file = os.pipe()
-        os.close(end)
-    else:
-        file = os.open(reader, os.O_WRONLY)
+    end, pipe = os.pipe()
+    os.close(end)
+    file = pipe if reader == "pipe" else os.open(reader, os.O_WRONLY)
     done = drake_diff("run", "problem.py", "--out", "run", cwd=tmp_path, stdout=file)
     os.close(file)
     assert done.returncode == status, done.stderr
@@ -72,10 +73,8 @@ def test_names_that_are_no_text_are_refused_by_name(tmp_path):
     name = os.fsdecode(b"\xff.urdf")
     (tmp_path / name).write_bytes((MODELS / "pendulum.urdf").read_bytes())
     (tmp_path / "problem.py").write_text(PROBLEM)
-    for words, subject in (
-        (("certify", name), "model file"),
-        (("run", "problem.py", "--out", os.fsdecode(b"\xff")), "name"),
-    ):
+    run = ("run", "problem.py", "--out", os.fsdecode(b"\xff"))
+    for words, subject in ((("certify", name), "model file"), (run, "name")):
         done = drake_diff(*words, cwd=tmp_path)
         assert done.returncode == 2
         assert f"{subject}: expected a name in UTF-8, got '\\udcff" in done.stderr
