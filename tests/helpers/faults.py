@@ -120,9 +120,15 @@ def tried(action, root, at=None, fault="", *, exchanges=True):
     return ended(*forked(act))
 
 
-def two_solutions():
-    """A plan that was saved, and one to be saved where it is, both of a pendulum."""
-    model = dd.load_model("models/pendulum.urdf", time_step=0.02)
+def two_solutions(folder):
+    """A plan that was saved, and one to be saved where it is, both of a pendulum in `folder` that has a mesh."""
+    sphere = '<sphere radius="0.05"/>'
+    urdf = Path("models/pendulum.urdf").read_text().replace(sphere, '<mesh filename="meshes/bob.obj"/>')
+    (folder / "meshes").mkdir()
+    (folder / "meshes" / "bob.obj").write_text("mtllib bob.mtl\nusemtl red\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    (folder / "meshes" / "bob.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    (folder / "pendulum.urdf").write_text(urdf)
+    model = dd.load_model(folder / "pendulum.urdf", time_step=0.02)
     asked = {"x0": [0, 0], "num_steps": 10, "running_cost": dd.QuadraticCost(R=[[1.0]])}
     return [dd.solve(dd.Problem(model, x_goal=[goal, 0], **asked), method="shooting") for goal in (0.2, 0.3)]
 

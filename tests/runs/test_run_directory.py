@@ -56,8 +56,8 @@ BUILT = {
 
 
 @pytest.fixture(scope="module")
-def solutions():
-    return two_solutions()
+def solutions(tmp_path_factory):
+    return two_solutions(tmp_path_factory.mktemp("robot"))
 
 
 @pytest.fixture(scope="module")
@@ -246,6 +246,7 @@ def test_a_fault_in_any_call_loses_nothing(run, solutions, monkeypatch, exchange
     quick_pages(monkeypatch)
     faults = FAULTS if exchanges else (*ERRORS[:1], KILLED)
     count = len(calls_of(run, solutions[1], exchanges=exchanges))
+    assert len([name for name in (run / "model").rglob("*") if name.is_file()]) == 2  # a mesh and its material
     assert count > 50
     for at in range(count):
         if check(run, solutions, at, faults[at % len(faults)], exchanges=exchanges) == NEW:
