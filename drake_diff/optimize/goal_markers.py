@@ -72,7 +72,7 @@ def _arrow(path: str, frame: RigidTransform, along: Array, colour: Rgba) -> list
     length = float(np.linalg.norm(along))
     if length == 0.0:
         return []
-    turned = frame @ RigidTransform(RotationMatrix.MakeFromOneVector(along, 2), np.zeros(3))
+    turned = frame @ RigidTransform(RotationMatrix.MakeFromOneVector(along / length, 2), np.zeros(3))
     radius = THIN * length
     middle, end = (turned @ RigidTransform([0.0, 0.0, fraction * length]) for fraction in (0.5, 1.0))
     tip = end @ RigidTransform(RollPitchYaw(np.pi, 0.0, 0.0), [0.0, 0.0, 4 * radius])  # a cone's apex is its origin

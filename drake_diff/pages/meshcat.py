@@ -118,9 +118,9 @@ class _Arrows:
         for slot in range(self.slots):
             path, used = f"{self.root}/{slot}", slot < len(pushing)
             if used:
-                force = pushing[slot].force
-                length = min(float(np.linalg.norm(force)) / self.reference, LONGEST) * self.longest
-                pose = RigidTransform(RotationMatrix.MakeFromOneVector(force, 2), pushing[slot].point)
+                force, size = pushing[slot].force, float(np.linalg.norm(pushing[slot].force))
+                length = min(size / self.reference, LONGEST) * self.longest
+                pose = RigidTransform(RotationMatrix.MakeFromOneVector(force / size, 2), pushing[slot].point)
                 meshcat.SetTransform(path, pose, time_in_recording=time)
                 meshcat.SetTransform(f"{path}/tip", RigidTransform([0.0, 0.0, length]), time_in_recording=time)
                 meshcat.SetProperty(f"{path}/shaft", "scale", [1.0, 1.0, length], time_in_recording=time)

@@ -178,7 +178,7 @@ def _origin(frame: Any, context: Any) -> Array:
 def _bone(path: str, start: Array, end: Array, radius: float) -> Drawn:
     along, middle = end - start, (start + end) / 2
     length = float(np.linalg.norm(along))
-    pose = RigidTransform(RotationMatrix.MakeFromOneVector(along, 2), middle)
+    pose = RigidTransform(RotationMatrix.MakeFromOneVector(along / length, 2), middle)
     return Drawn(path, Cylinder(radius, length), pose, BONE, middle, length / 2)
 
 

@@ -14,11 +14,11 @@ from drake_diff.pages.shapes import Drawn
 
 ROTORS = [
     dd.model.BodyForce("left", "ball", point=(0, 0.2, 0.1), direction=(0, 0, 2), upper=9.0),
-    dd.model.BodyForce("right", "ball", point=(0, -0.2, 0.1), direction=(0, 3, 4), moment_ratio=0.1),
+    dd.model.BodyForce("right", "ball", point=(0, -0.2, 0.1), direction=(0, 3e-12, 4e-12), moment_ratio=0.1),
 ]
 
 
-def test_the_force_of_an_input_is_drawn_where_it_pushes():
+def test_the_force_of_an_input_is_drawn_where_it_pushes(tmp_path):
     """At p + R r along R d, of u newtons: from the formula of a body's pose."""
     model = dd.load_model(MODELS / "projectile.sdf", time_step=0.01, body_forces=ROTORS)
     rng = np.random.default_rng(5)
@@ -28,6 +28,7 @@ def test_the_force_of_an_input_is_drawn_where_it_pushes():
         x[:4], x[4:7] = turn.ToQuaternion().wxyz(), rng.uniform(-1, 1, 3)
     found = scene_of(model, np.array([0, 0.01, 0.02]), xs, us=us).thrusts
     assert [len(step) for step in found] == [2, 2]
+    write_replay(tmp_path / "r.html", scene_of(model, np.array([0, 0.01]), xs[:2], us=1e-17 * us[:1]), title="faint")
     for x, turn, u, step in zip(xs, turns, us, found, strict=False):
         R = turn.ToRotationMatrix().matrix()
         for rotor, force, one in zip(ROTORS, u, step, strict=True):
