@@ -225,10 +225,9 @@ def mjcf(description: Description, time_step: float, inverse_masses: Mapping[str
     actuators, contacts = SubElement(root, "actuator"), SubElement(root, "contact")
     for i, (name, joint) in enumerate(zip(description.inputs, description.actuated, strict=True)):
         motor = SubElement(actuators, "motor", name=name, joint=joint, gear="1")
-        limit = float(description.effort_limits[i])
-        if np.isfinite(limit):
+        if np.isfinite(description.effort_limits[i]):
             motor.set("forcelimited", "true")
-            motor.set("forcerange", row([-limit, limit]))
+            motor.set("forcerange", row(description.effort_sides[i]))
     for pair in description.pairs:
         if set(pair.names) <= body_of.keys():
             element = SubElement(contacts, "pair", geom1=pair.names[0], geom2=pair.names[1], condim="3")

@@ -337,10 +337,10 @@ def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Descri
             raise ModelError(f"actuator {name} of the MJCF: expected a motor on a joint, got another transmission")
         row = int(np.flatnonzero(native.dofs == m.jnt_dofadr[m.actuator_trnid[i][0]])[0])
         B[row, column] = m.actuator_gainprm[i][0] * m.actuator_gear[i][0]
-        # Of MuJoCo's limits of control and force that which is reached first.
-        by_force = _side(name, m.actuator_forcerange[i]) if m.actuator_forcelimited[i] else np.inf
-        by_control = _side(name, m.actuator_ctrlrange[i]) if m.actuator_ctrllimited[i] else np.inf
-        limits.append(min(by_force / abs(float(m.actuator_gainprm[i][0])), by_control))
+        # Of MuJoCo's limits of control and force those which are reached first.
+        sides = [np.sort(m.actuator_forcerange[i] / m.actuator_gainprm[i][0])] if m.actuator_forcelimited[i] else []
+        sides += [m.actuator_ctrlrange[i]] if m.actuator_ctrllimited[i] else []
+        limits.append(max(abs(max(s[0] for s in sides)), abs(min(s[1] for s in sides))) if sides else np.inf)
     law = f"soft constraint, {CONES[int(m.opt.cone)]} cone, impratio {float(m.opt.impratio):g}"
     law += f", {slips} noslip iterations" if (slips := int(getattr(m.opt, "noslip_iterations", 0))) else ""
     free, who = native.coordinates.free, fields.pop("who")
@@ -376,13 +376,6 @@ def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Descri
 def _not_given(description: Description, pair: PairContract) -> bool:
     """Whether one of the two is of a shape that MJCF is not written for."""
     return any(not shape_of(g)[1] for g in description.geometries if g.name in pair.names)
-
-
-def _side(name: str, both: Any) -> float:
-    lower, upper = (float(side) for side in both)
-    if lower != -upper:
-        raise ModelError(f"actuator {name} of the MJCF: expected equal limits up and down, got {lower}, {upper}")
-    return upper
 
 
 def read_followers(m: Any) -> tuple[Follower, ...]:

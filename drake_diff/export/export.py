@@ -314,7 +314,8 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
     contract = DrakeEngine(model.whole).contract
     made = {"seed": seed, "count": states, "distribution": DISTRIBUTION}
     facts: dict[str, Any] = {**vars(contract), "h": repr(contract.time_step), "gravity": list(contract.gravity)}
-    facts["inputs"] = ", ".join(contract.inputs) or "none"
+    sides = dict(zip(contract.inputs, description.effort_sides.tolist(), strict=True))
+    facts["inputs"] = ", ".join(n + (f" in [{a:g}, {b:g}]" if a != -b else "") for n, (a, b) in sides.items()) or "none"
     readme = README.format(
         name=model.name, target=target, file=f"model{SUFFIX[form]}", about_usd=about_usd,
         settings=(COMMON + OF_TARGET.get(target, "")).format(**facts), left_out=", ".join(left_out) or "none",

@@ -137,6 +137,7 @@ class Description:
     inputs: tuple[str, ...]
     actuated: tuple[str, ...]  # the joint of each input
     effort_limits: Array
+    effort_sides: Array  # (nu, 2) the least and the greatest of each, which problems keep and steps do not
     geometries: tuple[Geometry, ...]
     pairs: tuple[PairContract, ...]
     followers: tuple[Follower, ...] = ()  # of `describe_whole` alone
@@ -233,6 +234,7 @@ def describe_tree(model: Model) -> Description:
         inputs=model.input_names,
         actuated=tuple(joint_names[a.joint().index()] for a in actuators(plant)),
         effort_limits=np.array([a.effort_limit() for a in actuators(plant)]),
+        effort_sides=np.column_stack([model.inputs.lower, model.inputs.upper]),
         geometries=geometries,
         pairs=pairs,
     )

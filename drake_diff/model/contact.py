@@ -306,6 +306,7 @@ def softened(model: Model, contact: SoftContact) -> Model:
         forces=(*model.forces, contact),
         coupling=model.coupling,
         body_forces=model.body_forces,
+        facts=model.file_facts,
         shared=model.shared,
     )
     contact.force(soft.plant, soft.double.context)  # refuses what has no distance

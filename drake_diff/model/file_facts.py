@@ -108,6 +108,7 @@ def _included(element: Element, path: Path) -> Path | None:
     return file if file.name.endswith((".xml", ".mjcf")) and file.is_file() else None
 
 
+Range = tuple[float, float]
 Key = tuple[str, str]  # the names of a model instance and of a joint or link in it
 
 
@@ -134,6 +135,7 @@ class Mimic:
 class JointSays:
     """Of a joint: the effort limit [N or N m] as written, None where there is none.
 
+    `sides` are the least and the greatest effort, where MJCF has them differ: the limit is then the larger size.
     `passive` says that it is not to be driven: so SDF means an effort limit of 0, where it makes a motor of each other.
     `spring` is the stiffness [N m/rad or N/m] and the position at rest of one that Drake's parser does not read,
     `armature` [kg m^2 or kg] MJCF's inertia of a rotor, which Drake has only where an actuator is, and `start` [rad or
@@ -142,6 +144,7 @@ class JointSays:
 
     effort: float | None
     passive: bool = False
+    sides: Range | None = None
     spring: tuple[float, float] | None = None
     armature: float = 0.0
     start: float = 0.0
@@ -177,14 +180,18 @@ class FileFacts:
 
 @dataclass(frozen=True)
 class FileActuator:
-    """An actuator as MuJoCo means it: the limit of its effort at the joint, and what a PD law there would have."""
+    """An actuator as MuJoCo means it: the limits of its effort at the joint, and what a PD law there would have."""
 
     kind: str
     name: str
     joint: str
     read: bool  # by Drake
-    limit: float  # [N or N m]
+    sides: Range  # [N or N m]
     gains: tuple[float, float] | None
+
+    @property
+    def limit(self) -> float:
+        return max(map(abs, self.sides))
 
 
 class Mjcf:
@@ -242,8 +249,10 @@ class Mjcf:
             if kind in SCALAR and says.get("name"):
                 unit = math.pi / 180 if kind == "hinge" and self.degrees else 1.0
                 stiffness = _numbers(says.get("stiffness", "0"))
+                sides = self._range(says, "actuatorfrc")
                 joints[says["name"]] = JointSays(
-                    self._range(says, "actuatorfrc"),
+                    max(map(abs, sides)) if sides else None,
+                    sides=sides,
                     spring=(stiffness[0], unit * _first(says.get("springref", "0")))
                     if len(stiffness) == 1 and stiffness != [0.0]
                     else None,
@@ -263,12 +272,12 @@ class Mjcf:
         ]
         return len(springs) > sum(joint.spring is not None for joint in self.joints.values())
 
-    def _range(self, says: Attributes, name: str) -> float | None:
-        """The larger end of a range that holds; None where none does."""
+    def _range(self, says: Attributes, name: str) -> Range | None:
+        """A range that holds; None where none does."""
         ends = _numbers(says.get(f"{name}range", ""))
         limited = says.get(f"{name}limited", "auto")
         holds = limited == "true" or (limited == "auto" and self.autolimits)
-        return max(abs(end) for end in ends) if len(ends) == 2 and holds else None
+        return (ends[0], ends[1]) if len(ends) == 2 and holds else None
 
     @cached_property
     def actuators(self) -> list[FileActuator]:
@@ -277,22 +286,21 @@ class Mjcf:
 
     def _actuator(self, element: Element) -> FileActuator:
         says = self.attributes(element)
-        gear, kind = abs(_first(says.get("gear", "1"), 1.0)), element.tag
+        gear, kind = _first(says.get("gear", "1"), 1.0), element.tag
         force, control = self._range(says, "force"), self._range(says, "ctrl")
-        gain, gains = _first(says.get("gainprm", "1"), 1.0), None
-        limits = [force]
+        gains, scaled = None, [(force, gear)]
         if kind == "motor":
-            limits.append(control)
-        elif kind == "general" and says.get("biastype", "none") == "none" and control is not None:
-            limits.append(abs(gain) * control)
+            scaled.append((control, gear))
+        elif kind == "general" and says.get("biastype", "none") == "none":
+            scaled.append((control, gear * _first(says.get("gainprm", "1"), 1.0)))
         elif kind == "position":
             gains = gear**2 * _first(says.get("kp", "1"), 1.0), gear**2 * _first(says.get("kv", "0"))
         joint = says.get("joint", "")
-        at_joint = [gear * limit for limit in limits if limit is not None]
-        if joint in self.joints and self.joints[joint].effort is not None:
-            at_joint.append(float(self.joints[joint].effort or 0.0))
-        read = kind in KINDS and bool(joint)
-        return FileActuator(kind, says.get("name", ""), joint, read, min(at_joint, default=math.inf), gains)
+        at_joint = [sorted(factor * end for end in ends) for ends, factor in scaled if ends]
+        if joint in self.joints and (sides := self.joints[joint].sides):
+            at_joint.append(list(sides))
+        lower, upper = max((s[0] for s in at_joint), default=-math.inf), min((s[1] for s in at_joint), default=math.inf)
+        return FileActuator(kind, says.get("name", ""), joint, kind in KINDS and bool(joint), (lower, upper), gains)
 
     def mimics(self, instance: str) -> Iterator[Mimic]:
         """Joints that follow another one linearly, of the robot that is called `instance`."""
@@ -321,8 +329,10 @@ def correct(plant: MultibodyPlant, instance: ModelInstanceIndex, mjcf: Mjcf) -> 
         )
     limits, gains = [], []
     for actuator, meant in zip(motors, says, strict=True):
-        if not math.isclose(actuator.effort_limit(), meant.limit, rel_tol=1e-12):
-            limits.append(f"{actuator.name()} ({meant.limit:g} for {actuator.effort_limit():g})")
+        lower, upper = meant.sides
+        if lower != -upper or not math.isclose(actuator.effort_limit(), upper, rel_tol=1e-12):
+            sides = f"{upper:g}" if lower == -upper else f"{lower:g} to {upper:g}"
+            limits.append(f"{actuator.name()} ({sides} for {actuator.effort_limit():g})")
             actuator.set_effort_limit(meant.limit)
         if meant.gains is not None:
             had = actuator.get_controller_gains()
@@ -414,9 +424,10 @@ def _read_urdf(robot: Element, name: str, facts: FileFacts) -> None:
 
 
 def _read_mjcf(mjcf: Mjcf, name: str, facts: FileFacts) -> None:
-    limits = {actuator.joint: actuator.limit for actuator in mjcf.actuators if math.isfinite(actuator.limit)}
+    driven = {actuator.joint: actuator for actuator in mjcf.actuators if math.isfinite(actuator.limit)}
     for joint, says in mjcf.joints.items():
-        facts.joints[name, joint] = replace(says, effort=limits.get(joint, says.effort))
+        motor = driven.get(joint)
+        facts.joints[name, joint] = replace(says, effort=motor.limit, sides=motor.sides) if motor else says
     facts.followers.update({(name, mimic.follower): mimic for mimic in mjcf.mimics(name)})
     facts.disabled.update(mjcf.disabled)
     facts.left_out.update((name, actuator.joint) for actuator in mjcf.actuators if not actuator.read)

@@ -20,6 +20,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, InputPortIndex, O
 from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff._base.values import plain_numbers
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.model.file_facts import FileFacts
 from drake_diff.model.plant import actuators, bodies, instances, joints, labelled
 
 BODY_FORCES = "body_forces"  # the exported port of those that `load_model` adds
@@ -126,7 +127,8 @@ def add_body_forces(builder: DiagramBuilder, plant: MultibodyPlant, forces: Sequ
             raise UnknownNameError(f"body of the BodyForce {force.name}", got=force.body, known=links)
         if force.name in driven:
             raise InputError("body_forces", got=force.name, expected="no name of an actuator")
-        pose = RigidTransform(RotationMatrix.MakeFromOneVector(np.array(force.direction), 2), np.array(force.point))
+        direction = np.array(force.direction) / np.max(np.abs(force.direction))  # Drake refuses a short one
+        pose = RigidTransform(RotationMatrix.MakeFromOneVector(direction, 2), np.array(force.point))
         propellers.append(PropellerInfo(links[force.body].index(), pose, 1.0, force.moment_ratio))
     system = builder.AddNamedSystem(BODY_FORCES, Propeller(propellers))
     builder.Connect(plant.get_body_poses_output_port(), system.get_body_poses_input_port())
@@ -223,8 +225,8 @@ def _leaf(system: Any, port: Any) -> Any:
     return system
 
 
-def read_inputs(diagram: Diagram, plant: Any, forces: Sequence[BodyForce] = ()) -> Inputs:
-    """The inputs of a diagram with one plant; `forces` are those of its port `BODY_FORCES`.
+def read_inputs(diagram: Diagram, plant: Any, facts: FileFacts, forces: Sequence[BodyForce] = ()) -> Inputs:
+    """The inputs of a diagram with one plant; `forces` are those of its port `BODY_FORCES`, `facts` of its files.
 
     Raises ModelError where a system that acts on the plant has a state of its own, or where the plant's actuation is
     fed inside and there are no other inputs.
@@ -262,7 +264,7 @@ def read_inputs(diagram: Diagram, plant: Any, forces: Sequence[BodyForce] = ()) 
     chosen = {number for number, _, _ in vectors}
     fed = frozenset(i for i in acting if _is_fed(wiring.sources[id(plant), i], chosen))
     driven = [i for i, a in enumerate(actuators(plant)) if whole in fed or ports_of[a.model_instance()] in fed]
-    rows = _rows_of_actuators(plant, [i for i in range(plant.num_actuators()) if i not in driven])
+    rows = _rows_of_actuators(plant, facts, [i for i in range(plant.num_actuators()) if i not in driven])
     input_rows: list[Row] = []
     ports: list[tuple[int, slice]] = []
     first = min(places, default=0)
@@ -312,11 +314,14 @@ def _check_states(systems: Sequence[Any]) -> None:
             )
 
 
-def _rows_of_actuators(plant: Any, which: list[int]) -> list[Row]:
-    motors, names = actuators(plant), list(labelled(actuators(plant)))
-    lower, upper = plant.GetEffortLowerLimits(), plant.GetEffortUpperLimits()
-    units = ["N" if a.joint().type_name() == "prismatic" else "N m" for a in motors]
-    return [(names[i], units[i], float(lower[i]), float(upper[i]), i) for i in which]
+def _rows_of_actuators(plant: Any, facts: FileFacts, which: list[int]) -> list[Row]:
+    motors, rows = actuators(plant), list[Row]()
+    for i, name in enumerate(labelled(motors)):
+        joint, limit = motors[i].joint(), float(motors[i].effort_limit())
+        says = facts.joints.get((plant.GetModelInstanceName(joint.model_instance()), joint.name()))
+        lower, upper = says.sides if says and says.sides else (-limit, limit)
+        rows.append((name, "N" if joint.type_name() == "prismatic" else "N m", lower, upper, i))
+    return [rows[i] for i in which]
 
 
 def _rows_of_port(plant: Any, port: Any, into: set[int], generalized: int, forces: Sequence[BodyForce]) -> list[Row]:

@@ -264,6 +264,7 @@ def refusal(path: Path, message: str, xml: XmlText | None, notes: list[str]) -> 
 
 FORMATS = (".urdf", ".sdf", ".xml", ".mjcf", ".dmd.yaml")
 DRAKES_REFUSALS = (RuntimeError, ValueError, IndexError, OverflowError, SystemExit)  # the last is a failed condition
+OF_SIDES = re.compile(r"Asymmetrical effort limits are not supported")
 OF_A_SPRING = re.compile(r"attribute '(?:stiffness|springref)' found in a 'joint' tag .* ignored")
 
 # Drake says of every half space that deformable bodies will not touch it, which no model here has.
@@ -383,8 +384,8 @@ class _Reading:
         if xml is not None and xml.root.tag == "mujoco":
             mjcf = Mjcf(xml)
             self.notes += correct(self.parser.plant(), instance, mjcf)
-            if not mjcf.has_other_springs:
-                self.notes[:] = [note for note in self.notes if not OF_A_SPRING.search(note)]
+            outdated = (OF_SIDES,) if mjcf.has_other_springs else (OF_SIDES, OF_A_SPRING)
+            self.notes[:] = [note for note in self.notes if not any(meant.search(note) for meant in outdated)]
 
     def in_own_words(self, message: str) -> str:
         """What the parser said, with the files of the user in the place of what it was given."""

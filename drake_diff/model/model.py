@@ -107,6 +107,7 @@ class Model(ShowsItsRepr):
         forces: tuple[AddedForce, ...] = (),
         coupling: JointCoupling | None = None,
         body_forces: tuple[BodyForce, ...] = (),
+        facts: FileFacts | None = None,
         shared: SharedPlant | None = None,
     ):
         self.diagram = diagram
@@ -115,7 +116,7 @@ class Model(ShowsItsRepr):
         self.notes = notes
         self.contact_geometry = contact_geometry  # the route around refused pairs that the user chose
         self.options: dict[str, Any] | None = None  # what `load_model` was called with, None of a user's diagram
-        self.file_facts = FileFacts()  # what the file says that the plant does not keep
+        self.file_facts = FileFacts() if facts is None else facts  # what the file says that the plant does not keep
         self._rebuild = rebuild
         self._others: dict[frozenset[tuple[str, Hashable]], Model] = {}  # the same model with something changed
         self._here = OfThread()
@@ -130,7 +131,7 @@ class Model(ShowsItsRepr):
         self.nv: int = self.plant.num_velocities() if coupling is None else len(coupling.own_v)
         self.nx = self.nq + self.nv
         self.body_forces = body_forces
-        self.inputs = read_inputs(diagram, self.plant, body_forces)
+        self.inputs = read_inputs(diagram, self.plant, self.file_facts, body_forces)
         self.nu: int = len(self.inputs.names)
         self.notes += tuple(f"the exported input {name} does not reach the plant" for name in self.inputs.left_out)
         self.time_step: float = self.plant.time_step()
@@ -213,6 +214,7 @@ class Model(ShowsItsRepr):
                 notes=self.notes,
                 forces=self.forces,
                 body_forces=self.body_forces,
+                facts=self.file_facts,
                 shared=self.shared,
             )
             self._whole.held = self.held
@@ -573,9 +575,9 @@ def load_model(
         rebuild=rebuild,
         coupling=coupling,
         body_forces=body_forces,
+        facts=read.facts,
     )
     model.options = options
-    model.file_facts = read.facts
     return model
 
 
@@ -758,5 +760,14 @@ def _check_plant(model: Model) -> None:
             "the plant has sampled output ports, so its update cannot be evaluated alone: before Finalize call "
             "plant.SetUseSampledOutputPorts(False), or set use_sampled_output_ports=False in its MultibodyPlantConfig"
         )
+    motors: dict[Any, list[str]] = {}
+    for actuator in actuators(plant):
+        motors.setdefault(actuator.joint().index(), []).append(actuator.name())
+    for index, names in motors.items():
+        if len(names) > 1:
+            told = f"the joint {plant.get_joint(index).name()} has {len(names)} actuators, {', '.join(names)}"
+            raise ModelError(
+                f"{where}{told}, of which Drake's step applies the last alone: leave one with the limits of all"
+            )
     if plant.num_velocities() == 0:
         raise ModelError(f"{where}the model cannot move: it has no joints and no free body")

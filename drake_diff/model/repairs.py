@@ -21,7 +21,7 @@ impulses are those at its own v', which differs from E v'_own by what its near-r
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -101,6 +101,8 @@ def add_actuators(plant: MultibodyPlant, asked: Actuated, facts: FileFacts) -> t
         says = facts.joints.get(_key(plant, joint))
         given = asked[name] if isinstance(asked, dict) else None if says is None else says.effort
         limit = given if given is not None and given > 0 else np.inf
+        if given_here and says is not None:
+            facts.joints[_key(plant, joint)] = replace(says, sides=None)
         if joint.index() in driven:
             notes += _limit_again(driven[joint.index()], limit) if given_here else []
             continue

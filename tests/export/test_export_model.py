@@ -50,6 +50,21 @@ def test_the_written_file_steps_as_the_hand_calculation_does(load, tmp_path, tar
     np.testing.assert_allclose(x, [0.686908411253, -1.309158874737], atol=1e-11)  # as many digits as are known
 
 
+def test_a_motor_that_only_pushes_stays_so(tmp_path):
+    (tmp_path / "m.xml").write_text(
+        '<mujoco model="m"><worldbody><body><joint name="j"/><geom size="0.1" mass="1"/></body></worldbody>'
+        '<actuator><motor joint="j" gear="4" ctrlrange="0 1"/></actuator></mujoco>'
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)  # the gear
+        model = dd.load_model(tmp_path / "m.xml", time_step=0.01)
+        export_model(model, tmp_path / "out", target="mjcf")
+        again = dd.load_model(tmp_path / "out" / "model.xml", time_step=0.01)
+    assert (again.inputs.lower, again.inputs.upper) == (0.0, 4.0)
+    export_model(model, tmp_path / "urdf", target="urdf")
+    assert "in [0, 4]" in (tmp_path / "urdf" / "README.md").read_text()  # URDF cannot say it
+
+
 def test_the_contract_is_drake_s_in_strict_json(load, tmp_path):
     export_model(load("cart_pole.urdf"), tmp_path / "out", target="gazebo", states=4, seed=9)
 

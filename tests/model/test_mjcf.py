@@ -124,6 +124,18 @@ def test_a_random_file_is_read_as_mujoco_reads_it(tmp_path, seed):
     assert gap_to_mujoco(text, model, random) < AGREE
 
 
+def effort_range(path):
+    """What MuJoCo makes of the largest controls of the only joint's motor."""
+    mujoco = pytest.importorskip("mujoco")
+    other = mujoco.MjModel.from_xml_path(str(path))
+    data, found = mujoco.MjData(other), []
+    for control in (-1e6, 1e6):
+        data.ctrl[:] = control
+        mujoco.mj_forward(other, data)
+        found.append(data.qfrc_actuator[0])
+    return min(found), max(found)
+
+
 HINGE = f'<body name="a" pos="0 0 1"><joint name="j" axis="0 1 0" {{}}/>{GEOM}{{}}</body>'
 
 
@@ -135,17 +147,50 @@ HINGE = f'<body name="a" pos="0 0 1"><joint name="j" axis="0 1 0" {{}}/>{GEOM}{{
         ("", '<motor joint="j" gear="3" ctrlrange="-2 2" forcerange="-1 1"/>', 3.0, None),
         ("", '<motor joint="j" ctrlrange="-2 2" ctrllimited="false"/>', math.inf, None),
         ('actuatorfrcrange="-5 5"', '<motor joint="j" gear="3" ctrlrange="-2 2"/>', 5.0, None),
+        ("", '<motor joint="j" gear="4" ctrlrange="0 1"/>', 4.0, None),
+        ("", '<motor joint="j" gear="-4" ctrlrange="0 1"/>', 4.0, None),
+        ("", '<motor joint="j" gear="3" ctrlrange="-1 2" forcerange="-5 1"/>', 3.0, None),
+        ('actuatorfrcrange="-1 5"', '<motor joint="j" gear="3" ctrlrange="-2 4"/>', 5.0, None),
         ("", '<position joint="j" kp="7" kv="2" ctrlrange="-2 2"/>', math.inf, (7.0, 2.0)),
         ("", '<position joint="j" kp="7" kv="2" gear="3" forcerange="-2 2"/>', 6.0, (63.0, 18.0)),
     ],
 )
 def test_an_effort_is_limited_at_the_joint(tmp_path, attributes, actuator, limit, gains):
     """The torque is gear times force, and a position servo of gear g has the stiffness g^2 kp at the joint."""
-    model = load(write(tmp_path, HINGE.format(attributes, ""), more=f"<actuator>{actuator}</actuator>"))
+    path = write(tmp_path, HINGE.format(attributes, ""), more=f"<actuator>{actuator}</actuator>")
+    model = load(path)
     (found,) = actuators(model.plant)
-    assert found.effort_limit() == limit
+    assert found.effort_limit() == max(-model.inputs.lower[0], model.inputs.upper[0]) == limit
+    if gains is None:
+        sides = effort_range(path)
+        assert sides == (model.inputs.lower[0], model.inputs.upper[0]) or limit == math.inf
     if gains:
         assert (found.get_controller_gains().p, found.get_controller_gains().d) == gains
+
+
+def test_a_motor_that_only_pushes_is_planned_so(tmp_path):
+    """MuJoCo, which cuts controls at their range, goes where the plan goes: its step is Drake's, damping implicit."""
+    mujoco = pytest.importorskip("mujoco")
+    body = '<body><joint name="j" axis="0 1 0" damping="0.1"/><geom size="0.02" pos="0 0 -0.5" mass="1"/></body>'
+    actuator = '<actuator><motor joint="j" gear="4" ctrlrange="0 1"/></actuator>'
+    path = write(tmp_path, body, more=actuator, head='<mujoco model="m"><option timestep="0.02"/>')
+    model, other = load(path, time_step=0.02), mujoco.MjModel.from_xml_path(str(path))
+    costs = {"running_cost": dd.QuadraticCost(R=[[1.0]])}
+    solution = dd.solve(dd.Problem(model, x0=[0, 0], x_goal=[-0.5, 0], num_steps=60, **costs))
+    assert solution.success
+    assert solution.us.min() >= 0
+    data = mujoco.MjData(other)
+    for u in solution.us:
+        data.ctrl[:] = u / 4
+        mujoco.mj_step(other, data)
+    np.testing.assert_allclose(data.qpos, -0.5, atol=1e-3)
+
+
+def test_two_motors_on_a_joint_are_refused(tmp_path):
+    """Drake's step drops the torque of the first, with a derivative of 0 that agrees with differences."""
+    motors = '<actuator><motor name="big" joint="j" gear="2"/><motor name="small" joint="j" gear="3"/></actuator>'
+    with pytest.raises(ModelError, match="the joint j has 2 actuators, big, small"):
+        load(write(tmp_path, HINGE.format("", ""), more=motors))
 
 
 def test_a_spring_pulls_to_its_rest_in_the_step(tmp_path):
