@@ -1,12 +1,13 @@
-"""How far the pieces of a robot are from a ball, from a box and from each other, as functions of the state.
+"""How far the shapes of a robot are from a ball, from a box and from each other, as functions of the state.
 
 Each is a function of x (nx,) in ordinary arithmetic, for floats, AutoDiffXd and symbols, with one number a row, and for
 many states at once `values`, and `linearize` with exact derivatives: the slope of a distance is that of its nearest
 points, held where they are on their pieces.
 
-The formulas of points, segments and boxes have no branch; a capsule's distance is that of its segment less its radius.
-All are exact and continuous. Their slopes jump where another feature becomes the nearest one: nowhere for a point and a
-segment that are apart, between parallel segments, and on the planes inside a box that part its faces.
+From a ball and a box they are capsules that contain its shapes; from each other they are Drake's own shapes, see
+`OfShapes`. The formulas of points, segments and boxes have no branch; a capsule's distance is that of its segment less
+its radius. All are exact and continuous. Their slopes jump where another feature becomes the nearest one: nowhere for a
+point and a segment that are apart, between parallel segments, and on the planes inside a box that part its faces.
 """
 
 from collections.abc import Sequence
@@ -14,10 +15,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from pydrake.autodiffutils import ExtractValue
 
 from drake_diff._base.arrays import Array, Indices
+from drake_diff._base.autodiff import chain_rows
 from drake_diff.exceptions import InputError
-from drake_diff.mechanics.cover import Piece
+from drake_diff.mechanics.cover import Piece, Solid, with_whole_shapes
 from drake_diff.mechanics.forward_kinematics import ForwardKinematics
 from drake_diff.mechanics.quantities import PLACE
 from drake_diff.model.model import Model
@@ -215,6 +218,84 @@ class OfPairs(Clearance):
         a, b = self._nearest(frames)
         way = (a - b) / length(a - b)[..., None]
         return [(a, way), (b, -way)]
+
+
+class OfShapes(Clearance):
+    """Of two shapes from each other, a row for each pair: Drake's signed distance, below 0 by the depth of an overlap.
+
+    The capsules around two shapes are never further apart than these. Where the capsules are further apart than `far`
+    their distance stands for that of the shapes, which takes a hundredth of the time; between `near` and `far` it goes
+    over into it. So no row is above the distance of its shapes, and those below `near` are that distance. Of meshes
+    Drake takes the convex hull. Of two balls or capsules ours is exact. Shapes that are only drawn are their capsules.
+    """
+
+    def __init__(
+        self, model: Model, kinematics: ForwardKinematics, pairs: Sequence[tuple[Solid, Solid]], near: float, far: float
+    ):
+        sides = [in_rows([pair[i].pieces[0] for pair in pairs]) for i in (0, 1)]
+        super().__init__(model, kinematics, [f"{a.body} and {b.body}" for a, b in pairs], *sides)
+        self.pairs, self.near, self.far, self.whole = tuple(pairs), near, far, with_whole_shapes(model)
+        self.exact = np.array(
+            [None not in (a.geometry, b.geometry) and not (a.is_round and b.is_round) for a, b in pairs], dtype=bool
+        )
+        self.capsules = OfPairs(model, kinematics, [(p, r) for a, b in pairs for p in a.pieces for r in b.pieces])
+        self.first = np.cumsum([0, *(len(a.pieces) * len(b.pieces) for a, b in pairs)])[:-1]
+
+    def __call__(self, x: Any) -> Any:
+        if np.asarray(x).dtype == float:
+            return self.values(np.asarray(x)[None])[0]
+        values, slopes = self.linearize(ExtractValue(np.asarray(x).reshape(-1, 1)).T)
+        return chain_rows(values[0], slopes[0], x)
+
+    def values(self, xs: Array) -> Array:
+        return self._mixed(xs, np.minimum.reduceat(self.capsules.values(xs), self.first, axis=1))[0]
+
+    def linearize(self, xs: Array) -> tuple[Array, Array]:
+        of_capsules, slopes = self.capsules.linearize(xs)
+        ends = [*self.first[1:], of_capsules.shape[1]]
+        nearest = [a + np.argmin(of_capsules[:, a:b], axis=1) for a, b in zip(self.first, ends, strict=True)]
+        rows = np.arange(len(xs))[:, None], np.column_stack(nearest)
+        values, by_capsules, by_shapes, points, way = self._mixed(xs, of_capsules[rows])
+        q, total = xs[:, : self.model.nq], slopes[rows] * by_capsules[..., None]
+        frames = self.kinematics(q)
+        for side, nearest_points, sign in zip(self.sides, points, (1.0, -1.0), strict=True):
+            total += by_shapes[..., None] * self.kinematics.pushes(q, frames, side.at, nearest_points, sign * way)
+        return values, total
+
+    def moved(self, xs: Array) -> Array:
+        frames = self.kinematics(xs[:, : self.model.nq])
+        far = np.zeros((len(xs) - 1, len(self.pairs)))
+        for i, side in enumerate(self.sides):
+            corners = np.array([pair[i].corners for pair in self.pairs])  # (m, 8, 3), which contain it
+            R, p = frames[0][:, side.at], frames[1][:, side.at]
+            far += np.max(
+                np.linalg.norm(np.diff(corners @ R.swapaxes(-1, -2) + p[:, :, None], axis=0), axis=-1), axis=-1
+            )
+        return far
+
+    def _mixed(self, xs: Array, least: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """The rows (K, m), where the capsules are `least` (K, m) apart, and what their slopes are made of.
+
+        The derivatives (K, m) of a row by the distances of capsules and of shapes, the shapes' nearest points
+        (2, K, m, 3) in the world, and the way (K, m, 3) in which the distance grows as the first of them moves.
+        """
+        share = np.clip((self.far - least) / (self.far - self.near), 0.0, 1.0) * self.exact
+        weight, slope = share**2 * (3 - 2 * share), -6 * share * (1 - share) / (self.far - self.near)
+        apart, points, way = least.copy(), np.zeros((2, *least.shape, 3)), np.zeros((*least.shape, 3))
+        twin = self.whole.double
+        for k in np.flatnonzero(np.any(weight > 0, axis=1) & np.all(np.isfinite(xs), axis=1)):
+            twin.set_state(xs[k])
+            query = twin.plant.get_geometry_query_input_port().Eval(twin.context)
+            for i in np.flatnonzero(weight[k] > 0):
+                a, b = (solid.geometry for solid in self.pairs[i])
+                pair = query.ComputeSignedDistancePairClosestPoints(a, b)
+                points[:, k, i] = query.GetPoseInWorld(a) @ pair.p_ACa, query.GetPoseInWorld(b) @ pair.p_BCb
+                apart[k, i], way[k, i] = pair.distance, pair.nhat_BA_W
+                if not np.all(np.isfinite(way[k, i])):  # of shapes that just touch
+                    way[k, i] = query.GetPoseInWorld(a).translation() - query.GetPoseInWorld(b).translation()
+                    way[k, i] /= length(way[k, i])
+        values = least + weight * (apart - least)
+        return values, 1 - weight + slope * (apart - least), weight, points, way
 
 
 def from_ball(

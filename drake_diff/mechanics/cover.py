@@ -51,13 +51,46 @@ class Piece:
         return float(np.sum((self.end - self.start) ** 2))
 
 
-@dataclass(frozen=True)
-class Cover:
-    """The pieces of all bodies; `bare` are bodies that have none, `doubts` say what they may not contain."""
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A shape of a body, and the pieces that contain it."""
 
     pieces: tuple[Piece, ...]
+    geometry: Any  # Drake's, in `with_whole_shapes`; None of a shape that is only drawn and of a skeleton
+
+    @property
+    def body(self) -> str:
+        return self.pieces[0].body
+
+    @property
+    def link(self) -> int:
+        return self.pieces[0].link
+
+    @property
+    def is_round(self) -> bool:
+        """Whether its piece is the shape."""
+        return self.pieces[0].source in ("sphere", "capsule")
+
+    @property
+    def corners(self) -> Array:
+        """(8, 3) of a box in the link's frame that contains it."""
+        ends = np.array([(p.start, p.end) for p in self.pieces])
+        radii = np.array([p.radius for p in self.pieces])[:, None, None]
+        low, high = np.min(ends - radii, axis=(0, 1)), np.max(ends + radii, axis=(0, 1))
+        return np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, 8).T
+
+
+@dataclass(frozen=True)
+class Cover:
+    """The shapes of all bodies; `bare` are bodies that have none, `doubts` say what the pieces may not contain."""
+
+    solids: tuple[Solid, ...]
     bare: tuple[str, ...]
     doubts: tuple[str, ...]
+
+    @property
+    def pieces(self) -> tuple[Piece, ...]:
+        return tuple(piece for solid in self.solids for piece in solid.pieces)
 
 
 def cover_of(model: Model, kinematics: ForwardKinematics) -> Cover:
@@ -66,20 +99,22 @@ def cover_of(model: Model, kinematics: ForwardKinematics) -> Cover:
 
 
 def _cover(model: Model, kinematics: ForwardKinematics) -> Cover:
-    whole, pieces, bare, unread = _with_whole_shapes(model), list[Piece](), list[str](), list[str]()
+    whole, solids, bare, unread = with_whole_shapes(model), list[Solid](), list[str](), list[str]()
     inspector = whole.double.inspector
     for label, body in labelled(bodies(whole.plant)).items():
         link, pose = kinematics.on[label]
         shapes = [] if inspector is None else list(_of_shapes(whole, inspector, body, unread))
-        shapes = shapes or list(_skeleton(whole, body))
-        pieces += [replace(p, body=label, link=link, start=pose @ p.start, end=pose @ p.end) for p in shapes]
+        for geometry, pieces in shapes or [(None, [bone]) for bone in _skeleton(whole, body)]:
+            placed = (replace(p, body=label, link=link, start=pose @ p.start, end=pose @ p.end) for p in pieces)
+            solids.append(Solid(tuple(placed), geometry))
     for number, rigid in enumerate(kinematics.links):
-        if number not in kinematics.between and all(p.link != number for p in pieces):
+        if number not in kinematics.between and all(solid.link != number for solid in solids):
             bare.append(rigid.joint.body)
-    return Cover(tuple(pieces), tuple(bare), (*unread, *_doubts(pieces, bare)))
+    doubts = _doubts([piece for solid in solids for piece in solid.pieces], bare)
+    return Cover(tuple(solids), tuple(bare), (*unread, *doubts))
 
 
-def _with_whole_shapes(model: Model) -> Model:
+def with_whole_shapes(model: Model) -> Model:
     """The model with the shapes that its file gives: what it touches with may be spheres inside them, or nothing.
 
     A user's diagram has what it has.
@@ -100,8 +135,8 @@ def _doubts(pieces: Sequence[Piece], bare: Sequence[str]) -> Iterator[str]:
         yield f"{', '.join(bare)}: no shape, no mass and no next joint, not kept clear of anything"
 
 
-def _of_shapes(model: Model, inspector: Any, body: Any, unread: list[str]) -> Iterator[Piece]:
-    """Of the body's collision shapes, or of those that are drawn where there are none, in the body's frame.
+def _of_shapes(model: Model, inspector: Any, body: Any, unread: list[str]) -> Iterator[tuple[Any, list[Piece]]]:
+    """The body's collision shapes, or those that are drawn where there are none, and their pieces in its frame.
 
     A sentence is added to `unread` where shapes of a kind cannot be read.
     """
@@ -111,13 +146,14 @@ def _of_shapes(model: Model, inspector: Any, body: Any, unread: list[str]) -> It
     for role in (Role.kProximity, Role.kIllustration):
         geometries = inspector.GetGeometries(frame, role)
         try:
-            pieces = [p for g in geometries for p in _around(inspector.GetShape(g), inspector.GetPoseInFrame(g))]
+            around = [(g, list(_around(inspector.GetShape(g), inspector.GetPoseInFrame(g)))) for g in geometries]
         except (ModelError, RuntimeError) as error:
             kind = "collision shapes" if role == Role.kProximity else "drawn shapes"
             unread.append(f"{body.name()}: its {kind} cannot be read ({error}), so others stand for them")
             continue
-        if pieces:
-            yield from pieces
+        shapes = [(g if role == Role.kProximity else None, pieces) for g, pieces in around if pieces]
+        if shapes:
+            yield from shapes
             return
 
 

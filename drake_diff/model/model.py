@@ -760,14 +760,12 @@ def _check_plant(model: Model) -> None:
             "the plant has sampled output ports, so its update cannot be evaluated alone: before Finalize call "
             "plant.SetUseSampledOutputPorts(False), or set use_sampled_output_ports=False in its MultibodyPlantConfig"
         )
-    motors: dict[Any, list[str]] = {}
-    for actuator in actuators(plant):
-        motors.setdefault(actuator.joint().index(), []).append(actuator.name())
-    for index, names in motors.items():
-        if len(names) > 1:
-            told = f"the joint {plant.get_joint(index).name()} has {len(names)} actuators, {', '.join(names)}"
-            raise ModelError(
-                f"{where}{told}, of which Drake's step applies the last alone: leave one with the limits of all"
-            )
+    driven = [actuator.joint().index() for actuator in actuators(plant)]
+    for index in {index for index in driven if driven.count(index) > 1}:
+        names = ", ".join(a.name() for a in actuators(plant) if a.joint().index() == index)
+        raise ModelError(
+            f"{where}expected one actuator on the joint {plant.get_joint(index).name()}, got {names}: Drake's step "
+            "applies the last alone"
+        )
     if plant.num_velocities() == 0:
         raise ModelError(f"{where}the model cannot move: it has no joints and no free body")

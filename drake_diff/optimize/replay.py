@@ -37,7 +37,7 @@ from drake_diff.motion.rollout import CONTINUOUS, Policy, Rollout, rollout
 from drake_diff.optimize.checks import Check, check
 from drake_diff.optimize.problem.dynamics import units_of
 from drake_diff.optimize.problem.goals import GoalConstraint
-from drake_diff.optimize.problem.obstacles import ClearanceConstraint, along_steps, clearances
+from drake_diff.optimize.problem.obstacles import ClearanceConstraint, SelfCollision, along_steps, clearances
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.terminal import TerminalConstraint
 from drake_diff.optimize.transcription.collocation import EFFORT_WEIGHT, FINAL_WEIGHT
@@ -607,6 +607,10 @@ def clearance_checks(plan: ReplayPlan, motion: MeasuredMotion) -> Iterator[Check
     """How near the motion comes to obstacles, at its states or between them: it may use the margin up."""
     for c in clearances(plan.problem.kept):
         yield c.nearest(*along_steps(motion.times, motion.xs), c.tolerance)
+    for goal in plan.problem.goals:
+        if isinstance(goal, SelfCollision):
+            for pair in goal.left_out(plan.problem.model):
+                yield check("apart", pair, np.nan, goal.margin, "m", "undecided")
 
 
 def penetration_check(model: Model, motion: MeasuredMotion) -> Check:

@@ -144,3 +144,19 @@ def state_in_contact(model, random, depth=1e-3, speed=0.2):
     (base,) = plant.GetFloatingBaseBodies()
     x[plant.get_body(base).floating_positions_start() + 6] -= min(heights) - FOOT + depth
     return x
+
+
+def arm_beside_table(folder, link, table, *, at, scale=1.0, **options):
+    """Two links of a shape on hinges about y and z, and a table beside them that is welded to the world."""
+    inertial = "<inertial><mass>1</mass></inertial>"
+    shape = "<collision name='c'><pose>{0} 0 0 0 1.5707963267948966 0</pose><geometry>{1}</geometry></collision>"
+    links, joints, middle = "", "", 0.15 * scale
+    for name, parent, axis, x in (("upper", "world", "0 1 0", 0.0), ("lower", "upper", "0 0 1", 0.32 * scale)):
+        links += f"<link name='{name}'><pose>{x} 0 0 0 0 0</pose>{inertial}{shape.format(middle, link)}</link>"
+        joints += f"<joint name='at {name}' type='revolute'><parent>{parent}</parent><child>{name}</child>"
+        joints += f"<axis><xyz>{axis}</xyz></axis></joint>"
+    top = f"<link name='top'><pose>{' '.join(map(str, at))} 0 0 0</pose>{inertial}<collision name='c'><geometry>{table}"
+    top += "</geometry></collision></link><joint name='t' type='fixed'><parent>world</parent><child>top</child></joint>"
+    path = folder / "scene.sdf"
+    path.write_text(f"<sdf version='1.9'><model name='m'>{links}{joints}{top}</model></sdf>")
+    return dd.load_model(path, time_step=0.02, contact=False, **options)

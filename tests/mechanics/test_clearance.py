@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.models import MODELS, Plant, contact_properties, robot_file
-from helpers.robots import example_robot, state_in_range
+from helpers.robots import arm_beside_table, example_robot, state_in_range
 from helpers.table import each_row, slow_after
 from pydrake.autodiffutils import InitializeAutoDiff
 from pydrake.geometry import (
@@ -373,6 +373,56 @@ def test_the_way_of_a_step_is_along_the_rates_of_positions(kinds):
     earlier = np.concatenate([x[: model.nq] - dt * rates, x[model.nq :]])
     found = Swept(clearance, np.array([dt])).values(x[None])
     np.testing.assert_allclose(found, clearance.values(earlier[None]), rtol=0, atol=CLOSED)
+
+
+def surface(kind, sizes, random, count=4000):
+    """(P, 3) points on a box, and on a cylinder along z, edges and rims among them."""
+    at = random.uniform(-1, 1, (count, 3))
+    if kind == "box":
+        for row in at:
+            row[random.integers(3)] = np.sign(random.standard_normal())
+        at[: count // 2] = np.where(np.abs(at[: count // 2]) > 0.6, np.sign(at[: count // 2]), at[: count // 2])
+        return at * sizes / 2
+    angle, height = np.pi * at[:, 0], np.where(np.abs(at[:, 1]) > 0.3, np.sign(at[:, 1]), at[:, 1])
+    return np.column_stack([sizes[0] * np.cos(angle), sizes[0] * np.sin(angle), height * sizes[1] / 2])
+
+
+@pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
+@each_row(
+    "kind, sizes, scale",
+    [("box", (0.06, 0.08, 0.26), 1.0), ("cylinder", (0.03, 0.28), 1.0), ("box", (0.06, 0.08, 0.26), 0.05)],
+)
+def test_links_and_a_table_are_as_far_apart_as_their_surfaces(tmp_path, kind, sizes, scale):
+    """The table is wide and thin: capsules around it are 0.2 m high. Points miss the nearest by 2 mm of metres."""
+    random, sizes, table = np.random.default_rng(4), scale * np.array(sizes), scale * np.array([1.4, 1.2, 0.05])
+    words = f"<radius>{sizes[0]}</radius><length>{sizes[-1]}</length>" if kind == "cylinder" else ""
+    words = words or f"<size>{' '.join(map(str, sizes))}</size>"
+    top = f"<box><size>{' '.join(map(str, table))}</size></box>"
+    at = scale * np.array([0.1, 0, -0.14])
+    model = arm_beside_table(tmp_path, f"<{kind}>{words}</{kind}>", top, at=at, scale=scale)
+    goal = dd.SelfCollision(margin=0.02 * scale)
+    (constraint,) = goal.bind(model)
+    clearance, plant = constraint.clearance, model.plant
+    assert clearance.labels == ("upper and top", "lower and top")  # neighbours but for the table
+    context, turned = plant.CreateDefaultContext(), RigidTransform(RollPitchYaw(0, np.pi / 2, 0), [0.15 * scale, 0, 0])
+    exact = 0
+    for _ in range(20):
+        q = random.uniform([-0.6, -2], [0.4, 2])
+        values, slopes = (rows[0] for rows in clearance.linearize(np.concatenate([q, [0, 0]])[None]))
+        plant.SetPositions(context, q)
+        for name, value in zip(("upper", "lower"), values, strict=True):
+            pose = plant.EvalBodyPoseInWorld(context, plant.GetBodyByName(name)) @ turned
+            least = np.min(to_box((pose @ surface(kind, sizes, random).T).T - at, table / 2))
+            if least > 0:
+                assert value <= least + 1e-5  # Drake's search ends within 1e-6 m
+                assert value >= min(least - 2e-3 * scale, clearance.near)
+                exact += value < clearance.near
+        here, h = np.concatenate([q, [0, 0]]), 1e-3
+        ahead, behind = (clearance.values(here + way * h * np.eye(4)).T for way in (1, -1))
+        sides = np.sort([(ahead - values[:, None]) / h, (values[:, None] - behind) / h], axis=0)
+        apart, near = values > 1e-3 * scale, 4e-3 + 1e-2 * scale  # rounding of Drake's search, and curvature
+        assert np.all((sides[0] - near <= slopes) & (slopes <= sides[1] + near), axis=1)[apart].all()
+    assert exact > 5
 
 
 @pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.robots import example_robot
+from helpers.robots import arm_beside_table, example_robot
 from helpers.table import each_row
 from pydrake.math import RigidTransform
 
@@ -216,6 +216,49 @@ def test_neighbours_and_what_always_overlaps_are_left_out_of_self_collision():
     some = dd.SelfCollision(ignore=[("wrist_3_link", "upper_arm_link")])
     fewer = dd.Problem(model, x0=x0, num_steps=5, final_cost=lambda x: x[0] ** 2, goals=[some])
     assert set(fewer.kept_goals[0].clearance.labels) == labels - {"upper_arm_link and wrist_3_link"}
+
+
+BAR, TOP = "<box><size>0.04 0.04 0.26</size></box>", "<box><size>1 1 0.05</size></box>"
+
+
+def reach(folder, at, *, margin=0.01, ignore=(), to=(0.3, 0.5)):
+    """From a table at the height of its start, or beyond it."""
+    model = arm_beside_table(folder, BAR, TOP, at=at, actuators="all", gravity=[0, 0, 0])
+    goal, cost = dd.SelfCollision(margin=margin, ignore=ignore), dd.QuadraticCost(R=np.eye(2))
+    return dd.Problem(model, x0=np.zeros(4), x_goal=[*to, 0, 0], num_steps=20, running_cost=cost, goals=[goal])
+
+
+def overlaps(model, xs):
+    """Whether any two shapes that Drake lets collide do so on the way between some of xs, by its penetration query."""
+    twin, found = model.changed(contact=True).double, False
+    for before, after in pairwise(xs):
+        for share in np.linspace(0, 1, 10):
+            twin.set_state((1 - share) * before + share * after)
+            found |= twin.overlaps()
+    return found
+
+
+@pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
+def test_a_pair_that_overlaps_at_the_start_leaves_a_plan_undecided(tmp_path):
+    """The table goes through the lower link: nothing says that the plan may."""
+    at = (0.9, 0, 0.0)
+    solution = dd.solve(reach(tmp_path, at))
+    assert not solution.success
+    assert "lower and top overlap where the file has them" in solution.message
+    assert dd.solve(reach(tmp_path, at, ignore=[("lower", "top")])).success
+
+
+@pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
+def test_a_plan_passes_over_a_table_and_not_through_it(tmp_path):
+    """Half a metre wide and 0.05 m high, 0.1 m below the arm: capsules around it would reach to where the arm is."""
+    solution = dd.solve(reach(tmp_path, (0.3, 0, -0.1), to=(0.05, 1.0)))
+    assert solution.success, solution
+    with pytest.raises(InputError, match=r"x_goal: .*and top come .* nearer than their margin"):
+        reach(tmp_path, (0.3, 0, -0.1), to=(0.5, 0.0))
+    around = dd.solve(reach(tmp_path, (0.5, 0, -0.45), to=(2.5, 0.0)))  # from above it to below it
+    assert around.success
+    assert overlaps(around.problem.model, np.linspace(around.xs[0], around.xs[-1], 100))
+    assert not overlaps(around.problem.model, around.xs)
 
 
 def test_a_folded_arm_is_refused_by_self_collision():

@@ -16,11 +16,11 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.mechanics.clearance import Clearance, FromBox, OfPairs, Swept, from_ball
-from drake_diff.mechanics.cover import Piece, cover_of
+from drake_diff.mechanics.clearance import Clearance, FromBox, OfPairs, OfShapes, Swept, from_ball
+from drake_diff.mechanics.cover import Piece, Solid, cover_of
 from drake_diff.mechanics.forward_kinematics import ForwardKinematics, forward_kinematics
 from drake_diff.model.model import Model
-from drake_diff.model.plant import bodies, labelled
+from drake_diff.model.plant import bodies, joints, labelled
 from drake_diff.model.tangent import any_state
 from drake_diff.optimize.checks import Check, check
 from drake_diff.optimize.problem.constraint import Constraint
@@ -33,6 +33,7 @@ MOST_SEEN, MOST_HALVINGS = 20_000, 30  # states, and halvings of the time betwee
 ARC = 1.05  # over its chord: the way of a point while all joints together turn by TURN
 TURN = 1.0  # [rad]
 RED = (0.78, 0.2, 0.16, 0.55)  # red, green, blue, opacity
+EXACT = 0.05  # [m] beyond the margin: nearer, the distance of two links is exact
 LOOKED_AT = 1000  # random states in which two links that always overlap are found
 UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -156,7 +157,9 @@ class _Solid(Obstacle):
 
     def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
         kinematics, center = _kinematics(model), np.array(self.center)
-        pieces = _near(kinematics, _pieces(model, kinematics, self.links), center, self.extent + self.margin)
+        moving = [solid for solid in _solids(model, kinematics, self.links) if solid.link >= 0]
+        pieces = [piece for solid in moving for piece in solid.pieces]
+        pieces = _near(kinematics, pieces, center, self.extent + self.margin)
         clearance = self.clearance(model, kinematics, pieces, center)
         return self.kept_clear(clearance, f"clear of {self.label}", f"obstacle {self.label}")
 
@@ -259,8 +262,10 @@ class BoxObstacle(_Solid):
 class SelfCollision(Obstacle):
     """That the links of a robot keep clear of each other, at every knot of a plan and in between.
 
-    Left out are links next to each other, and pairs whose capsules overlap in the posture that the file gives or in
-    every one of 1,000 random states.
+    Links are their collision shapes, of meshes the convex hulls, at Drake's signed distance, whatever `contact` the
+    model has; those without are capsules as for a `SphereObstacle`. Left out are links that a joint ties to each other
+    and what is welded together. Pairs that overlap in the posture that the file gives, or in every one of 1,000 random
+    states, cannot be kept apart: a plan is then undecided, unless they are in `ignore`.
 
     Args:
         margin, weight: As those of a `SphereObstacle`.
@@ -285,57 +290,78 @@ class SelfCollision(Obstacle):
         self._set(ignore=tuple(_pair("SelfCollision.ignore", pair) for pair in self.ignore))
 
     def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
-        return self._kept_but(model, self._pairs(model)[1])
+        overlapping = set(self.left_out(model))
+        pairs = [pair for pair in self._pairs(model) if _bodies(*pair) not in overlapping]
+        return self.kept_clear(self._apart(model, pairs), "clear of itself") if pairs else ()
 
     def apart_but_at(self, model: Model, xs: Array) -> tuple[ClearanceConstraint, ...]:
-        """What keeps all pairs of `model` apart but those that are nearer than the margin at one of xs (K, nx).
+        """What keeps the capsules of all pairs of `model` apart but those nearer than the margin at one of xs (K, nx).
 
         What stands for a link contains its shapes and sticks out of some: what is near there need not touch.
         """
-        pairs = self._pairs(model)[0]
-        near = np.any(OfPairs(model, _kinematics(model), pairs).values(xs) < self.margin, axis=0) if pairs else ()
-        return self._kept_but(model, {_bodies(pair) for pair, close in zip(pairs, near, strict=True) if close})
-
-    def _kept_but(self, model: Model, touching: set[frozenset[str]]) -> tuple[ClearanceConstraint, ...]:
-        pairs = [pair for pair in self._pairs(model)[0] if _bodies(pair) not in touching]
-        return self.kept_clear(OfPairs(model, _kinematics(model), pairs), "clear of itself")
+        pairs = [(p, r) for a, b in self._pairs(model) for p in a.pieces for r in b.pieces]
+        overlapping, kinematics = set(self.left_out(model)), _kinematics(model)
+        near = np.any(OfPairs(model, kinematics, pairs).values(xs) < self.margin, axis=0) if pairs else ()
+        overlapping |= {_bodies(*pair) for pair, close in zip(pairs, near, strict=True) if close}
+        pairs = [pair for pair in pairs if _bodies(*pair) not in overlapping]
+        return self.kept_clear(OfPairs(model, kinematics, pairs), "clear of itself")
 
     def left_out(self, model: Model) -> tuple[str, ...]:
         """The pairs of bodies of `model` that overlap by their shapes and are not kept apart: "a and b"."""
-        return tuple(sorted(" and ".join(sorted(pair)) for pair in self._pairs(model)[1]))
+        pairs = self._pairs(model)
+        key = ("overlapping", tuple(_bodies(*pair) for pair in pairs))
+        return model.cache(key, lambda: _overlapping(model, lambda some: self._apart(model, some), pairs))
 
-    def _pairs(self, model: Model) -> tuple[list[tuple[Piece, Piece]], set[frozenset[str]]]:
-        """The pairs of pieces that may touch, and the pairs of bodies among them that always do."""
-        kinematics, ignored = _kinematics(model), {frozenset(pair) for pair in self.ignore}
+    def _apart(self, model: Model, pairs: Sequence[tuple[Solid, Solid]]) -> OfShapes:
+        near = self.margin + EXACT
+        return OfShapes(model, _kinematics(model), pairs, near, near + EXACT)
+
+    def _pairs(self, model: Model) -> list[tuple[Solid, Solid]]:
+        """The pairs of shapes that may touch, but those of `ignore`."""
+        kinematics, ignored = _kinematics(model), {_pair_name(*pair) for pair in self.ignore}
         _check_bodies(model, "SelfCollision.ignore", [name for pair in self.ignore for name in pair])
-        pairs = [
-            pair
-            for pair in combinations(_pieces(model, kinematics, self.links, fixed=True), 2)
-            if not _are_neighbours(kinematics, *pair) and _bodies(pair) not in ignored
+        neighbours = {frozenset(pair) for pair in _carried(model, {s.body for s in cover_of(model, kinematics).solids})}
+        return [
+            (a, b)
+            for a, b in combinations(_solids(model, kinematics, self.links), 2)
+            if a.link != b.link and {a.body, b.body} not in neighbours and _bodies(a, b) not in ignored
         ]
-        key = ("touching", tuple((a.body, b.body) for a, b in pairs))
-        return pairs, model.cache(key, lambda: _touching(model, kinematics, pairs))
 
 
-def _bodies(pair: tuple[Piece, Piece]) -> frozenset[str]:
-    return frozenset(piece.body for piece in pair)
+def _bodies(a: Solid | Piece, b: Solid | Piece) -> str:
+    return _pair_name(a.body, b.body)
 
 
-def _touching(model: Model, kinematics: ForwardKinematics, pairs: Sequence[tuple[Piece, Piece]]) -> set[frozenset[str]]:
-    """The pairs of bodies of which some pieces overlap in the default posture, or in all of many random ones."""
-    if not pairs:
-        return set()
-    random, overlaps = np.random.default_rng(0), dict[frozenset[str], Any]()
-    xs = np.array([model.default_state, *(any_state(model, random) for _ in range(LOOKED_AT))])
-    for pair, overlap in zip(pairs, (OfPairs(model, kinematics, pairs).values(xs) < 0).T, strict=True):
-        overlaps[_bodies(pair)] = overlap | overlaps.get(_bodies(pair), False)
-    return {names for names, overlap in overlaps.items() if overlap[0] or np.all(overlap[1:])}
+def _pair_name(a: str, b: str) -> str:
+    return " and ".join(sorted((a, b)))
 
 
-def _are_neighbours(kinematics: ForwardKinematics, a: Piece, b: Piece) -> bool:
-    """Whether two pieces are on one link, or one of their links carries the other."""
-    carriers = [-2 if piece.link < 0 else kinematics.carrier(piece.link) for piece in (a, b)]
-    return a.link == b.link or carriers[0] == b.link or carriers[1] == a.link
+def _overlapping(
+    model: Model, apart: Callable[[Sequence[tuple[Solid, Solid]]], OfShapes], pairs: Sequence[tuple[Solid, Solid]]
+) -> tuple[str, ...]:
+    """The pairs of bodies of which some shapes overlap in the default posture, or in all of many random ones."""
+    random = np.random.default_rng(0)
+
+    def overlaps(x: Array, among: Sequence[tuple[Solid, Solid]]) -> set[str]:
+        values = apart(among).values(x[None])[0] if among else ()
+        return {_bodies(*pair) for pair, value in zip(among, values, strict=True) if value < 0}
+
+    always, tried = {_bodies(*pair) for pair in pairs}, 0
+    while always and tried < LOOKED_AT:
+        always &= overlaps(any_state(model, random), [pair for pair in pairs if _bodies(*pair) in always])
+        tried += 1
+    return tuple(sorted(always | overlaps(model.default_state, pairs)))
+
+
+def _carried(model: Model, shaped: set[str]) -> Iterator[tuple[str, str]]:
+    """Each body of a model and the next one that carries it and is among `shaped`, those with a shape."""
+    names = {body.index(): label for label, body in labelled(bodies(model.plant)).items()}
+    above = {names[j.child_body().index()]: names.get(j.parent_body().index(), "") for j in joints(model.plant)}
+    for name in above:
+        carrier = above[name]
+        while carrier and carrier not in shaped:
+            carrier = above.get(carrier, "")
+        yield name, carrier
 
 
 def _kinematics(model: Model) -> ForwardKinematics:
@@ -345,17 +371,14 @@ def _kinematics(model: Model) -> ForwardKinematics:
     return kinematics
 
 
-def _pieces(
-    model: Model, kinematics: ForwardKinematics, links: Sequence[str] | None, *, fixed: bool = False
-) -> list[Piece]:
-    """Those of the named bodies, or of all; without those that are `fixed` to the world, or with them."""
+def _solids(model: Model, kinematics: ForwardKinematics, links: Sequence[str] | None) -> list[Solid]:
+    """Those of the named bodies, or of all."""
     _check_bodies(model, "links", links or ())
-    cover = cover_of(model, kinematics)
-    chosen = [p for p in cover.pieces if (links is None or p.body in links) and (fixed or p.link >= 0)]
+    solids = cover_of(model, kinematics).solids
     for name in links or ():
-        if all(p.body != name for p in cover.pieces):
+        if all(solid.body != name for solid in solids):
             raise InputError("links", got=name, expected="a body with a shape, with mass, or with a next joint")
-    return chosen
+    return [solid for solid in solids if links is None or solid.body in links]
 
 
 def _check_bodies(model: Model, subject: str, names: Sequence[str]) -> None:
