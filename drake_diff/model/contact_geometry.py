@@ -8,6 +8,8 @@ Here are also the distance of shapes from a half space, which Drake does not com
 overlap wherever the joints are, such as the cover of a joint: their contact pushes in every step.
 """
 
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
 from typing import Any
@@ -21,6 +23,7 @@ from pydrake.systems.framework import Diagram
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.model.file_facts import GeomSays, Touching
 from drake_diff.model.plant import bodies, joints
 
 ROUTES = ("corner_spheres", "hydroelastic", "differences")
@@ -252,7 +255,7 @@ FIRST = 10  # of them, in which a pair has to overlap once
 FLUSH = 1e-9  # [m]
 REACH = 4.0  # [m or rad] of a joint without limits, and of a free body
 TOLD = 6  # pairs of links named in a sentence
-Pairs = tuple[tuple[Any, Any], ...]
+Pairs = Sequence[tuple[Any, Any]]
 
 
 def inseparable_pairs(plant: MultibodyPlant, diagram: Diagram) -> Pairs:
@@ -325,3 +328,49 @@ def touch_what_can_separate(plant: MultibodyPlant, scene_graph: pg.SceneGraph, d
     return (
         f"{number} through each other, as they overlap wherever the joints are: {links_of(plant, scene_graph, pairs)}.",
     )
+
+
+def touch_as_mujoco(
+    plant: MultibodyPlant, scene_graph: pg.SceneGraph, touching: Mapping[str, Touching], *, give: bool
+) -> tuple[str, ...]:
+    """Let shapes of MJCF touch as MuJoCo does, by instance; a sentence for what changes. Pairs are added where `give`.
+
+    Drake lets neighbours pass through each other, but not where a body has two joints, and knows no masks. To be called
+    when the diagram is built, before it has contexts in use.
+    """
+    inspector, apart, together = scene_graph.model_inspector(), list[tuple[Any, Any]](), list[tuple[Any, Any]]()
+    for instance, says in touching.items():
+        shapes = _shapes_of(plant, scene_graph, instance, says, alone=len(touching) == 1)
+        for (a, g), (b, h) in combinations(shapes, 2):
+            if says.may_touch(a, b) == inspector.CollisionFiltered(g, h):
+                (together if says.may_touch(a, b) else apart).append((g, h))
+    notes = []
+    for pairs, rule in ((apart, "pass through each other"), (together if give else [], "touch")):
+        for g, h in pairs:
+            ways, declaration = (pg.GeometrySet([g]), pg.GeometrySet([h])), pg.CollisionFilterDeclaration()
+            changed = declaration.AllowBetween(*ways) if rule == "touch" else declaration.ExcludeBetween(*ways)
+            scene_graph.collision_filter_manager().Apply(changed)
+        if pairs:
+            notes.append(f"As in MuJoCo, {len(pairs)} pairs of shapes {rule}: {links_of(plant, scene_graph, pairs)}.")
+    return tuple(notes)
+
+
+def _shapes_of(
+    plant: MultibodyPlant, scene_graph: pg.SceneGraph, instance: str, says: Touching, *, alone: bool
+) -> list[tuple[GeomSays, Any]]:
+    """The shapes of an instance, and those of the world where it is `alone` there, with what its file says of them."""
+    inspector, by_body = scene_graph.model_inspector(), dict[str, list[Any]]()
+    for body, geometry in collision_geometries(plant, scene_graph):
+        whose = plant.GetModelInstanceName(body.model_instance())
+        if whose == instance or (alone and body.index() == plant.world_body().index()):
+            by_body.setdefault("world" if whose != instance else body.name(), []).append(geometry)
+    names = list(dict.fromkeys(geom.body for geom in says.geoms))
+    nameless = [name for name in names if name.startswith("?")], [name for name in by_body if name not in names]
+    called = dict(zip(*nameless, strict=True)) if len(nameless[0]) == len(nameless[1]) else {}
+    shapes = []
+    for geom in says.geoms:
+        for geometry in by_body.get(called.get(geom.body, geom.body), ()):
+            name = inspector.GetName(geometry).rpartition("::")[2]
+            if re.sub(r"_corner_\d+$", "", name) == geom.name:
+                shapes.append((geom, geometry))
+    return shapes

@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import count
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -27,6 +28,7 @@ SHARED = ("gear", "ctrlrange", "ctrllimited", "forcerange", "forcelimited")  # b
 SCALAR = ("hinge", "slide")  # the types of joints with one coordinate
 FLAGS = ("contact", "constraint", "gravity")  # what <option><flag> may disable and Drake has all the same
 MOST_INCLUDES = 100
+UNSEEN = 2**30  # a mask that no other meets: Drake makes no collision shape of a geom whose masks are both 0
 
 Attributes = dict[str, str]
 Defaults = dict[str, dict[str, Attributes]]  # by class and tag
@@ -54,6 +56,10 @@ def as_mujoco_means(xml: XmlText, path: Path, notes: list[str]) -> XmlText:
                 f"{path}:{connect.line}: <connect> holds {says['body1']} to the world, and a step with such a "
                 "constraint ends the process in Drake: let its body2 be a body without a joint, in <worldbody>"
             )
+    paired = {name for pair in mjcf.touching.pairs for name in pair}
+    for geom in (g for section in xml.root.findall("worldbody") for g in section.iter("geom")):
+        if geom.get("name") in paired and not any(mjcf.masks(geom)):
+            xml.set(geom, "contype", str(UNSEEN))
     if mjcf.needs_flat_defaults:
         mjcf.flatten_defaults()
         notes.append("Default classes were written out with what they inherit, which Drake would lose.")
@@ -164,11 +170,50 @@ class LinkSays:
 
 
 @dataclass(frozen=True)
+class GeomSays:
+    """Of a shape of MJCF that may touch: its own name and its body's, as Drake has them, and MuJoCo's filter.
+
+    `rigid` is the number of the bodies that move as one with its own, 0 the world, `carrier` that of those that carry
+    them. Shapes whose masks meet touch, but not on one of these, or on one and its carrier, unless that is the world.
+    """
+
+    body: str
+    name: str
+    rigid: int
+    carrier: int
+    contype: int
+    conaffinity: int
+
+    def may_touch(self, other: "GeomSays") -> bool:
+        """Whether MuJoCo's filter lets the two touch."""
+        neighbours = self.rigid and other.rigid and (self.carrier == other.rigid or other.carrier == self.rigid)
+        if self.rigid == other.rigid or neighbours:
+            return False
+        return bool(self.contype & other.conaffinity or other.contype & self.conaffinity)
+
+
+@dataclass(frozen=True)
+class Touching:
+    """What may touch in an MJCF file: its shapes, the pairs of names that touch in any case, and bodies that do not."""
+
+    geoms: tuple[GeomSays, ...]
+    pairs: frozenset[frozenset[str]]
+    excluded: frozenset[frozenset[str]]
+
+    def may_touch(self, a: GeomSays, b: GeomSays) -> bool:
+        """Whether two shapes touch in MuJoCo where they meet."""
+        if frozenset((a.name, b.name)) in self.pairs:
+            return True
+        return a.may_touch(b) and frozenset((a.body, b.body)) not in self.excluded
+
+
+@dataclass(frozen=True)
 class FileFacts:
     """What the files say, joints and links by the names of their model instance and their own.
 
     `followers` are the joints that mimic another one. `disabled` is what MJCF switches off and Drake has all the same:
-    contact, constraint, gravity. `left_out` are the joints of actuators of MJCF that Drake does not read.
+    contact, constraint, gravity. `left_out` are the joints of actuators of MJCF that Drake does not read, `touching` is
+    what MJCF lets touch, by model instance.
     """
 
     joints: dict[Key, JointSays] = field(default_factory=dict)
@@ -176,6 +221,7 @@ class FileFacts:
     followers: dict[Key, Mimic] = field(default_factory=dict)
     disabled: set[str] = field(default_factory=set)
     left_out: set[Key] = field(default_factory=set)
+    touching: dict[str, Touching] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -312,6 +358,35 @@ class Mjcf:
             if a and b and says.get("active", "true") == "true" and not any(terms[2:]):
                 yield Mimic(instance, *names, terms[1], a.start + terms[0] - terms[1] * b.start, in_drake=False)
 
+    def masks(self, geom: Element) -> tuple[int, int]:
+        """Its contype and conaffinity."""
+        says = self.attributes(geom)
+        return int(_first(says.get("contype", "1"), 1.0)), int(_first(says.get("conaffinity", "1"), 1.0))
+
+    @property
+    def touching(self) -> Touching:
+        """Which shapes may touch; a body without a name is called ?0, ?1, ... in the order of the file."""
+        geoms, groups, nameless = list[GeomSays](), count(1), count()
+
+        def read(body: Element, name: str, rigid: int, carrier: int) -> None:
+            for i, geom in enumerate(body.findall("geom")):
+                masks = self.masks(geom)
+                if any(masks):
+                    geoms.append(GeomSays(name, geom.get("name") or f"geom{i}", rigid, carrier, *masks))
+            for inner in body.findall("body"):
+                moves = any(child.tag in ("joint", "freejoint") for child in inner.children)
+                sides = (next(groups), rigid) if moves else (rigid, carrier)
+                read(inner, inner.get("name") or f"?{next(nameless)}", *sides)
+
+        for world in self.root.findall("worldbody"):
+            read(world, "world", 0, 0)
+        contacts = [element for section in self.root.findall("contact") for element in section.children]
+        pairs, excluded = (
+            frozenset(frozenset((e.get(f"{of}1"), e.get(f"{of}2"))) for e in contacts if e.tag == tag)
+            for tag, of in (("pair", "geom"), ("exclude", "body"))
+        )
+        return Touching(tuple(geoms), pairs, excluded)
+
     @property
     def disabled(self) -> tuple[str, ...]:
         """Which of FLAGS the file disables."""
@@ -430,6 +505,7 @@ def _read_mjcf(mjcf: Mjcf, name: str, facts: FileFacts) -> None:
         facts.joints[name, joint] = replace(says, effort=motor.limit, sides=motor.sides) if motor else says
     facts.followers.update({(name, mimic.follower): mimic for mimic in mjcf.mimics(name)})
     facts.disabled.update(mjcf.disabled)
+    facts.touching[name] = mjcf.touching
     facts.left_out.update((name, actuator.joint) for actuator in mjcf.actuators if not actuator.read)
 
 

@@ -264,7 +264,7 @@ def refusal(path: Path, message: str, xml: XmlText | None, notes: list[str]) -> 
 
 FORMATS = (".urdf", ".sdf", ".xml", ".mjcf", ".dmd.yaml")
 DRAKES_REFUSALS = (RuntimeError, ValueError, IndexError, OverflowError, SystemExit)  # the last is a failed condition
-OF_SIDES = re.compile(r"Asymmetrical effort limits are not supported")
+OF_RANGES = re.compile(r"Asymmetrical effort limits are not supported|collision filter groups are not yet implemented")
 OF_A_SPRING = re.compile(r"attribute '(?:stiffness|springref)' found in a 'joint' tag .* ignored")
 
 # Drake says of every half space that deformable bodies will not touch it, which no model here has.
@@ -384,7 +384,7 @@ class _Reading:
         if xml is not None and xml.root.tag == "mujoco":
             mjcf = Mjcf(xml)
             self.notes += correct(self.parser.plant(), instance, mjcf)
-            outdated = (OF_SIDES,) if mjcf.has_other_springs else (OF_SIDES, OF_A_SPRING)
+            outdated = (OF_RANGES,) if mjcf.has_other_springs else (OF_RANGES, OF_A_SPRING)
             self.notes[:] = [note for note in self.notes if not any(meant.search(note) for meant in outdated)]
 
     def in_own_words(self, message: str) -> str:

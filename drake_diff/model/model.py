@@ -26,6 +26,7 @@ from drake_diff.model.contact_geometry import (
     CONTACT_MODELS,
     ROUTES,
     replace_collision_geometry,
+    touch_as_mujoco,
     touch_what_can_separate,
 )
 from drake_diff.model.contract import Contract, read_contract
@@ -559,6 +560,8 @@ def load_model(
     coupling = coupling_of(plant, mimics)
     add_body_forces(builder, plant, body_forces)
     diagram = builder.Build()
+    if contact:
+        notes += touch_as_mujoco(plant, scene_graph, read.facts.touching, give=contact != "ground")
     if contact == "separable":
         notes += touch_what_can_separate(plant, scene_graph, diagram)
 

@@ -186,6 +186,67 @@ def test_a_motor_that_only_pushes_is_planned_so(tmp_path):
     np.testing.assert_allclose(data.qpos, -0.5, atol=1e-3)
 
 
+def random_tree(random):
+    """Spheres in one place, on bodies with none to two joints, some of which have no name; masks, pairs, excludes."""
+    names, opened = [], 0
+
+    def mask():
+        return "" if random.random() < 0.5 else 'contype="{}" conaffinity="{}"'.format(*random.integers(0, 4, 2))
+
+    text = f'<geom name="w" size="0.2" {mask()}/>'
+    for i in range(int(random.integers(3, 9))):
+        while opened and random.random() < 0.4:
+            text, opened = text + "</body>", opened - 1
+        name = f'name="b{i}"' if random.random() < 0.7 else ""
+        names += [f"b{i}"] if name else []
+        axes = ["1 0 0", "0 1 0"][: int(random.integers(0, 3))]
+        text += f"<body {name}>" + "".join(f'<joint name="j{i}{k}" axis="{a}"/>' for k, a in enumerate(axes))
+        text, opened = text + f'<geom name="g{i}" size="0.1" {mask()}/>', opened + 1
+    contact = (
+        "".join(
+            f'<exclude body1="{a}" body2="{b}"/>' for a, b in [random.permutation(names)[:2]] if random.random() < 0.5
+        )
+        if len(names) > 1
+        else ""
+    )
+    contact += f'<pair geom1="g0" geom2="g{i}"/>' if random.random() < 0.5 else ""
+    return text + "</body>" * opened, f"<contact>{contact}</contact>"
+
+
+def test_what_may_touch_is_what_touches_in_mujoco(tmp_path):
+    """All shapes overlap, so that MuJoCo has a contact of each pair that its filter lets touch."""
+    mujoco = pytest.importorskip("mujoco")
+    counts = []
+    for seed in range(40):
+        body, more = random_tree(np.random.default_rng(seed))
+        path = write(tmp_path, f'{body}<body name="free"><freejoint/>{GEOM}</body>', more=more)
+        other = mujoco.MjModel.from_xml_path(str(path))
+        data = mujoco.MjData(other)
+        mujoco.mj_forward(other, data)
+        wanted = {frozenset(other.geom(i).name or "geom0" for i in contact.geom) for contact in data.contact}
+        inspector = load(path).double.inspector
+        found = inspector.GetCollisionCandidates()
+        assert {frozenset(inspector.GetName(g).rpartition("::")[2] for g in pair) for pair in found} == wanted, seed
+        counts.append(len(wanted))
+    assert sum(counts) > 200
+
+
+def test_a_leg_whose_hip_has_two_hinges_swings(tmp_path):
+    """The thigh overlaps the pelvis, which slides freely; MuJoCo has the same equation and a step of first order."""
+    mujoco = pytest.importorskip("mujoco")
+    hip = '<joint name="abd" axis="1 0 0" damping="0.5"/><joint name="flex" axis="0 1 0" damping="0.5"/>'
+    thigh = f'<body name="thigh">{hip}<geom type="capsule" fromto="0 0 -0.05 0 0 -0.35" size="0.04" mass="2"/></body>'
+    body = f'<body><geom size="0.08" mass="5"/><joint name="x" type="slide" axis="1 0 0"/>{thigh}</body>'
+    path = write(tmp_path, body, head='<mujoco model="m"><option timestep="1e-3"/>')
+    model, other = load(path, time_step=1e-3), mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(other)
+    data.qpos[:] = 0, 0.2, 0.3
+    motion = dd.rollout(model, np.concatenate([data.qpos, data.qvel]), np.zeros((200, 0)))
+    mujoco.mj_step(other, data, 200)
+    np.testing.assert_allclose(motion.xs[-1, :3], data.qpos, atol=1e-4)
+    assert data.qpos[1] < 0.19
+
+
 def test_two_motors_on_a_joint_are_refused(tmp_path):
     """Drake's step drops the torque of the first, with a derivative of 0 that agrees with differences."""
     motors = '<actuator><motor name="big" joint="j" gear="2"/><motor name="small" joint="j" gear="3"/></actuator>'
