@@ -358,6 +358,15 @@ class Mjcf:
             if a and b and says.get("active", "true") == "true" and not any(terms[2:]):
                 yield Mimic(instance, *names, terms[1], a.start + terms[0] - terms[1] * b.start, in_drake=False)
 
+    def mesh(self, geom: Element) -> str:
+        """The name of the mesh that gives a geom its mass; "" where a number does."""
+        says = self.attributes(geom)
+        return "" if "mass" in says else says.get("mesh", "")
+
+    def density(self, geom: Element) -> float:
+        """[kg/m^3]"""
+        return _first(self.attributes(geom).get("density", "1000"), 1000.0)
+
     def masks(self, geom: Element) -> tuple[int, int]:
         """Its contype and conaffinity."""
         says = self.attributes(geom)

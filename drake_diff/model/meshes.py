@@ -5,6 +5,7 @@ one, so that pose, friction and filters are read as always; then that sphere's s
 """
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -19,15 +20,18 @@ from pydrake.multibody.parsing import PackageMap
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_diff.exceptions import ModelError
+from drake_diff.model.file_facts import Mjcf
 from drake_diff.model.triangles import (
     OF_MUJOCO,
     READ_BY_TRIMESH,
     CoverSpheres,
     Hull,
+    Triangles,
     as_obj,
     fit_spheres,
     hull_of_file,
     read_mesh,
+    scaled,
 )
 from drake_diff.model.xml_text import Element, XmlText
 
@@ -35,6 +39,7 @@ TREATMENTS = ("skip", "convex", "spheres")
 NOT_OBJ = tuple(ending for ending in READ_BY_TRIMESH if ending != ".obj")  # Drake reads no other in MJCF
 USABLE_MESHES = (".obj", ".vtk", ".gltf", ".glb")  # by Drake
 PLACEHOLDER = 1.2345678e-9  # [m] the radius of the first; no file has such a sphere
+SAME_MASS = 1e-6  # relative
 MOST_TOLD = 12  # in a note; links with the same file and scale count once
 
 Scale = tuple[float, float, float]
@@ -66,6 +71,7 @@ class FileMeshes:
     skipped: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
     unusable: list[str] = field(default_factory=list)
+    hollow: list[str] = field(default_factory=list)
 
     def notes(self) -> list[str]:
         """What the user should know of meshes that are not used, a sentence each."""
@@ -75,6 +81,8 @@ class FileMeshes:
             f"{len(self.missing)} meshes skipped, no file found: {_listed(self.missing)}. Links without a shape "
             "are drawn as a skeleton; packages={name: folder} says where a package is.": self.missing,
             f"{len(self.unusable)} meshes skipped, they cannot be used: {_listed(self.unusable)}.": self.unusable,
+            f"{len(self.hollow)} masses by the exact volume of a mesh, where MuJoCo's default rule gives another: "
+            f'{_listed(self.hollow)}. inertia="exact" of the mesh, or an <inertial>, is the same in both.': self.hollow,
         }
         return [sentence for sentence, names in sentences.items() if names]
 
@@ -91,6 +99,7 @@ def read_meshes(meshes: FileMeshes, xml: XmlText, path: Path, packages: PackageM
     """
     if xml.root.tag == "mujoco":
         _convert_assets(meshes, xml, path)
+        _look_for_hollows(meshes, xml, path)
         return
     for element in list(xml.root.iter("visual", "collision")):
         mesh = next(element.iter("mesh"), None)
@@ -122,6 +131,37 @@ def _convert_assets(meshes: FileMeshes, xml: XmlText, path: Path) -> None:
         obj.write_text(as_obj(triangles))
         meshes.converted[str(obj)] = file
         xml.set(mesh, "file", str(obj))
+
+
+def _look_for_hollows(meshes: FileMeshes, xml: XmlText, path: Path) -> None:
+    """Note each geom whose mass by MuJoCo's default rule for meshes is not that by the exact volume, with both."""
+    mjcf, by_name = Mjcf(xml), dict[str, tuple[float, float]]()
+    for mesh in (m for section in xml.root.findall("asset") for m in section.findall("mesh")):
+        file, says = in_any_case(asset_of(xml, mesh, path)) if mesh.get("file") else None, mjcf.attributes(mesh)
+        if file is not None and says.get("inertia", "legacy") == "legacy" and file.suffix.lower() in READ_BY_TRIMESH:
+            with suppress(ModelError):  # Drake says what is wrong with it
+                by_name[mesh.get("name") or file.stem] = volumes(scaled(read_mesh(file), _scale(mesh, file.name)))
+    for body in (body for section in xml.root.findall("worldbody") for body in section.iter("body")):
+        for geom in body.findall("geom") if not body.findall("inertial") else ():
+            exact, legacy = (mjcf.density(geom) * volume for volume in by_name.get(mjcf.mesh(geom), (0.0, 0.0)))
+            if abs(legacy - exact) > SAME_MASS * legacy:
+                meshes.hollow.append(f"{body.get('name', '?')} ({exact:.4g} kg, MuJoCo {legacy:.4g})")
+
+
+def volumes(mesh: Triangles) -> tuple[float, float]:
+    """[m^3] the volume of a closed mesh, and what MuJoCo takes for it by its default, inertia="legacy".
+
+    That is all pyramids on the faces, those that the exact volume takes away, too: first from the centre of the faces,
+    then from the centre of mass of these.
+    """
+    corners = mesh.vertices[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    areas, middles = np.linalg.norm(normals, axis=1), np.mean(corners, axis=1)
+    top = areas @ middles / np.sum(areas)
+    sizes = np.abs(np.sum((middles - top) * normals, axis=1))
+    top = sizes @ (0.75 * middles + 0.25 * top) / np.sum(sizes)
+    pyramids = np.sum((middles - top) * normals, axis=1) / 3
+    return abs(float(np.sum(pyramids))), float(np.sum(np.abs(pyramids)))
 
 
 def asset_of(xml: XmlText, mesh: Element, path: Path) -> Path:

@@ -186,6 +186,26 @@ def test_a_motor_that_only_pushes_is_planned_so(tmp_path):
     np.testing.assert_allclose(data.qpos, -0.5, atol=1e-3)
 
 
+@each_row("ending", ["stl", "obj"])
+def test_the_mass_of_a_mesh_that_is_not_convex_is_told_with_mujoco_s(tmp_path, ending):
+    """Two walls apart, one of them the larger: MuJoCo's default rule counts some of what is empty between them."""
+    mujoco = pytest.importorskip("mujoco")
+    walls = [((0.3, 0.05, 0.1), (0, 0, 0)), ((0.1, 0.05, 0.2), (0.05, 0.15, 0.1))]
+    moved = trimesh.transformations.translation_matrix
+    frame = trimesh.util.concatenate([trimesh.creation.box(size, moved(middle)) for size, middle in walls])
+    frame.export(tmp_path / f"frame.{ending}")
+    asset = f'<asset><mesh name="f" file="{tmp_path}/frame.{ending}" scale="1 2 1" {{}}/></asset>'
+    body = '<body name="a"><joint name="j"/><geom type="mesh" mesh="f" density="800"/></body>'
+    for attribute, rows in (("", 1), ('inertia="exact"', 0)):
+        path = write(tmp_path, body, more=asset.format(attribute))
+        model, theirs = load(path), mujoco.MjModel.from_xml_path(str(path)).body_mass[1]
+        ours = model.plant.GetBodyByName("a").default_mass()
+        notes = [note for note in model.notes if "MuJoCo's default rule" in note]
+        assert len(notes) == rows
+        assert abs(theirs / ours - 1) > 0.1 if rows else theirs == pytest.approx(ours, rel=1e-6)
+        assert not rows or f"a ({ours:.4g} kg, MuJoCo {theirs:.4g})" in notes[0]
+
+
 def random_tree(random):
     """Spheres in one place, on bodies with none to two joints, some of which have no name; masks, pairs, excludes."""
     names, opened = [], 0
