@@ -23,7 +23,7 @@ from pydrake.systems.framework import Diagram
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.model.file_facts import GeomSays, Touching
+from drake_diff.model.file_facts import GeomSays, TouchFilter
 from drake_diff.model.plant import bodies, joints
 
 ROUTES = ("corner_spheres", "hydroelastic", "differences")
@@ -331,7 +331,7 @@ def touch_what_can_separate(plant: MultibodyPlant, scene_graph: pg.SceneGraph, d
 
 
 def touch_as_mujoco(
-    plant: MultibodyPlant, scene_graph: pg.SceneGraph, touching: Mapping[str, Touching], *, give: bool
+    plant: MultibodyPlant, scene_graph: pg.SceneGraph, touching: Mapping[str, TouchFilter], *, give: bool
 ) -> tuple[str, ...]:
     """Let shapes of MJCF touch as MuJoCo does, by instance; a sentence for what changes. Pairs are added where `give`.
 
@@ -356,7 +356,7 @@ def touch_as_mujoco(
 
 
 def _shapes_of(
-    plant: MultibodyPlant, scene_graph: pg.SceneGraph, instance: str, says: Touching, *, alone: bool
+    plant: MultibodyPlant, scene_graph: pg.SceneGraph, instance: str, says: TouchFilter, *, alone: bool
 ) -> list[tuple[GeomSays, Any]]:
     """The shapes of an instance, and those of the world where it is `alone` there, with what its file says of them."""
     inspector, by_body = scene_graph.model_inspector(), dict[str, list[Any]]()

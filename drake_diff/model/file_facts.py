@@ -193,7 +193,7 @@ class GeomSays:
 
 
 @dataclass(frozen=True)
-class Touching:
+class TouchFilter:
     """What may touch in an MJCF file: its shapes, the pairs of names that touch in any case, and bodies that do not."""
 
     geoms: tuple[GeomSays, ...]
@@ -221,7 +221,7 @@ class FileFacts:
     followers: dict[Key, Mimic] = field(default_factory=dict)
     disabled: set[str] = field(default_factory=set)
     left_out: set[Key] = field(default_factory=set)
-    touching: dict[str, Touching] = field(default_factory=dict)
+    touching: dict[str, TouchFilter] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -373,7 +373,7 @@ class Mjcf:
         return int(_first(says.get("contype", "1"), 1.0)), int(_first(says.get("conaffinity", "1"), 1.0))
 
     @property
-    def touching(self) -> Touching:
+    def touching(self) -> TouchFilter:
         """Which shapes may touch; a body without a name is called ?0, ?1, ... in the order of the file."""
         geoms, groups, nameless = list[GeomSays](), count(1), count()
 
@@ -391,10 +391,10 @@ class Mjcf:
             read(world, "world", 0, 0)
         contacts = [element for section in self.root.findall("contact") for element in section.children]
         pairs, excluded = (
-            frozenset(frozenset((e.get(f"{of}1"), e.get(f"{of}2"))) for e in contacts if e.tag == tag)
-            for tag, of in (("pair", "geom"), ("exclude", "body"))
+            frozenset(frozenset((e.get(f"{kind}1"), e.get(f"{kind}2"))) for e in contacts if e.tag == tag)
+            for tag, kind in (("pair", "geom"), ("exclude", "body"))
         )
-        return Touching(tuple(geoms), pairs, excluded)
+        return TouchFilter(tuple(geoms), pairs, excluded)
 
     @property
     def disabled(self) -> tuple[str, ...]:
