@@ -115,7 +115,7 @@ def _convert_assets(meshes: FileMeshes, xml: XmlText, path: Path) -> None:
 
     It computes masses by them, as MuJoCo does; `put_meshes` then puts back what was there.
     """
-    for mesh in (m for section in xml.root.findall("asset") for m in section.findall("mesh")):
+    for mesh in assets_of(xml):
         file = in_any_case(asset_of(xml, mesh, path)) if mesh.get("file") else None
         if file is None:
             continue  # which Drake says
@@ -135,17 +135,25 @@ def _convert_assets(meshes: FileMeshes, xml: XmlText, path: Path) -> None:
 
 def _look_for_hollows(meshes: FileMeshes, xml: XmlText, path: Path) -> None:
     """Note each geom whose mass by MuJoCo's default rule for meshes is not that by the exact volume, with both."""
-    mjcf, by_name = Mjcf(xml), dict[str, tuple[float, float]]()
-    for mesh in (m for section in xml.root.findall("asset") for m in section.findall("mesh")):
-        file, says = in_any_case(asset_of(xml, mesh, path)) if mesh.get("file") else None, mjcf.attributes(mesh)
-        if file is not None and says.get("inertia", "legacy") == "legacy" and file.suffix.lower() in READ_BY_TRIMESH:
-            with suppress(ModelError):  # Drake says what is wrong with it
-                by_name[mesh.get("name") or file.stem] = volumes(scaled(read_mesh(file), _scale(mesh, file.name)))
+    mjcf = Mjcf(xml)
+    files = {mesh.get("name") or Path(mesh.get("file")).stem: mesh for mesh in assets_of(xml)}
     for body in (body for section in xml.root.findall("worldbody") for body in section.iter("body")):
         for geom in body.findall("geom") if not body.findall("inertial") else ():
-            exact, legacy = (mjcf.density(geom) * volume for volume in by_name.get(mjcf.mesh(geom), (0.0, 0.0)))
+            mesh = files.get(mjcf.mesh(geom))
+            if mesh is None or mjcf.attributes(mesh).get("inertia", "legacy") != "legacy":
+                continue
+            exact, legacy = (mjcf.density(geom) * volume for volume in _volumes_of(xml, mesh, path))
             if abs(legacy - exact) > SAME_MASS * legacy:
                 meshes.hollow.append(f"{body.get('name', '?')} ({exact:.4g} kg, MuJoCo {legacy:.4g})")
+
+
+def _volumes_of(xml: XmlText, mesh: Element, path: Path) -> tuple[float, float]:
+    """The `volumes` of a mesh of an MJCF file; 0 of one that cannot be read, of which Drake says what is wrong."""
+    file = in_any_case(asset_of(xml, mesh, path)) if mesh.get("file") else None
+    if file is not None and file.suffix.lower() in READ_BY_TRIMESH:
+        with suppress(ModelError):
+            return volumes(scaled(read_mesh(file), _scale(mesh, file.name)))
+    return 0.0, 0.0
 
 
 def volumes(mesh: Triangles) -> tuple[float, float]:
@@ -157,11 +165,17 @@ def volumes(mesh: Triangles) -> tuple[float, float]:
     corners = mesh.vertices[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
     areas, middles = np.linalg.norm(normals, axis=1), np.mean(corners, axis=1)
-    top = areas @ middles / np.sum(areas)
-    sizes = np.abs(np.sum((middles - top) * normals, axis=1))
-    top = sizes @ (0.75 * middles + 0.25 * top) / np.sum(sizes)
+    with np.errstate(all="ignore"):  # a mesh that is flat has neither
+        top = areas @ middles / np.sum(areas)
+        sizes = np.abs(np.sum((middles - top) * normals, axis=1))
+        top = sizes @ (0.75 * middles + 0.25 * top) / np.sum(sizes)
     pyramids = np.sum((middles - top) * normals, axis=1) / 3
     return abs(float(np.sum(pyramids))), float(np.sum(np.abs(pyramids)))
+
+
+def assets_of(xml: XmlText) -> list[Element]:
+    """The meshes that an MJCF file declares."""
+    return [mesh for section in xml.root.findall("asset") for mesh in section.findall("mesh")]
 
 
 def asset_of(xml: XmlText, mesh: Element, path: Path) -> Path:
@@ -250,7 +264,7 @@ def make_absolute(xml: XmlText, path: Path) -> None:
     A model that is given to Drake as text has no folder to start from.
     """
     if xml.root.tag == "mujoco":
-        for mesh in (m for section in xml.root.findall("asset") for m in section.findall("mesh")):
+        for mesh in assets_of(xml):
             if mesh.get("file") and not Path(mesh.get("file")).is_absolute():
                 xml.set(mesh, "file", str(asset_of(xml, mesh, path)))
         for include in xml.root.iter("include"):  # what is left is missing

@@ -300,10 +300,10 @@ class SelfCollision(Obstacle):
         What stands for a link contains its shapes and sticks out of some: what is near there need not touch.
         """
         pairs = [(p, r) for a, b in self._pairs(model) for p in a.pieces for r in b.pieces]
-        overlapping, kinematics = set(self.left_out(model)), _kinematics(model)
+        kinematics = _kinematics(model)
         near = np.any(OfPairs(model, kinematics, pairs).values(xs) < self.margin, axis=0) if pairs else ()
-        overlapping |= {_bodies(*pair) for pair, close in zip(pairs, near, strict=True) if close}
-        pairs = [pair for pair in pairs if _bodies(*pair) not in overlapping]
+        touching = {_bodies(*pair) for pair, close in zip(pairs, near, strict=True) if close}
+        pairs = [pair for pair in pairs if _bodies(*pair) not in touching]
         return self.kept_clear(OfPairs(model, kinematics, pairs), "clear of itself")
 
     def left_out(self, model: Model) -> tuple[str, ...]:
