@@ -127,9 +127,13 @@ class Clearance:
 
     def __call__(self, x: Any) -> Any:
         """(m,) [m] at x (nx,)."""
+        self.refuse_parameters()
+        return self._distances(self.kinematics(np.asarray(x)[: self.model.nq]))
+
+    def refuse_parameters(self) -> None:
+        """InputError where a parameter that distances depend on is changed."""
         for quantity in sorted(self.model.other_quantities & PLACE):
             raise InputError("parameters", got=quantity, expected="only such as distances do not depend on")
-        return self._distances(self.kinematics(np.asarray(x)[: self.model.nq]))
 
     def values(self, xs: Array) -> Array:
         """(K, m) [m] at xs (K, nx)."""
@@ -242,9 +246,11 @@ class OfShapes(Clearance):
         self.first = np.cumsum([0, *(len(a.pieces) * len(b.pieces) for a, b in pairs)])[:-1]
 
     def __call__(self, x: Any) -> Any:
-        if np.asarray(x).dtype == float:
-            return self.values(np.asarray(x)[None])[0]
-        values, slopes = self.linearize(ExtractValue(np.asarray(x).reshape(-1, 1)).T)
+        self.refuse_parameters()
+        x = np.asarray(x)
+        if x.dtype == float:
+            return self.values(x[None])[0]
+        values, slopes = self.linearize(ExtractValue(x.reshape(-1, 1)).T)
         return chain_rows(values[0], slopes[0], x)
 
     def values(self, xs: Array) -> Array:

@@ -55,16 +55,10 @@ class Piece:
 class Solid:
     """A shape of a body, and the pieces that contain it."""
 
+    body: str
+    link: int
     pieces: tuple[Piece, ...]
     geometry: Any  # Drake's, in `with_whole_shapes`; None of a shape that is only drawn and of a skeleton
-
-    @property
-    def body(self) -> str:
-        return self.pieces[0].body
-
-    @property
-    def link(self) -> int:
-        return self.pieces[0].link
 
     @property
     def is_round(self) -> bool:
@@ -106,7 +100,7 @@ def _cover(model: Model, kinematics: ForwardKinematics) -> Cover:
         shapes = [] if inspector is None else list(_of_shapes(whole, inspector, body, unread))
         for geometry, pieces in shapes or [(None, [bone]) for bone in _skeleton(whole, body)]:
             placed = (replace(p, body=label, link=link, start=pose @ p.start, end=pose @ p.end) for p in pieces)
-            solids.append(Solid(tuple(placed), geometry))
+            solids.append(Solid(label, link, tuple(placed), geometry))
     for number, rigid in enumerate(kinematics.links):
         if number not in kinematics.between and all(solid.link != number for solid in solids):
             bare.append(rigid.joint.body)

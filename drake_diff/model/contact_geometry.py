@@ -347,9 +347,9 @@ def touch_as_mujoco(
     notes = []
     for pairs, rule in ((apart, "pass through each other"), (together if give else [], "touch")):
         for g, h in pairs:
-            ways, declaration = (pg.GeometrySet([g]), pg.GeometrySet([h])), pg.CollisionFilterDeclaration()
-            changed = declaration.AllowBetween(*ways) if rule == "touch" else declaration.ExcludeBetween(*ways)
-            scene_graph.collision_filter_manager().Apply(changed)
+            declaration = pg.CollisionFilterDeclaration()
+            declare = declaration.AllowBetween if rule == "touch" else declaration.ExcludeBetween
+            scene_graph.collision_filter_manager().Apply(declare(pg.GeometrySet([g]), pg.GeometrySet([h])))
         if pairs:
             notes.append(f"As in MuJoCo, {len(pairs)} pairs of shapes {rule}: {links_of(plant, scene_graph, pairs)}.")
     return tuple(notes)
@@ -370,7 +370,6 @@ def _shapes_of(
     shapes = []
     for geom in says.geoms:
         for geometry in by_body.get(called.get(geom.body, geom.body), ()):
-            name = inspector.GetName(geometry).rpartition("::")[2]
-            if re.sub(r"_corner_\d+$", "", name) == geom.name:
+            if re.sub(r"^.*::|_corner_\d+$", "", inspector.GetName(geometry)) == geom.name:
                 shapes.append((geom, geometry))
     return shapes

@@ -187,9 +187,8 @@ class GeomSays:
     def may_touch(self, other: "GeomSays") -> bool:
         """Whether MuJoCo's filter lets the two touch."""
         neighbours = self.rigid and other.rigid and (self.carrier == other.rigid or other.carrier == self.rigid)
-        if self.rigid == other.rigid or neighbours:
-            return False
-        return bool(self.contype & other.conaffinity or other.contype & self.conaffinity)
+        masks = self.contype & other.conaffinity or other.contype & self.conaffinity
+        return bool(masks and self.rigid != other.rigid and not neighbours)
 
 
 @dataclass(frozen=True)
@@ -202,9 +201,8 @@ class TouchFilter:
 
     def may_touch(self, a: GeomSays, b: GeomSays) -> bool:
         """Whether two shapes touch in MuJoCo where they meet."""
-        if frozenset((a.name, b.name)) in self.pairs:
-            return True
-        return a.may_touch(b) and frozenset((a.body, b.body)) not in self.excluded
+        paired, excluded = frozenset((a.name, b.name)) in self.pairs, frozenset((a.body, b.body)) in self.excluded
+        return paired or (a.may_touch(b) and not excluded)
 
 
 @dataclass(frozen=True)
@@ -358,14 +356,10 @@ class Mjcf:
             if a and b and says.get("active", "true") == "true" and not any(terms[2:]):
                 yield Mimic(instance, *names, terms[1], a.start + terms[0] - terms[1] * b.start, in_drake=False)
 
-    def mesh(self, geom: Element) -> str:
-        """The name of the mesh that gives a geom its mass; "" where a number does."""
+    def mesh_and_density(self, geom: Element) -> tuple[str, float]:
+        """The name of the mesh that gives a geom its mass, "" where a number does, and its density [kg/m^3]."""
         says = self.attributes(geom)
-        return "" if "mass" in says else says.get("mesh", "")
-
-    def density(self, geom: Element) -> float:
-        """[kg/m^3]"""
-        return _first(self.attributes(geom).get("density", "1000"), 1000.0)
+        return "" if "mass" in says else says.get("mesh", ""), _first(says.get("density", "1000"), 1000.0)
 
     def masks(self, geom: Element) -> tuple[int, int]:
         """Its contype and conaffinity."""

@@ -156,6 +156,12 @@ class Inputs:
         """Whether u is the plant's actuation and nothing else: all actuators, in order."""
         return not self.ports and not self.fed_actuators
 
+    @property
+    def one_sided(self) -> tuple[Array, Array]:
+        """Lower and upper limits (nu,) of motors whose sides differ, which steps do not keep; infinite of others."""
+        differ = (self.actuator >= 0) & (self.lower != -self.upper)
+        return np.where(differ, self.lower, -np.inf), np.where(differ, self.upper, np.inf)
+
     def of_actuators(self, rows: Any) -> Array:
         """(nu, ...) of numbers for each actuator, (actuators, ...), those for each input; 0 where it is no actuator."""
         rows = np.asarray(rows, dtype=float)
@@ -319,7 +325,7 @@ def _rows_of_actuators(plant: Any, facts: FileFacts, which: list[int]) -> list[R
     for i, name in enumerate(labelled(motors)):
         joint, limit = motors[i].joint(), float(motors[i].effort_limit())
         says = facts.joints.get((plant.GetModelInstanceName(joint.model_instance()), joint.name()))
-        lower, upper = says.sides if says and says.sides else (-limit, limit)
+        lower, upper = says.sides if says and says.sides and np.isfinite(limit) else (-limit, limit)
         rows.append((name, "N" if joint.type_name() == "prismatic" else "N m", lower, upper, i))
     return [rows[i] for i in which]
 

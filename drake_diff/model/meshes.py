@@ -139,10 +139,11 @@ def _look_for_hollows(meshes: FileMeshes, xml: XmlText, path: Path) -> None:
     files = {mesh.get("name") or Path(mesh.get("file")).stem: mesh for mesh in assets_of(xml)}
     for body in (body for section in xml.root.findall("worldbody") for body in section.iter("body")):
         for geom in body.findall("geom") if not body.findall("inertial") else ():
-            mesh = files.get(mjcf.mesh(geom))
+            name, density = mjcf.mesh_and_density(geom)
+            mesh = files.get(name)
             if mesh is None or mjcf.attributes(mesh).get("inertia", "legacy") != "legacy":
                 continue
-            exact, legacy = (mjcf.density(geom) * volume for volume in _volumes_of(xml, mesh, path))
+            exact, legacy = (density * volume for volume in _volumes_of(xml, mesh, path))
             if abs(legacy - exact) > SAME_MASS * legacy:
                 meshes.hollow.append(f"{body.get('name', '?')} ({exact:.4g} kg, MuJoCo {legacy:.4g})")
 

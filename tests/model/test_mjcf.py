@@ -11,7 +11,7 @@ from pydrake.geometry import Role
 from pydrake.multibody.tree import MultibodyForces
 
 import drake_diff as dd
-from drake_diff.exceptions import ModelError
+from drake_diff.exceptions import InputError, ModelError
 from drake_diff.model.named_files import named_files
 from drake_diff.model.plant import actuators, joints
 
@@ -175,10 +175,11 @@ def test_a_motor_that_only_pushes_is_planned_so(tmp_path):
     actuator = '<actuator><motor joint="j" gear="4" ctrlrange="0 1"/></actuator>'
     path = write(tmp_path, body, more=actuator, head='<mujoco model="m"><option timestep="0.02"/>')
     model, other = load(path, time_step=0.02), mujoco.MjModel.from_xml_path(str(path))
-    costs = {"running_cost": dd.QuadraticCost(R=[[1.0]])}
-    solution = dd.solve(dd.Problem(model, x0=[0, 0], x_goal=[-0.5, 0], num_steps=60, **costs))
-    assert solution.success
-    assert solution.us.min() >= 0
+    asked = {"x0": [0, 0], "x_goal": [-0.5, 0], "num_steps": 60, "running_cost": dd.QuadraticCost(R=[[1.0]])}
+    solution = dd.solve(dd.Problem(model, **asked))
+    with pytest.raises(InputError, match=r"expected within \[0, 4\]"):
+        dd.Problem(model, bounds=dd.Bounds(u_lower=[-4.0]), **asked)
+    assert (solution.success, solution.us.min() >= 0) == (True, True)
     data = mujoco.MjData(other)
     for u in solution.us:
         data.ctrl[:] = u / 4

@@ -318,7 +318,7 @@ class SelfCollision(Obstacle):
 
     def _pairs(self, model: Model) -> list[tuple[Solid, Solid]]:
         """The pairs of shapes that may touch, but those of `ignore`."""
-        kinematics, ignored = _kinematics(model), {_pair_name(*pair) for pair in self.ignore}
+        kinematics, ignored = _kinematics(model), {" and ".join(sorted(pair)) for pair in self.ignore}
         _check_bodies(model, "SelfCollision.ignore", [name for pair in self.ignore for name in pair])
         neighbours = {frozenset(pair) for pair in _carried(model, {s.body for s in cover_of(model, kinematics).solids})}
         return [
@@ -329,11 +329,7 @@ class SelfCollision(Obstacle):
 
 
 def _bodies(a: Solid | Piece, b: Solid | Piece) -> str:
-    return _pair_name(a.body, b.body)
-
-
-def _pair_name(a: str, b: str) -> str:
-    return " and ".join(sorted((a, b)))
+    return " and ".join(sorted((a.body, b.body)))
 
 
 def _overlapping(

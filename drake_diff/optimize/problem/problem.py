@@ -687,6 +687,9 @@ class Problem(PicklesItsFields, ShowsItsRepr):
 
     def _check_kept(self) -> None:
         """Bind the goals, which checks their names, and look at the knots of all that is kept."""
+        if self.has_model:
+            sides = np.array([self.bounds.u_lower, self.bounds.u_upper])
+            check_inside("bounds", sides, *self.model.inputs.one_sided, self.input_names)
         for constraint in self.kept:
             self.knots_of(constraint, input_at_end=not self.has_model)
         for constraint in self.kept_goals:
