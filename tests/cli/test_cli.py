@@ -53,6 +53,7 @@ def drake_diff(*words, cwd):
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
 
 
+@pytest.mark.slow
 def test_a_run_that_holds_prints_its_checks_and_exits_with_0(tmp_path):
     done = drake_diff("run", script(tmp_path), cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -25,6 +25,7 @@ def test_pd_gains_reach_the_autodiff_twin():
     assert d.B[1, 0] == pytest.approx(h / inertia, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_dropped_pd_gains_are_caught_by_the_parity_gate():
     model = pd_pendulum()
     twin = actuators(model.autodiff.plant)[0]
@@ -89,6 +90,7 @@ def test_aligned_hydroelastic_shapes_are_caught(upper, lower, height):
     assert refuses(*pair(upper, lower, hydroelastic=True, height=height))
 
 
+@pytest.mark.slow
 def test_a_pair_that_autodiff_refuses_has_the_derivative_of_the_steps_equation():
     model, x = pair(Box(0.2, 0.2, 0.2), Box(1, 1, 0.2), hydroelastic=False, height=0.0995)
     x[:4] = [0.9996, 0.02, -0.015, 0.01]

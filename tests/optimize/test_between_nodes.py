@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from helpers.plants import block
+from helpers.table import slow_after
 
 import drake_diff as dd
 from drake_diff.exceptions import GradientError
@@ -110,7 +111,7 @@ def narrow(random):
 
 
 @pytest.mark.solve
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", slow_after(1, range(8)))
 def test_a_gust_between_two_nodes_is_seen(seed):
     """The input of a block's move from rest to rest, 6 - 12 t; the gust's work changes its speed in one interval."""
     random = np.random.default_rng(seed)
@@ -128,7 +129,7 @@ def test_a_gust_between_two_nodes_is_seen(seed):
         assert np.max(motion.gaps[:, 1]) == pytest.approx(expected, rel=0.1)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", slow_after(1, range(8)))
 def test_a_peak_of_the_cost_between_two_nodes_counts(seed):
     random = np.random.default_rng(100 + seed)
     peak, area, speed = narrow(random)
@@ -177,6 +178,7 @@ def test_a_cost_that_jumps_is_reported(what, cost, jump):
     assert row.passes == (jump == 0.0) == solution.success, (what, solution.message)
 
 
+@pytest.mark.slow
 def test_a_cost_whose_derivatives_are_of_other_values_is_refused_or_reported():
     """1 or 2 u^2, by the kind of its numbers: everywhere, and beyond the places at which functions are tried."""
     everywhere = lambda x, u: u[0] ** 2 * (1 + (x.dtype != float))  # noqa: E731

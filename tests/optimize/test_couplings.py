@@ -114,7 +114,7 @@ def test_what_is_no_coupling_is_refused_at_once(make, told):
         make()
 
 
-@pytest.mark.solve
+@pytest.mark.slow
 def test_a_record_of_it_is_verified_and_one_of_a_motion_that_does_not_repeat_fails(tmp_path):
     solution = dd.solve(swing())
     assert dd.save(solution, tmp_path / "a").verdict == "pass"

@@ -330,7 +330,7 @@ def test_half_a_turn_away_is_no_gap_in_the_derivatives(pendulum):
 
 ARMS = [
     ("ur5_robot.urdf", "tool0", {}),
-    ("panda.urdf", "panda_hand", {"mimic": "reduce"}),
+    pytest.param("panda.urdf", "panda_hand", {"mimic": "reduce"}, marks=pytest.mark.long),
     ("solo12.urdf", "HR_FOOT", {}),
 ]
 

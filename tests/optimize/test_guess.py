@@ -199,6 +199,7 @@ def test_a_reference_is_the_first_guess_bent_to_the_ends_that_are_given():
     assert guess.us[:, 0] == pytest.approx(np.cos(2 * s[:-1] + 0.05), abs=2e-3)
 
 
+@pytest.mark.slow
 def test_a_car_keeps_to_a_figure_eight_from_beside_it():
     """From a straight line, which stays at the start, it ended in loops, 0.28 m off the eight."""
     time = 23.0

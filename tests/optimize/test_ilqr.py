@@ -84,6 +84,7 @@ def test_a_swing_up_without_bounds_leaves_no_slope():
     assert np.abs(pendulum_gradient(solution.us)).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_a_swing_up_within_bounds_meets_them_and_the_conditions_of_an_optimum():
     """Where |u| < 2.5 there is no slope; at a bound the cost pushes outwards. Shooting finds the same cost."""
     problem = pendulum(bounds=dd.Bounds(u_lower=[-2.5], u_upper=[2.5]))

@@ -238,6 +238,7 @@ def overlaps(model, xs):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
 def test_a_pair_that_overlaps_at_the_start_leaves_a_plan_undecided(tmp_path):
     """The table goes through the lower link: nothing says that the plan may."""
@@ -248,6 +249,7 @@ def test_a_pair_that_overlaps_at_the_start_leaves_a_plan_undecided(tmp_path):
     assert dd.solve(reach(tmp_path, at, ignore=[("lower", "top")])).success
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
 def test_a_plan_passes_over_a_table_and_not_through_it(tmp_path):
     """Half a metre wide and 0.05 m high, 0.1 m below the arm: capsules around it would reach to where the arm is."""

@@ -89,6 +89,7 @@ def test_the_plants_own_step_gives_the_plan_back(write_urdf):
         np.testing.assert_allclose(motion.xs, plan.sample(1)[0], rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 @each_row(
     "fields, what, where, value",
     [
@@ -109,6 +110,7 @@ def test_a_plan_that_misses_what_is_asked_is_told(write_urdf, fields, what, wher
     assert len(broken_variants(plan, replays(plan))) == 4
 
 
+@pytest.mark.slow
 @each_row("i", range(4))
 def test_one_coordinate_off_is_refused_and_named(load, i):
     """A cart-pole's own motion, asked to end at its own last state but for one coordinate, within one bound as well."""

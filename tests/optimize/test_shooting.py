@@ -132,6 +132,7 @@ def test_a_cart_pole_swings_up(limit):
     assert solution.goal_error < 1e-7
 
 
+@pytest.mark.slow
 def test_all_of_it_together_is_solved():
     solution = shoot(everything(x_goal=None))
     assert solution.success, solution.message

@@ -44,6 +44,7 @@ def arm(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_a_textbook_arm_is_mended_planned_for_and_verified(arm, tmp_path):
     done = drake_diff("plan", arm, "--goal", "elbow=0.5", "--out", "out", cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -148,6 +148,7 @@ def test_the_panda_arrives_although_it_is_pushed(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_quadrotor_flies_through_its_gates_and_its_record_holds(tmp_path):
     """The plan passes each gate as the replays do, in finer steps too; verify builds the rotors again."""
     module = example("quadrotor_gates")
@@ -301,6 +302,7 @@ def test_the_quadruped_goes_as_its_schedule_says_and_its_record_holds(name, way,
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_leg_that_is_designed_jumps_by_a_design_inside_its_bounds():
     """Found with its torques: no length and no stiffness is at a bound, and every replay of its torques is a jump."""
     module = example("jumping_leg")
@@ -317,6 +319,7 @@ def test_the_leg_that_is_designed_jumps_by_a_design_inside_its_bounds():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_policy_lands_and_rests_at_its_height_and_its_plan_can_be_verified(tmp_path):
     """From heights that it was not trained on too; what is saved is its own motion, to the last input."""
     module = example("landing_policy")
@@ -336,6 +339,7 @@ def test_the_policy_lands_and_rests_at_its_height_and_its_plan_can_be_verified(t
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_tossed_cube_has_its_published_size_and_is_predicted_better_than_by_hand(tmp_path, monkeypatch, capsys):
     """Half of 104.8 mm to 1 %, as a caliper would say, from tosses whose fall says how long the cameras' metre is."""
     monkeypatch.chdir(tmp_path)

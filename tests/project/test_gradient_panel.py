@@ -82,6 +82,7 @@ def test_on_stiff_ground_the_jumps_of_the_step_turn_the_sign_of_first_order():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_stiffness_and_a_long_chaotic_horizon_make_first_order_vary_and_zeroth_hardly():
     def variances(case, sigma, samples):
         return [PANEL.quality(case, order, sigma, samples=samples, seeds=2).variance for order in ("first", "zeroth")]

@@ -245,6 +245,7 @@ def missing(named, bundle):
     (bundle / named[A].sha256).unlink()
 
 
+@pytest.mark.slow
 @each_row(
     "change, verdict, words",
     [

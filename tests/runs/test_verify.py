@@ -253,6 +253,7 @@ def test_a_run_that_stopped_far_from_its_goal_cannot_say_that_it_converged(solut
         assert any(f"record.json: {words}" in complaint for complaint in result.complaints), result.complaints
 
 
+@pytest.mark.slow
 def test_exchanged_pages_are_found_although_all_hashes_are_right_and_a_file_more_is_told(run, other_run, copy):
     for name in ("replay.html", "report.html"):
         honest = (copy / name).read_bytes()
@@ -283,6 +284,7 @@ def numbers_changed(by):
     return lambda page, _: with_commands(page, change)
 
 
+@pytest.mark.slow
 @each_row(
     "forge, verdict",
     [
@@ -483,6 +485,7 @@ def test_a_changed_directory_of_any_kind_is_refused_and_the_file_named(kinds, ki
     assert any(f"{record.FILE}: its content does not match" in words for words in dd.verify(directory).complaints)
 
 
+@pytest.mark.slow
 @each_row("kind", ["comparison", "robustness"])
 def test_pages_and_sentences_of_what_is_not_run_again_follow_from_the_record(kinds, kind, tmp_path):
     """Plots and scenes do not: the verdict says that contents are not checked."""
