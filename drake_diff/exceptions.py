@@ -62,9 +62,9 @@ class InputError(DrakeDiffError, ValueError):
 class ShapeError(InputError):
     """An array of the wrong shape."""
 
-    def __init__(self, subject: str, *, got: tuple[int, ...], expected: tuple[int | str, ...]):
+    def __init__(self, subject: str, *, got: tuple[int, ...], expected: tuple[int | str, ...], because: str = ""):
         shape = "(" + ", ".join(str(n) for n in expected) + ("," if len(expected) == 1 else "") + ")"
-        super().__init__(subject, got=f"shape {tuple(got)}", expected=f"shape {shape}")
+        super().__init__(subject, got=f"shape {tuple(got)}{because and f': {because}'}", expected=f"shape {shape}")
 
 
 class NonFiniteError(InputError):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_diff._base.arrays import Array, finite_array, number_of_steps
+from drake_diff._base.arrays import Array, number_of_steps
 from drake_diff._base.differences import Many
 from drake_diff.certificates.certificate import (
     DISAGREE,
@@ -137,7 +137,7 @@ def certify_rollout(
             raise InputError("certify_rollout", got=got, expected=expected)
     if not is_continuous:
         check_method(method)
-    x0, vector = finite_array("x0", x0, (model.nx,)), select(model, parameters)
+    x0, vector = model.finite_state("x0", x0), select(model, parameters)
     inputs = check_inputs(model, us, num_steps) if policy is None else np.empty((number_of_steps(num_steps), 0))
     moved = Displaced(model, x0, inputs, loss, fresh(policy), vector, method)
     if is_continuous:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_diff._base.arrays import Array, finite_array, frozen, number_of_steps
+from drake_diff._base.arrays import Array, frozen, number_of_steps
 from drake_diff._base.values import Refusal
 from drake_diff.comparison import attribution
 from drake_diff.comparison.attribution import (
@@ -90,7 +90,7 @@ def compare(
     if us is None:
         count = (num_steps and number_of_steps(num_steps)) or min(MOST_STEPS, max(1, round(DURATION / model.time_step)))
         us = np.tile(sample.u, (count, 1))
-    start = sample.x if x0 is None else finite_array("x0", x0, (model.nx,))
+    start = sample.x if x0 is None else model.finite_state("x0", x0)
     inputs = check_inputs(model, us, num_steps)
     reference = DrakeEngine(model)
     loaded: list[Engine] = []

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linprog
 
-from drake_diff._base.arrays import Array, finite_array, frozen, positive_float, positive_int
+from drake_diff._base.arrays import Array, frozen, positive_float, positive_int
 from drake_diff._base.values import Refusal, ShowsItsRepr
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
@@ -140,7 +140,7 @@ def excite(
 
 def _first(model: Model, x0: Any) -> Array:
     if x0 is not None:
-        x = np.array(finite_array("x0", x0, (model.nx,)))
+        x = np.array(model.finite_state("x0", x0))
         if np.any(x[model.nq :] != 0):
             raise InputError("x0", got="a moving state", expected="one at rest")
         return x

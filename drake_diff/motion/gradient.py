@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_diff._base.arrays import Array, finite_array, frozen, number_of_steps
+from drake_diff._base.arrays import Array, frozen, number_of_steps
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.derivatives.sources import check_method
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
@@ -137,7 +137,7 @@ def differentiate_rollout(
     """
     if method != CONTINUOUS:
         check_method(method)
-    x0 = finite_array("x0", x0, (model.nx,))
+    x0 = model.finite_state("x0", x0)
     if us is not None and policy is not None:
         raise InputError("differentiate_rollout", got="us and policy", expected="one of them")
     vector = select(model, parameters)

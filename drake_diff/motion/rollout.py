@@ -148,10 +148,10 @@ def rollout(
     vector = select(model, parameters or ())
     with applied(vector) as set_model:
         if method == CONTINUOUS:
-            return _in_continuous_time(set_model, vector, finite_array("x0", x0, (model.nx,)), inputs, count)
+            return _in_continuous_time(set_model, vector, model.finite_state("x0", x0), inputs, count)
         h, meter = set_model.time_step, Meter(set_model)
         xs, us = np.empty((count + 1, model.nx)), np.empty((count, model.nu))
-        xs[0] = finite_array("x0", x0, (model.nx,))
+        xs[0] = model.finite_state("x0", x0)
         for k in range(count):
             us[k] = _asked(inputs, xs[k].copy(), k * h, model.nu) if callable(inputs) else inputs[k]
             xs[k + 1] = advance(set_model.double, xs[k], us[k])

@@ -19,7 +19,7 @@ from drake_diff._base.values import Refusal
 from drake_diff.exceptions import GradientError
 from drake_diff.mechanics.casadi_tree import agrees
 from drake_diff.mechanics.symbol import Symbol, symbols
-from drake_diff.optimize.problem.constraint import Constraint
+from drake_diff.optimize.problem.constraint import Constraint, short
 from drake_diff.optimize.problem.cost import (
     QuadraticCost,
     QuadraticForm,
@@ -441,9 +441,20 @@ class Costs:
             width = nx if stage.final else n
             gradients[stage.at, :width] += stage.weight * gradient
             hessians[stage.at, :width, :width] += stage.weight * hessian
-        if not (np.all(np.isfinite(gradients)) and np.all(np.isfinite(hessians))):
-            raise GradientError("the cost's derivative is not finite along the motion")
+        knots = np.hstack([xs, np.vstack([us, np.zeros((len(xs) - len(us), us.shape[1]))])])
+        require_finite(np.concatenate([gradients[:, None], hessians], axis=1), knots)
         return gradients, hessians
+
+
+def require_finite(derivatives: Array, knots: Array) -> None:
+    """GradientError where the derivatives (K, ...) of a cost are not finite at one of the knots (K, n)."""
+    bad = ~np.isfinite(derivatives).reshape(len(derivatives), -1).all(axis=1)
+    if bad.any():
+        k = int(np.argmax(bad))
+        raise GradientError(
+            f"the cost's derivative is not finite at knot {k}, [x; u] = {short(knots[k])}: a norm has no derivative at "
+            "zero, sqrt(f + 1e-9) has one"
+        )
 
 
 _KNOT_COSTS: WeakKeyDictionary[Problem, tuple[KnotCost, KnotCost]] = WeakKeyDictionary()

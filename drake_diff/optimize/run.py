@@ -24,6 +24,7 @@ from drake_diff.optimize.continuation import Stages, solve_continuation
 from drake_diff.optimize.guess import Guess
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr, takes
 from drake_diff.optimize.ilqr.through_contact import moves_shapes, solve_through_jumps
+from drake_diff.optimize.knots import costs_of
 from drake_diff.optimize.measure import certify_equations, first_knots, telling_knots
 from drake_diff.optimize.optimality import HOLDS, doubt_of_the_slope, out_of_reach, why_blind
 from drake_diff.optimize.options import Options
@@ -171,6 +172,7 @@ class Run:
         if isinstance(self.problem, PhasedProblem):
             return ()
         guess, task = guesses[0], transcription.tasks[0]
+        costs_of(self.problem, guess.xs, guess.us).expand(guess.xs, guess.us)
         point = transcription.jacobian, guess.xs, guess.us, task
         return certify_equations(self.problem, *point, knots=first_knots(guess.us))
 
@@ -553,7 +555,7 @@ def kept_apart(problem: Problem) -> Problem:
     """
     goal = np.array(problem.goal)
     ends = [problem.x0] + [goal] * (not np.any(np.isnan(goal[: problem.model.nq])))
-    more = SelfCollision().apart_but_at(problem.model, np.nan_to_num(np.array(ends)))
+    more = SelfCollision().rows_away_from(problem.model, np.nan_to_num(np.array(ends)))
     return dataclasses.replace(problem, constraints=(*problem.constraints, *more))
 
 

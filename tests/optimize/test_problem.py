@@ -8,7 +8,7 @@ from helpers.models import MODELS
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff.exceptions import InputError
+from drake_diff.exceptions import InputError, ShapeError
 from drake_diff.optimize.problem.cost import differentiate_cost, running_cost_hessian
 
 R = dd.QuadraticCost(R=[[1.0]])
@@ -183,6 +183,27 @@ def test_no_goal_has_no_tolerance(load):
         cart_pole(load, x_goal=[1, np.nan, 0, 0], goal_tolerance=[0.1, 0.1, np.nan, np.nan])
 
 
+def test_the_shape_error_of_a_state_names_what_floats(load):
+    model = load("sphere_on_ground.sdf")
+    for ask in (lambda: dd.Problem(model, x0=[0, 0], num_steps=5), lambda: dd.step(model, [0, 0])):
+        with pytest.raises(ShapeError, match=r"got shape \(2,\): .* floats, with 13 states; base="):
+            ask()
+    with pytest.raises(ShapeError, match=r"got shape \(3,\)$"):
+        dd.step(load("pendulum.urdf"), [0, 0, 0], [0])
+
+
+@each_row("method", ["collocation", "shooting", "ilqr", "auto"])
+def test_a_cost_without_a_derivative_where_the_search_begins_is_named_with_its_knot(load, method):
+    def norm(x, u):
+        return (x[0] ** 2 + x[1] ** 2) ** 0.5
+
+    problem = dd.Problem(load("pendulum.urdf"), x0=[0, 0], x_goal=[0.5, 0], num_steps=20, running_cost=norm)
+    solution = dd.solve(problem, method=method)
+    assert solution.status.value == "no_gradient"
+    assert "not finite at knot 0" in " ".join([solution.message, *solution.notes])
+    assert "norm" in " ".join([solution.message, *solution.notes])
+
+
 def test_a_quaternion_and_its_negative_are_one_goal(load):
     """A goal on the other side is turned to the side of x0, and a state on either side is at no distance from it."""
     model = load("sphere_on_ground.sdf")
@@ -194,3 +215,21 @@ def test_a_quaternion_and_its_negative_are_one_goal(load):
     for x in (x0, goal):
         assert np.all(problem.goal_error(x) == 0)
     np.testing.assert_array_equal(problem.x_goal, x0)
+
+
+def test_a_body_that_turns_on_has_the_signs_of_the_waypoint_before(load):
+    """Quarter turns about z: at three of them a quaternion is nearer to the negative of that of x0."""
+    model = load("sphere_on_ground.sdf")
+    angles = np.array([0.0, np.pi / 2, np.pi, 3 * np.pi / 2, 2 * np.pi])
+    states = np.tile(np.asarray(model.default_state), (5, 1))
+    states[:, :4] = np.column_stack([np.cos(angles / 2), 0 * angles, 0 * angles, np.sin(angles / 2)])
+    asked = states * np.where(np.arange(model.nx) < 4, np.array([1, -1, 1, 1, -1])[:, None], 1.0)
+    waypoints = {1: asked[1], 2: np.full(model.nx, np.nan), 3: asked[2], 4: asked[3]}
+    free = np.arange(model.nx) == 10
+    fields = {"num_steps": 5, "optimize": ("initial_state",), "initial_state_mask": free, "waypoints": waypoints}
+    problem = dd.Problem(model, x0=states[0], x_goal=asked[4], **fields)
+    for knot, state in ((1, states[1]), (3, states[2]), (4, states[3])):
+        np.testing.assert_allclose(problem.waypoints[knot], state, rtol=0, atol=1e-15)  # sums of rounded angles
+    np.testing.assert_allclose(
+        problem.x_goal, states[4], rtol=0, atol=1e-15
+    )  # a whole turn, whose quaternion is that of x0 negated

@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any, cast
 
@@ -159,7 +159,8 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         if not isinstance(system, (Model, Dynamics)):
             raise InputError("system", got=type(system).__name__, expected="a Model or Dynamics")
         x0 = state_of(system, "x0", self.x0, system.default_state)
-        self._set("x0", finite_array("x0", x0, (self.nx,)))
+        state = system.finite_state if isinstance(system, Model) else partial(finite_array, shape=(self.nx,))
+        self._set("x0", state("x0", x0))
         self._set("num_steps", number_of_steps(self.num_steps))
         self._set("optimize", _check_optimize(self.nu, self.optimize))
         if isinstance(system, Model):
@@ -185,11 +186,11 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             check_inside("us", us, bounds.u_lower, bounds.u_upper, self.input_names)
         self._set("us", us)
         check_inside("x0", self.x0, bounds.x_lower, bounds.x_upper, self.state_names)
+        self._set("waypoints", self._check_waypoints())
         if self.x_goal is not None:
-            self._set("x_goal", self._check_state("x_goal", self.x_goal))
+            self._set("x_goal", self._check_state("x_goal", self.x_goal, self._last_before_goal()))
         if self.goal_tolerance is not None:
             self._set("goal_tolerance", self._check_goal_tolerance())
-        self._set("waypoints", self._check_waypoints())
         self._set("constraints", self._check_constraints())
         self._set("couplings", self._check_couplings())
         self._set("goals", self._check_goals())
@@ -612,14 +613,14 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             raise InputError("initial_state_mask", got=f"{mask.tolist()}", expected=expected)
         return mask
 
-    def _check_state(self, subject: str, given: Any) -> Array:
-        """`given` (nx,), NaN where free, within the bounds."""
+    def _check_state(self, subject: str, given: Any, before: Array) -> Array:
+        """`given` (nx,), NaN where free, within the bounds; quaternions have the signs nearer to the state `before`."""
         named = state_of(self.system, subject, given, np.full(self.nx, np.nan))
         state = array_with_gaps(subject, named, (self.nx,))
         if np.any(np.isinf(state)):
             raise InputError(subject, got=state, expected="finite numbers, NaN where free")
         check_inside(subject, state, self.bounds.x_lower, self.bounds.x_upper, self.state_names)
-        return self._with_the_signs_of(self.x0, state)
+        return self._with_the_signs_of(before, state)
 
     def _with_the_signs_of(self, x: Array, state: Array) -> Array:
         """`state` (nx,) with each quaternion or its negative, the same orientation, on the side of that of `x`."""
@@ -646,7 +647,18 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             raise InputError("waypoints", got=f"{given!r:.80}", expected="a mapping from knots to states")
         subject = "knots of waypoints (the last state's is x_goal)"
         knots = {count(subject, k, 1, self.num_steps - 1): state for k, state in given.items()}
-        return {k: self._check_state(f"waypoint at knot {k}", state) for k, state in sorted(knots.items())}
+        states, before = dict[int, Array](), self.x0
+        for k, state in sorted(knots.items()):
+            states[k] = self._check_state(f"waypoint at knot {k}", state, before)
+            before = np.where(np.isnan(states[k]), before, states[k])
+        return states
+
+    def _last_before_goal(self) -> Array:
+        """(nx,) the last that x0 and the waypoints say of each state."""
+        last = self.x0
+        for state in self.waypoints.values():
+            last = np.where(np.isnan(state), last, state)
+        return last
 
     def _check_constraints(self) -> tuple[Constraint, ...]:
         where = "; couplings= takes it" if isinstance(self.constraints, Couples) else ""

@@ -188,7 +188,7 @@ class ContactSchedule(Goal):
         Raises:
             InputError: No forces of the feet within friction make such a motion, or feet that stand are in the air.
         """
-        x0 = np.array(finite_array("x0", x0, (model.nx,)))
+        x0 = np.array(model.finite_state("x0", x0))
         last = x0[: model.nq] if end is None else np.array(finite_array("end", end, (model.nq,)))
         legs = Legs.named(model, self.feet, x0[: model.nq])
         self._check_touching(legs, x0)

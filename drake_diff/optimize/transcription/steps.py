@@ -23,7 +23,15 @@ from drake_diff.model.parameters import ParameterVector
 from drake_diff.motion.intervals import roll
 from drake_diff.motion.loss import differentiate_loss
 from drake_diff.optimize.ilqr.expansion import Motion, curvature_along
-from drake_diff.optimize.knots import DIFFERENCE, Called, KnotCost, PointFunction, costs_of, knot_function
+from drake_diff.optimize.knots import (
+    DIFFERENCE,
+    Called,
+    KnotCost,
+    PointFunction,
+    costs_of,
+    knot_function,
+    require_finite,
+)
 from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.cost import differentiate_final_cost
 from drake_diff.optimize.problem.dynamics import PROBED
@@ -270,8 +278,7 @@ class _KnownCost(PointFunction):
 
     def jacobian(self, points: Array) -> Array:
         gradients = self.cost.expand(points, self.times)[0]
-        if not np.all(np.isfinite(gradients)):
-            raise GradientError("the cost's derivative is not finite along the motion")
+        require_finite(gradients, points)
         return gradients
 
     def hessian(self, points: Array, weights: Array, jacobian: Array) -> Array:
