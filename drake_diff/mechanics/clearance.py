@@ -20,7 +20,7 @@ from pydrake.autodiffutils import ExtractValue
 from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.autodiff import chain_rows
 from drake_diff.exceptions import InputError
-from drake_diff.mechanics.cover import Piece, Solid, with_whole_shapes
+from drake_diff.mechanics.cover import Piece, Solid, with_collision_shapes
 from drake_diff.mechanics.forward_kinematics import ForwardKinematics
 from drake_diff.mechanics.quantities import PLACE
 from drake_diff.model.model import Model
@@ -238,7 +238,7 @@ class OfShapes(Clearance):
     ):
         sides = [in_rows([pair[i].pieces[0] for pair in pairs]) for i in (0, 1)]
         super().__init__(model, kinematics, [f"{a.body} and {b.body}" for a, b in pairs], *sides)
-        self.pairs, self.near, self.far, self.whole = tuple(pairs), near, far, with_whole_shapes(model)
+        self.pairs, self.near, self.far, self.shapes = tuple(pairs), near, far, with_collision_shapes(model)
         self.exact = np.array(
             [None not in (a.geometry, b.geometry) and not (a.is_round and b.is_round) for a, b in pairs], dtype=bool
         )
@@ -254,14 +254,14 @@ class OfShapes(Clearance):
         return chain_rows(values[0], slopes[0], x)
 
     def values(self, xs: Array) -> Array:
-        return self._mixed(xs, np.minimum.reduceat(self.capsules.values(xs), self.first, axis=1))[0]
+        return self._blended(xs, np.minimum.reduceat(self.capsules.values(xs), self.first, axis=1))[0]
 
     def linearize(self, xs: Array) -> tuple[Array, Array]:
         of_capsules, slopes = self.capsules.linearize(xs)
         ends = [*self.first[1:], of_capsules.shape[1]]
         nearest = [a + np.argmin(of_capsules[:, a:b], axis=1) for a, b in zip(self.first, ends, strict=True)]
         rows = np.arange(len(xs))[:, None], np.column_stack(nearest)
-        values, by_capsules, by_shapes, points, way = self._mixed(xs, of_capsules[rows])
+        values, by_capsules, by_shapes, points, way = self._blended(xs, of_capsules[rows])
         q, total = xs[:, : self.model.nq], slopes[rows] * by_capsules[..., None]
         frames = self.kinematics(q)
         for side, nearest_points, sign in zip(self.sides, points, (1.0, -1.0), strict=True):
@@ -279,16 +279,16 @@ class OfShapes(Clearance):
             )
         return far
 
-    def _mixed(self, xs: Array, least: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """The rows (K, m), where the capsules are `least` (K, m) apart, and what their slopes are made of.
+    def _blended(self, xs: Array, least: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """The rows (K, m), of capsules with the distances `least` (K, m), and what their slopes are made of.
 
         The derivatives (K, m) of a row by the distances of capsules and of shapes, the shapes' nearest points
         (2, K, m, 3) in the world, and the way (K, m, 3) in which the distance grows as the first of them moves.
         """
         share = np.clip((self.far - least) / (self.far - self.near), 0.0, 1.0) * self.exact
         weight, slope = share**2 * (3 - 2 * share), -6 * share * (1 - share) / (self.far - self.near)
-        apart, points, way = least.copy(), np.zeros((2, *least.shape, 3)), np.zeros((*least.shape, 3))
-        twin = self.whole.double
+        distances, points, way = least.copy(), np.zeros((2, *least.shape, 3)), np.zeros((*least.shape, 3))
+        twin = self.shapes.double
         for k in np.flatnonzero(np.any(weight > 0, axis=1) & np.all(np.isfinite(xs), axis=1)):
             twin.set_state(xs[k])
             query = twin.plant.get_geometry_query_input_port().Eval(twin.context)
@@ -296,12 +296,12 @@ class OfShapes(Clearance):
                 a, b = (solid.geometry for solid in self.pairs[i])
                 pair = query.ComputeSignedDistancePairClosestPoints(a, b)
                 points[:, k, i] = query.GetPoseInWorld(a) @ pair.p_ACa, query.GetPoseInWorld(b) @ pair.p_BCb
-                apart[k, i], way[k, i] = pair.distance, pair.nhat_BA_W
+                distances[k, i], way[k, i] = pair.distance, pair.nhat_BA_W
                 if not np.all(np.isfinite(way[k, i])):  # of shapes that just touch
                     way[k, i] = query.GetPoseInWorld(a).translation() - query.GetPoseInWorld(b).translation()
                     way[k, i] /= length(way[k, i])
-        values = least + weight * (apart - least)
-        return values, 1 - weight + slope * (apart - least), weight, points, way
+        values = least + weight * (distances - least)
+        return values, 1 - weight + slope * (distances - least), weight, points, way
 
 
 def from_ball(

@@ -58,7 +58,7 @@ class Solid:
     body: str
     link: int
     pieces: tuple[Piece, ...]
-    geometry: Any  # Drake's, in `with_whole_shapes`; None of a shape that is only drawn and of a skeleton
+    geometry: Any  # Drake's, in `with_collision_shapes`; None of a shape that is only drawn and of a skeleton
 
     @property
     def is_round(self) -> bool:
@@ -93,7 +93,7 @@ def cover_of(model: Model, kinematics: ForwardKinematics) -> Cover:
 
 
 def _cover(model: Model, kinematics: ForwardKinematics) -> Cover:
-    whole, solids, bare, unread = with_whole_shapes(model), list[Solid](), list[str](), list[str]()
+    whole, solids, bare, unread = with_collision_shapes(model), list[Solid](), list[str](), list[str]()
     inspector = whole.double.inspector
     for label, body in labelled(bodies(whole.plant)).items():
         link, pose = kinematics.on[label]
@@ -108,7 +108,7 @@ def _cover(model: Model, kinematics: ForwardKinematics) -> Cover:
     return Cover(tuple(solids), tuple(bare), (*unread, *doubts))
 
 
-def with_whole_shapes(model: Model) -> Model:
+def with_collision_shapes(model: Model) -> Model:
     """The model with the shapes that its file gives: what it touches with may be spheres inside them, or nothing.
 
     A user's diagram has what it has.

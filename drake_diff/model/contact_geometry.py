@@ -320,8 +320,8 @@ def touch_what_can_separate(plant: MultibodyPlant, scene_graph: pg.SceneGraph, d
     """Filter what overlaps in every posture; to be called when the diagram is built, before it has contexts in use."""
     pairs = inseparable_pairs(plant, diagram)
     for a, b in pairs:
-        apart = pg.CollisionFilterDeclaration().ExcludeBetween(pg.GeometrySet([a]), pg.GeometrySet([b]))
-        scene_graph.collision_filter_manager().Apply(apart)
+        filtered = pg.CollisionFilterDeclaration().ExcludeBetween(pg.GeometrySet([a]), pg.GeometrySet([b]))
+        scene_graph.collision_filter_manager().Apply(filtered)
     if not pairs:
         return ()
     number = f"{len(pairs)} pairs of shapes pass" if len(pairs) > 1 else "One pair of shapes passes"
@@ -338,14 +338,14 @@ def touch_as_mujoco(
     Drake lets neighbours pass through each other, but not where a body has two joints, and knows no masks. To be called
     when the diagram is built, before it has contexts in use.
     """
-    inspector, apart, together = scene_graph.model_inspector(), list[tuple[Any, Any]](), list[tuple[Any, Any]]()
+    inspector, excluded, allowed = scene_graph.model_inspector(), list[tuple[Any, Any]](), list[tuple[Any, Any]]()
     for instance, says in touching.items():
         shapes = _shapes_of(plant, scene_graph, instance, says, alone=len(touching) == 1)
         for (a, g), (b, h) in combinations(shapes, 2):
             if says.may_touch(a, b) == inspector.CollisionFiltered(g, h):
-                (together if says.may_touch(a, b) else apart).append((g, h))
+                (allowed if says.may_touch(a, b) else excluded).append((g, h))
     notes = []
-    for pairs, rule in ((apart, "pass through each other"), (together if give else [], "touch")):
+    for pairs, rule in ((excluded, "pass through each other"), (allowed if give else [], "touch")):
         for g, h in pairs:
             declaration = pg.CollisionFilterDeclaration()
             declare = declaration.AllowBetween if rule == "touch" else declaration.ExcludeBetween

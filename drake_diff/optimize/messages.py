@@ -8,7 +8,7 @@ LONGEST = 160  # characters of a message: a line that is read at once
 
 # {name} and {time} are the two parts of a check's `where` that " at " joins.
 CLAUSES = {
-    "apart": "{where} overlap where the file has them: SelfCollision(ignore=) says which may",
+    "left-out pair": "{where} overlap where the file has them: SelfCollision(ignore=) says which may",
     "bound": "{name} is {value} beyond its bound at {time}, tolerance {tolerance}",
     "chain": "through all phases, {where}, {value} of its range, tolerance {tolerance}",
     "clearance": "{name} come {value} nearer than their margin at {time}, tolerance {tolerance}",

@@ -610,7 +610,7 @@ def clearance_checks(plan: ReplayPlan, motion: MeasuredMotion) -> Iterator[Check
     for goal in plan.problem.goals:
         if isinstance(goal, SelfCollision):
             for pair in goal.left_out(plan.problem.model):
-                yield check("apart", pair, np.nan, goal.margin, "m", "undecided")
+                yield check("left-out pair", pair, np.nan, goal.margin, "m", "undecided")
 
 
 def penetration_check(model: Model, motion: MeasuredMotion) -> Check:

@@ -292,9 +292,9 @@ class SelfCollision(Obstacle):
     def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
         overlapping = set(self.left_out(model))
         pairs = [pair for pair in self._pairs(model) if _bodies(*pair) not in overlapping]
-        return self.kept_clear(self._apart(model, pairs), "clear of itself") if pairs else ()
+        return self.kept_clear(self._distances(model, pairs), "clear of itself") if pairs else ()
 
-    def apart_but_at(self, model: Model, xs: Array) -> tuple[ClearanceConstraint, ...]:
+    def rows_away_from(self, model: Model, xs: Array) -> tuple[ClearanceConstraint, ...]:
         """What keeps the capsules of all pairs of `model` apart but those nearer than the margin at one of xs (K, nx).
 
         What stands for a link contains its shapes and sticks out of some: what is near there need not touch.
@@ -310,9 +310,9 @@ class SelfCollision(Obstacle):
         """The pairs of bodies of `model` that overlap by their shapes and are not kept apart: "a and b"."""
         pairs = self._pairs(model)
         key = ("overlapping", tuple(_bodies(*pair) for pair in pairs))
-        return model.cache(key, lambda: _overlapping(model, lambda some: self._apart(model, some), pairs))
+        return model.cache(key, lambda: _overlapping(model, lambda some: self._distances(model, some), pairs))
 
-    def _apart(self, model: Model, pairs: Sequence[tuple[Solid, Solid]]) -> OfShapes:
+    def _distances(self, model: Model, pairs: Sequence[tuple[Solid, Solid]]) -> OfShapes:
         near = self.margin + EXACT
         return OfShapes(model, _kinematics(model), pairs, near, near + EXACT)
 
@@ -333,13 +333,13 @@ def _bodies(a: Solid | Piece, b: Solid | Piece) -> str:
 
 
 def _overlapping(
-    model: Model, apart: Callable[[Sequence[tuple[Solid, Solid]]], OfShapes], pairs: Sequence[tuple[Solid, Solid]]
+    model: Model, distances: Callable[[Sequence[tuple[Solid, Solid]]], OfShapes], pairs: Sequence[tuple[Solid, Solid]]
 ) -> tuple[str, ...]:
     """The pairs of bodies of which some shapes overlap in the default posture, or in all of many random ones."""
     random = np.random.default_rng(0)
 
     def overlaps(x: Array, among: Sequence[tuple[Solid, Solid]]) -> set[str]:
-        values = apart(among).values(x[None])[0] if among else ()
+        values = distances(among).values(x[None])[0] if among else ()
         return {_bodies(*pair) for pair, value in zip(among, values, strict=True) if value < 0}
 
     always, tried = {_bodies(*pair) for pair in pairs}, 0
