@@ -9,6 +9,7 @@ import typer
 from drake_diff._base.clock import INTERRUPTED
 from drake_diff.cli.text import (
     ModelFolder,
+    Packages,
     RunDirectory,
     Seed,
     WithoutMeshes,
@@ -20,6 +21,7 @@ from drake_diff.cli.text import (
     names_option,
     numbers_in,
     out_option,
+    packages_in,
     plain,
     progress_line,
     show,
@@ -56,6 +58,7 @@ def plan(
     seed: Seed = 0,
     restarts: Annotated[int, typer.Option(min=0, help="More first guesses, to list other optima.")] = 0,
     without_meshes: WithoutMeshes = False,
+    packages: Packages = None,
 ) -> None:
     """Plan a motion of ROBOT: mend its file, solve, write the run directory and verify it.
 
@@ -64,7 +67,7 @@ def plan(
     expected = "NAME=x,y,z of a frame, or NAME=number of a joint: numbers with commas between"
     numbers = numbers_in("--goal", goal or (), expected, counts=range(1, 100))
     goals = {name: list(values) for name, values in numbers.items()}
-    shapes = [_shape(words) for words in avoid or ()]
+    shapes, folders = [_shape(words) for words in avoid or ()], packages_in(packages)
     if robot is not None and not robot.is_file():
         raise InputError("ROBOT", got=str(robot), expected="a file that exists")
     # Only here: what is wrong is refused before Drake is loaded.
@@ -77,7 +80,7 @@ def plan(
 
     file = robot or example_files()[EXAMPLE]
     if robot is not None:
-        survived(robot, {"time_step": TIME_STEP})
+        survived(robot, {"time_step": TIME_STEP, "packages": folders})
     try:
         with progress_line("reading", pause=PAUSE) as report:
             asked: dict[str, Any] = {
@@ -88,6 +91,7 @@ def plan(
                 "seed": seed,
                 "restarts": restarts,
                 "meshes": not without_meshes,
+                "packages": folders,
             }
             done = planned(file, **asked, report=lambda stage, sentence: report(f"{stage:9} {sentence}"))
     except KeyboardInterrupt as error:

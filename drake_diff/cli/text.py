@@ -47,6 +47,14 @@ def repeated(metavar: str, what: str) -> Any:
     return typer.Option(metavar=metavar, help=f"{what}. Can be given again.")
 
 
+Packages = Annotated[list[str] | None, repeated("NAME=FOLDER", "Where a package:// is")]
+
+
+def packages_in(given: list[str] | None) -> dict[str, str] | None:
+    """The folders of packages by their names; None of none."""
+    return dict(split_pair("--packages", words, "NAME=FOLDER") for words in given) if given else None
+
+
 def names_in(words: str | None) -> list[str] | None:
     """The names in "a, b"; None for None."""
     return None if words is None else [name.strip() for name in words.split(",") if name.strip()]
@@ -89,7 +97,7 @@ def _load(
     ] = None,
     fix_joints: Annotated[str | None, names_option("Joints to replace by welds", "none")] = None,
     meshes: Annotated[str, typer.Option(help="What becomes of collision meshes: skip, convex or spheres")] = "skip",
-    packages: Annotated[list[str] | None, repeated("NAME=FOLDER", "Where a package:// is")] = None,
+    packages: Packages = None,
     mimic: Annotated[str | None, typer.Option(help="Joints that follow others: reduce or fix")] = None,
     ground: Annotated[
         str | None,
@@ -110,7 +118,7 @@ def _load(
         "base": base,
         "fix_joints": names_in(fix_joints) or (),
         "meshes": meshes,
-        "packages": dict(split_pair("--packages", words, "NAME=FOLDER") for words in packages) if packages else None,
+        "packages": packages_in(packages),
         "mimic": mimic,
         "ground": True
         if ground == "true"

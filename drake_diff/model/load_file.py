@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, requires, version
+from os.path import isfile
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -238,14 +239,29 @@ def _add_packages_of(packages: PackageMap, file: Path, above: tuple[Path, ...]) 
 
 
 def package_above(file: Path, name: str) -> Path | None:
-    """The folder of the package of that name, by where it stands to a file; None where there is none."""
+    """The folder of the package of that name, by where it stands to a file; None where there is none.
+
+    It is above the file, or beside a package that is; its name is the folder's, or that of its package.xml.
+    """
     for parent in file.resolve().parents:
-        if parent.name == name:
+        if parent.name == name or _name_of_package(parent) == name:
             return parent
         beside = parent / name
         if (beside / "package.xml").is_file():
             return beside
+        neighbours = sorted(parent.parent.glob("*/package.xml")) if _name_of_package(parent) else []
+        for manifest in neighbours:
+            if _name_of_package(manifest.parent) == name:
+                return manifest.parent
     return None
+
+
+def _name_of_package(folder: Path) -> str:
+    """The name that the package.xml in a folder gives; "" where there is none."""
+    manifest = folder / "package.xml"
+    text = manifest.read_text(errors="replace") if isfile(manifest) else ""  # a folder may be closed to us
+    name = re.search(r"<name>\s*([^<\s]+)\s*</name>", text)
+    return name[1] if name else ""
 
 
 def refusal(path: Path, message: str, xml: XmlText | None, notes: list[str]) -> str:

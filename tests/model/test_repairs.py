@@ -281,6 +281,12 @@ def test_packages_are_found_above_the_file_beside_it_and_where_they_are_said_to_
     (tmp_path / "shapes" / "tri.obj").write_text(obj)
     (tmp_path / "shapes" / "package.xml").write_text("<package><name>shapes</name></package>")
     assert load(path)[0].contract.geometries == model.contract.geometries
+    (tmp_path / "shapes").rename(tmp_path / "shapes_of_2020")  # a checkout whose folder has another name
+    (tmp_path / "arm" / "package.xml").write_text("<package><name>arm_description</name></package>")
+    assert load(path)[0].contract.geometries == model.contract.geometries
+    path.write_text(path.read_text().replace("package://shapes/", "package://arm_description/"))
+    (tmp_path / "arm" / "tri.obj").write_text(obj)
+    assert load(path)[0].contract.geometries == model.contract.geometries
 
 
 def test_a_chain_that_is_held_at_its_other_end_is_told_to_engines_and_differentiated(write):
