@@ -71,7 +71,8 @@ def audit(model: Model, x: ArrayLike | None = None, u: ArrayLike | None = None) 
           -> stay inside the limit (the bounds of a Problem do), or raise it in the file
     """
     x = model.default_state if x is None else x
-    point = Point(model, *check_point(model, x, np.zeros(model.nu) if u is None and model.nu else u))
+    x = model.finite_state("x", x)
+    point = Point(model, *check_point(model, x, model.neutral_input(x) if u is None else u))
     checks = _CHECKS if point.has_poses else _CHECKS_WITHOUT_POSES
     findings = [finding for check in checks for finding in check(point)]
     if not model.can_rebuild:  # a diagram has no arguments
@@ -95,7 +96,9 @@ def _pd_gains(point: Point) -> Found:
         if not names:
             continue
         target = "what your diagram feeds the desired state port"
-        if not point.model.feeds(plant.get_desired_state_input_port(instance)):
+        if point.model.servos:
+            target = "the commanded positions, which are inputs"
+        elif not point.model.feeds(plant.get_desired_state_input_port(instance)):
             values = ", ".join(f"{value:g}" for value in point.model.pd_targets[instance])
             target = f"[q; v] fixed at ({values}), the default position at rest"
         message = f"Drake's conversion to AutoDiffXd drops these PD gains; drake_diff puts them back; target: {target}"

@@ -99,7 +99,7 @@ class Controllers:
     velocity: NDArray[np.intp]  # (C,) the degree of freedom of each
     kp: Array  # (N, C)
     kd: Array
-    reference: Array  # (2, C) positions and velocities
+    reference: Array  # (2, N, C) positions and velocities
     limit: Array  # (C,) of the effort
 
     def impulses(self, q: Array, us: Array, diagonal: Array, h: float) -> JointImpulses:

@@ -422,8 +422,10 @@ def _problems(
     if controlled.any():
         which = np.flatnonzero(controlled)
         kp, kd = (np.array([getattr(r.settings, name)[which] for r in read]) for name in ("kp", "kd"))
-        pd = Controllers(form.velocity[which], kp, kd, form.reference[:, which], form.limit[which])
-        parts.append(pd.impulses(q, us[:, which], weights, h))
+        command = np.where(form.commanded[which], us[:, which], 0.0)
+        reference = form.reference[:, None, which] + np.stack([command, np.zeros_like(command)])
+        pd = Controllers(form.velocity[which], kp, kd, reference, form.limit[which])
+        parts.append(pd.impulses(q, us[:, which] - command, weights, h))
     if isinstance(couplers, Couplers) and len(couplers.offset):
         parts.append(couplers.impulses(q, weights, h))
     return ConvexSteps(A, momentum, _contact_impulses(model, read, v, weights), gather(parts), _same_tree(model))

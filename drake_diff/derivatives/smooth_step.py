@@ -98,19 +98,19 @@ def differentiate_equation(form: "Form", steps: Steps, k: int, jacobian: Array) 
     rows = gradient_rows(needed, len(variables))
     if vector.parameters:
         rows = rows + gradient_rows(model.autodiff.damping() * change, len(variables))
-    pressed = form.actuation * free  # (nv, nu) what an input that is not at its limit does
-    by_point = np.concatenate([rows[:, :nx], -pressed, rows[:, nx:]], axis=1)
+    pressed = form.actuation * free  # (nv, nu) what an effort that is not at its limit does
+    by_point = np.concatenate([rows[:, :nx], -pressed * form.per_input, rows[:, nx:]], axis=1)
     by_next = model.double.mass_matrix() / h
     by_next[form.diagonal] += damping
     by_point[:, nq:nx] -= by_next  # through (v' - v) / h and D (v' - v)
     if form.pd:
-        by_point[:, form.position] += pressed * kp
+        np.add.at(by_point, (slice(None), form.position), pressed * kp * form.ratio)  # two may be of one coordinate
         by_next += (pressed * (kd + h * kp)) @ form.actuation.T
     step = None if vector.step_entry is None else nx + model.nu + vector.step_entry
     if step is not None:
         by_point[:, step] = -(model.double.mass_matrix() @ change) / h**2
         if form.pd:
-            by_point[:, step] += (pressed * kp) @ v_next[form.velocity]
+            by_point[:, step] += (pressed * kp * form.ratio) @ v_next[form.velocity]
     velocities = -np.linalg.solve(by_next, by_point)
     jacobian[:nq] = _positions(model, form, v_next, velocities, len(vector.values))
     jacobian[nq:] = velocities
@@ -142,10 +142,13 @@ class Form:
     actuators: list[Any]
     velocity: NDArray[np.int64]  # (nu,) the index in v of the joint that an input drives, and in q; 0 of other inputs
     position: NDArray[np.int64]
+    ratio: Array  # (nu,) and `offset`: the joint's position by that entry; 1 and 0 unless it follows another joint
+    offset: Array
     actuation: Array  # (nv, nu)
     limit: Array
     cut: Array  # (nu,) beyond what Drake cuts off an input itself: infinite under PD control, whose sum it cuts off
-    reference: Array  # (2, nu) the positions and velocities that PD control holds
+    reference: Array  # (2, nu) the positions and velocities that PD control holds; 0 where an input commands them
+    commanded: NDArray[np.bool_]  # (nu,) whether it does
     diagonal: tuple[Any, ...]  # the indices of that of (nv, nv)
     pd: bool
     q_dot_is_v: bool
@@ -156,11 +159,21 @@ class Form:
         Exactly at a limit the derivative is that of the inside, as AutoDiffXd's is: there plans end up, and stay.
         """
         kp, kd = self.gains()
-        effort = u
+        effort = self.feedforward(u)
         if self.pd:
-            moved = q[..., self.position] + h * v_next[..., self.velocity] - self.reference[0]
-            effort = u - kp * moved - kd * (v_next[..., self.velocity] - self.reference[1])
+            v = self.ratio * v_next[..., self.velocity]
+            moved = self.ratio * q[..., self.position] + self.offset + h * v - self.reference[0]
+            effort = effort - kp * moved - kd * (v - self.reference[1])
         return effort, np.abs(effort) <= self.limit, (kp, kd)
+
+    @property
+    def per_input(self) -> Array:
+        """(nu,) the effort by an input: kp of a commanded position, else 1."""
+        return np.where(self.commanded, self.gains()[0], 1.0)
+
+    def feedforward(self, u: Array) -> Array:
+        """(..., nu) the efforts of inputs (..., nu), those of commanded positions where their joints are at 0."""
+        return u * self.per_input if self.commanded.any() else u
 
     def gains(self) -> tuple[Array, Array]:
         """kp (nu,) and kd (nu,), zero where there is no controller; they may change as parameters do."""
@@ -181,7 +194,9 @@ def _read_form(model: Model) -> Form:
     starts_and_limits = inputs.of_actuators(np.reshape(joined, (len(plant_actuators), 3)))
     velocity, position = starts_and_limits[:, 0].astype(int), starts_and_limits[:, 1].astype(int)
     controlled = inputs.of_actuators([a.has_controller() for a in plant_actuators]).astype(bool)
-    if model.coupling is not None:  # of inputs with PD control only, which such a model has not
+    ratio, offset = np.ones(len(position)), np.zeros(len(position))
+    if model.coupling is not None:
+        ratio, offset = model.coupling.ratio_q[position], model.coupling.offset[position]
         velocity, position = model.coupling.of_v[velocity], model.coupling.of_q[position]
     references = np.zeros((2, len(plant_actuators)))
     for instance, target in model.pd_targets.items():
@@ -194,10 +209,13 @@ def _read_form(model: Model) -> Form:
         actuators=plant_actuators,
         velocity=velocity,
         position=position,
+        ratio=ratio,
+        offset=offset,
         actuation=model.actuation,
         limit=np.where(inputs.actuator >= 0, starts_and_limits[:, 2], np.inf),
         cut=np.where((inputs.actuator >= 0) & ~controlled, starts_and_limits[:, 2], np.inf),
         reference=references,
+        commanded=inputs.commanded,
         diagonal=np.diag_indices(model.nv),
         pd=any(a.has_controller() for a in plant_actuators),
         q_dot_is_v=bool(model.plant.IsVelocityEqualToQDot()),
@@ -210,8 +228,6 @@ def _why_driven(model: Model) -> str:
     if any(joint.is_locked(model.double.context) for joint in joints(plant)):
         return "a joint is locked"
     controlled = [a for a in actuators(plant) if a.has_controller()]
-    if model.coupling is not None and controlled:
-        return "PD control acts on reduced coordinates"
     if controlled and not model.inputs.plain:
         return "PD controllers act beside the diagram's own inputs"
     targets = {a.model_instance(): plant.get_desired_state_input_port(a.model_instance()) for a in controlled}
@@ -266,7 +282,7 @@ class SmoothStep:
         n, h = len(self.damping), self.time_step
         nx, width = 2 * n, 2 * n + len(u)
         q, v = x[:n], x[n:]
-        force = self.form.actuation.dot(u)
+        force = self.form.actuation.dot(self.form.feedforward(u))
         if self.loaded:
             force += self.rest - self.damping * v - self.stiffness * q[self.positions]
         by_q, by_v, inverse, a = self.dynamics.accelerate_one(q, v, force)
@@ -280,7 +296,7 @@ class SmoothStep:
         lower, diagonal = jacobian[n:], jacobian.reshape(-1)[:: width + 1]  # of the first nx columns; views
         np.multiply(by_q, h, out=lower[:, :n])
         np.multiply(by_v, h, out=lower[:, n:nx])
-        np.multiply(inverse.take(self.form.velocity, axis=1), h, out=lower[:, nx:])
+        np.multiply(self.form.feedforward(inverse.take(self.form.velocity, axis=1)), h, out=lower[:, nx:])
         diagonal[n:] += 1.0
         np.multiply(lower, h, out=jacobian[:n])
         diagonal[:n] += 1.0
@@ -322,14 +338,14 @@ class SmoothStep:
         some = bool(clipped.any())
         if some:
             us = np.clip(us, -self.limit, self.limit)
-        force = us @ self.form.actuation.T + self.rest - self.damping * v
+        force = self.form.feedforward(us) @ self.form.actuation.T + self.rest - self.damping * v
         if self.sprung:
             force -= self.stiffness * q[:, self.positions]
         return force, clipped if some else None
 
     def _by_input(self, inverse: Array, clipped: NDArray[np.bool_] | None) -> Array:
         """(N, nv, nu) M^-1 B, 0 for clipped inputs."""
-        columns = inverse.take(self.form.velocity, axis=2)
+        columns = self.form.feedforward(inverse.take(self.form.velocity, axis=2))
         return columns if clipped is None else columns * ~clipped[:, None]
 
 

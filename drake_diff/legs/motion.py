@@ -208,7 +208,7 @@ def _inputs(legs: Legs, x: Array, v_next: Array, forces: Array, carries: Array) 
     loads = forces[carries][:, 2] / max(float(np.mean(forces[carries][:, 2])), 1e-9) if carries.any() else np.zeros(0)
     columns = np.hstack([BY_INPUT * model.actuation, BY_FORCE * by_force * np.repeat(loads, 3), BY_BASE * gives])
     solution = np.linalg.lstsq(columns, needed, rcond=1e-9)[0]
-    return np.asarray(BY_INPUT * solution[: model.nu])
+    return model.commands(x, v_next, BY_INPUT * solution[: model.nu])
 
 
 def plan_forces(

@@ -165,7 +165,7 @@ def hold(legs: Legs, q: Array, needed: Array | None = None) -> Stance | Refusal:
     points = legs.points_in(q)
     friction = OF_FRICTION * legs.frictions[owners]
     needed = model.double.inverse_dynamics(np.zeros(model.nv)) if needed is None else needed
-    limits = np.min(np.abs(input_limits(model)), axis=0)
+    limits = model.effort_limits
     count, share = len(points), legs.weight / len(legs.feet)
     scale = np.where(np.isfinite(limits), limits, legs.weight)
     program = MathematicalProgram()
@@ -188,7 +188,9 @@ def hold(legs: Legs, q: Array, needed: Array | None = None) -> Stance | Refusal:
     if not result.is_success():
         return Refusal("no forces of its feet, within friction, and of its motors, within their limits, balance it")
     forces = share * np.asarray(result.GetSolution(f)).reshape(-1, 3)
-    return Stance(q, scale * np.asarray(result.GetSolution(u)), points, forces)
+    still = np.zeros(model.nv)
+    u_hold = model.commands(np.append(q, still), still, scale * np.asarray(result.GetSolution(u)))
+    return Stance(q, u_hold, points, forces)
 
 
 def input_limits(model: Model) -> Array:
@@ -429,7 +431,8 @@ def _regulated(legs: Legs, xs: Array, us: Array) -> Shift | Refusal:
     """The model's own steps along xs (N+1, nx) under us (N, nu) and a regulator, which must stay within the limits."""
     model, nv = legs.model, legs.model.nv
     lower, upper = input_limits(model)
-    size = EFFORT_SHARE * np.maximum(np.abs(us[0]), 0.1 * float(np.max(np.abs(us[0]))))
+    effort = np.abs(model.efforts(xs[0], us[0]))
+    size = EFFORT_SHARE * np.maximum(effort, 0.1 * float(np.max(effort))) / model.servo_gains[0]
     Q = np.diag(np.concatenate([np.full(nv, NEAR**-2.0), np.full(nv, SLOW**-2.0)]))
     try:
         policy = TVLQR(model, xs, us, Q, np.diag(size**-2.0))

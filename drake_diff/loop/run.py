@@ -261,7 +261,7 @@ class Fallback:
         if self.mode == "hold":
             return last
         if self.mode == "stop" or not model.nu:
-            return np.zeros(model.nu)
+            return model.neutral_input(estimate)
         at_rest = np.concatenate([estimate[: model.nq], np.zeros(model.nv)])
         return np.asarray(PD(model, 0.0, self.damping, x_ref=at_rest)(estimate, 0.0))
 
@@ -420,7 +420,7 @@ def closed_loop(
         >>> run.applied[:, 0]
         array([0.5, 0.5, 0.5])
     """
-    x0, steps = finite_array("x0", x0, (model.nx,)), count("num_steps", num_steps, 1)
+    x0, steps = model.finite_state("x0", x0), count("num_steps", num_steps, 1)
     return _LoopRun(model, controller, loop or Loop(), seed).result(x0, steps)
 
 
@@ -595,7 +595,7 @@ class _LoopRun:
                     f"the controller took {taken:.3g} s, expected at most {budget:.3g} s: the last command is held"
                 )
                 self.events.append(LoopEvent(t, "late", message))
-                command, status = np.zeros(self.model.nu) if last is None else last, LATE
+                command, status = self.model.neutral_input(estimate) if last is None else last, LATE
         if command is not None and not self.in_charge:
             self.events.append(LoopEvent(t, "recovery", "the controller is followed again"))
         elif command is None and self.in_charge and fallback is not None:
@@ -607,7 +607,8 @@ class _LoopRun:
                 self._end(k, status)
                 return None
             self.controller_error = ""
-            command = fallback.command(self.model, estimate, np.zeros(self.model.nu) if last is None else last)
+            last = self.model.neutral_input(estimate) if last is None else last
+            command = fallback.command(self.model, estimate, last)
         applied = self.drive(k, self._given("commands", k, command))
         self.rows.append((shown, made, command, applied, status, taken))
         return np.asarray(self._given("applied", k, applied))

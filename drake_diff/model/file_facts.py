@@ -43,7 +43,7 @@ def as_mujoco_means(xml: XmlText, path: Path, notes: list[str]) -> XmlText:
     if not xml.root.get("model"):
         xml.set(xml.root, "model", path.stem)
         notes.append(f"The model has no name in the file: it is called {path.stem}.")
-    notes += _frames_to_bodies(xml)
+    notes += [*_frames_to_bodies(xml), *_motors_and_servos(xml)]
     mjcf = Mjcf(xml)
     notes += _unread(mjcf, path)
     for connect in (c for section in xml.root.findall("equality") for c in section.findall("connect")):
@@ -79,6 +79,36 @@ def _frames_to_bodies(xml: XmlText) -> list[str]:
     return [f"{len(frames)} <frame>s became bodies without a joint, which is the same."] if frames else []
 
 
+def _motors_and_servos(xml: XmlText) -> list[str]:
+    """Write <general> actuators of joints, which Drake does not read, as the motors and servos that they are.
+
+    With gain g and bias (0, -g, -d) one is a servo of kp g and kv d, or of the damping ratio -d where that is below 0.
+    """
+    mjcf, written = Mjcf(xml), list[str]()
+    for element in (e for section in xml.root.findall("actuator") for e in section.findall("general")):
+        says = mjcf.attributes(element)
+        gear, gain = _first(says.get("gear", "1"), 1.0), _first(says.get("gainprm", "1"), 1.0)
+        bias = [*_numbers(says.get("biasprm", "0")), 0.0, 0.0, 0.0][:3] if says.get("biastype") == "affine" else [0.0]
+        fixed = says.get("dyntype", "none") == "none" and says.get("gaintype", "fixed") == "fixed" and gain > 0
+        if not (says.get("joint") and fixed and says.get("biastype", "none") in ("none", "affine")):
+            continue
+        shared = {name: says[name] for name in SHARED if name in says}
+        if not any(bias):
+            force = " ".join(f"{end / gain!r}" for end in _numbers(says.get("forcerange", "")))
+            kind, more = "motor", {"gear": repr(gear * gain)} | ({"forcerange": force} if force else {})
+        elif bias[0] == 0 and bias[1] == -gain:
+            kind, more = "position", {"kp": repr(gain), "kv" if bias[2] <= 0 else "dampratio": repr(abs(bias[2]))}
+        else:
+            continue
+        for name, value in (shared | more).items():
+            xml.set(element, name, value)
+        for name in ("dyntype", "gaintype", "gainprm", "biastype", "biasprm"):
+            xml.drop(element, name)
+        xml.rename(element, kind)
+        written.append(f"{says.get('name', '?')} ({kind})")
+    return [f"<general> actuators read as what they are: {', '.join(written)}."] if written else []
+
+
 def _unread(mjcf: "Mjcf", path: Path) -> Iterator[str]:
     """A sentence for each thing that Drake's parser leaves out without a word."""
     elements = [element for section in mjcf.root.findall("worldbody") for element in section.iter()]
@@ -90,6 +120,9 @@ def _unread(mjcf: "Mjcf", path: Path) -> Iterator[str]:
         if says.get("type") in ("ball", "free") and any(_numbers(says.get("armature", "0"))):
             name = says.get("name", "without a name")
             yield f"{path}:{element.line}: the armature of the {says['type']} joint {name} is ignored."
+    for servo in (e for section in mjcf.root.findall("actuator") for e in section.findall("position")):
+        if _first(mjcf.attributes(servo).get("timeconst", "0")):
+            yield f"{path}:{servo.line}: the filter of a servo's commands (timeconst) is ignored."
     for mesh in (m for section in mjcf.root.findall("asset") for m in section.findall("mesh")):
         if mjcf.attributes(mesh).get("inertia") == "shell":
             yield f"{path}:{mesh.line}: a mesh whose mass is in its shell is taken as solid, its inertia is ignored."
@@ -143,6 +176,8 @@ class JointSays:
 
     `sides` are the least and the greatest effort, where MJCF has them differ: the limit is then the larger size.
     `passive` says that it is not to be driven: so SDF means an effort limit of 0, where it makes a motor of each other.
+    `range` is that of the joint, `command` that of its servo's commanded positions [rad or m], and `damping_ratio` what
+    MuJoCo makes the servo's kv of, by the inertia that the joint moves in the file's pose.
     `spring` is the stiffness [N m/rad or N/m] and the position at rest of one that Drake's parser does not read,
     `armature` [kg m^2 or kg] MJCF's inertia of a rotor, which Drake has only where an actuator is, and `start` [rad or
     m] the coordinate in MJCF's pose.
@@ -151,6 +186,9 @@ class JointSays:
     effort: float | None
     passive: bool = False
     sides: Range | None = None
+    range: Range | None = None
+    command: Range | None = None
+    damping_ratio: float = 0.0
     spring: tuple[float, float] | None = None
     armature: float = 0.0
     start: float = 0.0
@@ -232,6 +270,9 @@ class FileActuator:
     read: bool  # by Drake
     sides: Range  # [N or N m]
     gains: tuple[float, float] | None
+    line: int
+    command: Range | None = None
+    damping_ratio: float = 0.0
 
     @property
     def limit(self) -> float:
@@ -297,6 +338,7 @@ class Mjcf:
                 joints[says["name"]] = JointSays(
                     max(map(abs, sides)) if sides else None,
                     sides=sides,
+                    range=(unit * ends[0], unit * ends[1]) if (ends := self._range(says, "")) else None,
                     spring=(stiffness[0], unit * _first(says.get("springref", "0")))
                     if len(stiffness) == 1 and stiffness != [0.0]
                     else None,
@@ -332,19 +374,32 @@ class Mjcf:
         says = self.attributes(element)
         gear, kind = _first(says.get("gear", "1"), 1.0), element.tag
         force, control = self._range(says, "force"), self._range(says, "ctrl")
-        gains, scaled = None, [(force, gear)]
+        gains, command, scaled = None, None, [(force, gear)]
         if kind == "motor":
             scaled.append((control, gear))
         elif kind == "general" and says.get("biastype", "none") == "none":
             scaled.append((control, gear * _first(says.get("gainprm", "1"), 1.0)))
         elif kind == "position":
             gains = gear**2 * _first(says.get("kp", "1"), 1.0), gear**2 * _first(says.get("kv", "0"))
+            command = self._command(says, control, gear)
         joint = says.get("joint", "")
         at_joint = [sorted(factor * end for end in ends) for ends, factor in scaled if ends]
         if joint in self.joints and (sides := self.joints[joint].sides):
             at_joint.append(list(sides))
         lower, upper = max((s[0] for s in at_joint), default=-math.inf), min((s[1] for s in at_joint), default=math.inf)
-        return FileActuator(kind, says.get("name", ""), joint, kind in KINDS and bool(joint), (lower, upper), gains)
+        read, ratio = kind in KINDS and bool(joint), _first(says.get("dampratio", "0"))
+        return FileActuator(
+            kind, says.get("name", ""), joint, read, (lower, upper), gains, element.line, command, ratio
+        )
+
+    def _command(self, says: Attributes, control: Range | None, gear: float) -> Range | None:
+        """What a servo is commanded to, at the joint [rad or m]; None without a range."""
+        inherited = _first(says.get("inheritrange", "0"))
+        ends = self.joints[says["joint"]].range if inherited and says.get("joint") in self.joints else None
+        if ends:
+            middle, half = (ends[0] + ends[1]) / 2, inherited * (ends[1] - ends[0]) / 2
+            control = middle - half, middle + half
+        return (min(e / gear for e in control), max(e / gear for e in control)) if control and gear else None
 
     def mimics(self, instance: str) -> Iterator[Mimic]:
         """Joints that follow another one linearly, of the robot that is called `instance`."""
@@ -408,6 +463,11 @@ def correct(plant: MultibodyPlant, instance: ModelInstanceIndex, mjcf: Mjcf) -> 
     limits, gains = [], []
     for actuator, meant in zip(motors, says, strict=True):
         lower, upper = meant.sides
+        if meant.gains is not None and lower != -upper:
+            raise ModelError(
+                f"line {meant.line}: expected a servo that pushes as hard to both sides, got {lower:g} to {upper:g} of "
+                f"{actuator.name()}: Drake's have one limit"
+            )
         if lower != -upper or not math.isclose(actuator.effort_limit(), upper, rel_tol=1e-12):
             sides = f"{upper:g}" if lower == -upper else f"{lower:g} to {upper:g}"
             limits.append(f"{actuator.name()} ({sides} for {actuator.effort_limit():g})")
@@ -424,7 +484,8 @@ def correct(plant: MultibodyPlant, instance: ModelInstanceIndex, mjcf: Mjcf) -> 
         )
     if gains:
         notes.append(f"Gains kp and kv of position actuators at the joint, with the gear: {', '.join(gains)}.")
-    left = [f"{a.name or '?'} ({a.kind} of {a.joint or 'no joint'})" for a in mjcf.actuators if not a.read]
+    unread = [a for a in mjcf.actuators if not a.read]
+    left = [f"{a.name or '?'} ({a.kind} of {a.joint or 'no joint'}, line {a.line})" for a in unread]
     if left:
         notes.append(f"{len(left)} actuators left out, of kinds that Drake does not read: {', '.join(left)}.")
     return notes
@@ -502,10 +563,14 @@ def _read_urdf(robot: Element, name: str, facts: FileFacts) -> None:
 
 
 def _read_mjcf(mjcf: Mjcf, name: str, facts: FileFacts) -> None:
-    driven = {actuator.joint: actuator for actuator in mjcf.actuators if math.isfinite(actuator.limit)}
+    driven = {actuator.joint: actuator for actuator in mjcf.actuators}
     for joint, says in mjcf.joints.items():
         motor = driven.get(joint)
-        facts.joints[name, joint] = replace(says, effort=motor.limit, sides=motor.sides) if motor else says
+        if motor is not None and math.isfinite(motor.limit):
+            says = replace(says, effort=motor.limit, sides=motor.sides)
+        if motor is not None:
+            says = replace(says, command=motor.command, damping_ratio=motor.damping_ratio)
+        facts.joints[name, joint] = says
     facts.followers.update({(name, mimic.follower): mimic for mimic in mjcf.mimics(name)})
     facts.disabled.update(mjcf.disabled)
     facts.touching[name] = mjcf.touching

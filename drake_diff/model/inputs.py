@@ -2,7 +2,12 @@
 
 A diagram's own systems (propellers, wings, gains, thrusters) act on the plant through its input ports. Vector inputs
 that the diagram exports and that reach the plant are entries of u, in the order of the exports. Actuators that nothing
-in the diagram drives are entries, too: where the diagram exports them, else first.
+in the diagram drives are entries, too: where the diagram exports them, else first. The entry of an actuator is its
+effort, or the position that its servo is commanded to: Drake's PD control then exerts
+
+    clip(kp (u - q') - kd v', -limit, limit)
+
+at the end (q', v') of the step, as MuJoCo's <position> does at its start.
 """
 
 from collections.abc import Mapping, Sequence
@@ -145,6 +150,7 @@ class Inputs:
     lower: Array  # (nu,)
     upper: Array
     actuator: NDArray[np.intp]  # (nu,) which actuator an entry drives, -1 where it is one of a port
+    commanded: NDArray[np.bool_]  # (nu,) whether an entry is a position that a servo is commanded to
     ports: tuple[tuple[int, slice], ...]  # the diagram's own ports that are inputs, and where they stand in u
     fed: frozenset[int]  # the plant's input ports that systems feed, or that are inputs themselves
     fed_actuators: tuple[int, ...]  # those that are no entries of u, as a system drives them
@@ -159,7 +165,7 @@ class Inputs:
     @property
     def one_sided(self) -> tuple[Array, Array]:
         """Lower and upper limits (nu,) of motors whose sides differ, which steps do not keep; infinite of others."""
-        differ = (self.actuator >= 0) & (self.lower != -self.upper)
+        differ = (self.actuator >= 0) & (self.lower != -self.upper) & ~self.commanded
         return np.where(differ, self.lower, -np.inf), np.where(differ, self.upper, np.inf)
 
     def of_actuators(self, rows: Any) -> Array:
@@ -231,8 +237,12 @@ def _leaf(system: Any, port: Any) -> Any:
     return system
 
 
-def read_inputs(diagram: Diagram, plant: Any, facts: FileFacts, forces: Sequence[BodyForce] = ()) -> Inputs:
+def read_inputs(
+    diagram: Diagram, plant: Any, facts: FileFacts, forces: Sequence[BodyForce] = (), servos: bool = False
+) -> Inputs:
     """The inputs of a diagram with one plant; `forces` are those of its port `BODY_FORCES`, `facts` of its files.
+
+    `servos` says whether actuators with PD gains are commanded positions, else efforts beside what these hold.
 
     Raises ModelError where a system that acts on the plant has a state of its own, or where the plant's actuation is
     fed inside and there are no other inputs.
@@ -270,7 +280,8 @@ def read_inputs(diagram: Diagram, plant: Any, facts: FileFacts, forces: Sequence
     chosen = {number for number, _, _ in vectors}
     fed = frozenset(i for i in acting if _is_fed(wiring.sources[id(plant), i], chosen))
     driven = [i for i, a in enumerate(actuators(plant)) if whole in fed or ports_of[a.model_instance()] in fed]
-    rows = _rows_of_actuators(plant, facts, [i for i in range(plant.num_actuators()) if i not in driven])
+    commanded = [servos and a.has_controller() for a in actuators(plant)]
+    rows = _rows_of_actuators(plant, facts, [i for i in range(plant.num_actuators()) if i not in driven], commanded)
     input_rows: list[Row] = []
     ports: list[tuple[int, slice]] = []
     first = min(places, default=0)
@@ -293,6 +304,7 @@ def read_inputs(diagram: Diagram, plant: Any, facts: FileFacts, forces: Sequence
         lower=frozen(lower),
         upper=frozen(upper),
         actuator=np.array(index, dtype=np.intp),
+        commanded=np.array([i >= 0 and commanded[i] for i in index], dtype=bool),
         ports=tuple(ports),
         fed=fed,
         fed_actuators=tuple(driven),
@@ -320,13 +332,19 @@ def _check_states(systems: Sequence[Any]) -> None:
             )
 
 
-def _rows_of_actuators(plant: Any, facts: FileFacts, which: list[int]) -> list[Row]:
+def _rows_of_actuators(plant: Any, facts: FileFacts, which: list[int], commanded: list[bool]) -> list[Row]:
     motors, rows = actuators(plant), list[Row]()
     for i, name in enumerate(labelled(motors)):
         joint, limit = motors[i].joint(), float(motors[i].effort_limit())
+        slides = joint.type_name() == "prismatic"
         says = facts.joints.get((plant.GetModelInstanceName(joint.model_instance()), joint.name()))
+        if commanded[i]:
+            limits = float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
+            lower, upper = says.command if says and says.command else limits
+            rows.append((name, "m" if slides else "rad", lower, upper, i))
+            continue
         lower, upper = says.sides if says and says.sides and np.isfinite(limit) else (-limit, limit)
-        rows.append((name, "N" if joint.type_name() == "prismatic" else "N m", lower, upper, i))
+        rows.append((name, "N" if slides else "N m", lower, upper, i))
     return [rows[i] for i in which]
 
 

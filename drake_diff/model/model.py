@@ -21,7 +21,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from drake_diff._base.arrays import finite_array, positive_float, seconds
 from drake_diff._base.sandbox import call
 from drake_diff._base.values import ShowsItsRepr
-from drake_diff.exceptions import InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
+from drake_diff.exceptions import InputError, ModelError, ModelWarning, ShapeError, SimulationError, UnknownNameError
 from drake_diff.model.contact_geometry import (
     CONTACT_MODELS,
     ROUTES,
@@ -46,14 +46,18 @@ from drake_diff.model.repairs import (
     JointCoupling,
     add_actuators,
     add_ground,
+    add_servos,
     add_springs,
     as_actuated,
+    as_gains,
     as_ground,
     as_names,
     check_contact,
     check_mimic,
+    check_servos,
     couple,
     coupling_of,
+    damp_servos,
     fix,
     fix_mimics,
     hold_base,
@@ -110,6 +114,7 @@ class Model(ShowsItsRepr):
         body_forces: tuple[BodyForce, ...] = (),
         facts: FileFacts | None = None,
         shared: SharedPlant | None = None,
+        servos: bool = False,
     ):
         self.diagram = diagram
         self.forces = forces  # they act beside the plant's own
@@ -132,7 +137,8 @@ class Model(ShowsItsRepr):
         self.nv: int = self.plant.num_velocities() if coupling is None else len(coupling.own_v)
         self.nx = self.nq + self.nv
         self.body_forces = body_forces
-        self.inputs = read_inputs(diagram, self.plant, self.file_facts, body_forces)
+        self.servos = servos  # whether actuators with PD gains are commanded positions
+        self.inputs = read_inputs(diagram, self.plant, self.file_facts, body_forces, servos)
         self.nu: int = len(self.inputs.names)
         self.notes += tuple(f"the exported input {name} does not reach the plant" for name in self.inputs.left_out)
         self.time_step: float = self.plant.time_step()
@@ -217,6 +223,7 @@ class Model(ShowsItsRepr):
                 body_forces=self.body_forces,
                 facts=self.file_facts,
                 shared=self.shared,
+                servos=self.servos,
             )
             self._whole.held = self.held
         here = self._whole._here
@@ -227,7 +234,7 @@ class Model(ShowsItsRepr):
 
     @property
     def actuation(self) -> np.ndarray:
-        """B (nv, nu): the generalized force by the inputs; 0 of those that systems of the diagram hand on."""
+        """B (nv, nu): the generalized force by the efforts of the inputs; 0 of what systems of the diagram hand on."""
         return self.inputs.of_actuators(self.by_effort.T).T
 
     @property
@@ -237,9 +244,65 @@ class Model(ShowsItsRepr):
         return B if self.coupling is None else self.coupling.spread.T @ B
 
     @property
+    def servo_gains(self) -> tuple[np.ndarray, np.ndarray]:
+        """kp and kd (nu,) of the inputs that are commanded positions; 1 and 0 of others."""
+        gains, every = np.array([np.ones(self.nu), np.zeros(self.nu)]), actuators(self.plant)
+        for i in np.flatnonzero(self.inputs.commanded):
+            servo = every[self.inputs.actuator[i]].get_controller_gains()
+            gains[:, i] = servo.p, servo.d
+        return gains[0], gains[1]
+
+    @property
+    def effort_limits(self) -> np.ndarray:
+        """(nu,) what an input exerts at most [N or N m]: of two sides the smaller, infinite without a limit."""
+        sides = np.minimum(np.abs(self.inputs.lower), np.abs(self.inputs.upper))
+        motors = self.inputs.of_actuators([a.effort_limit() for a in actuators(self.plant)])
+        return np.where(self.inputs.commanded, motors, sides)
+
+    def efforts(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """(..., nu) what inputs u (..., nu) exert [N or N m], x (..., nx) being the state after the step.
+
+        Of a commanded position it is kp (u - q) - kd v, not yet cut off at its motor's limit.
+        """
+        kp, kd = self.servo_gains
+        q, v = self._joints_of_servos(x)
+        return np.asarray(kp * (u - q) - kd * v)
+
+    def commands(self, x: np.ndarray, v_next: np.ndarray, efforts: np.ndarray) -> np.ndarray:
+        """(nu,) the inputs that exert `efforts` (nu,) in a step from x (nx,) to the velocities v_next (nv,)."""
+        kp, kd = self.servo_gains
+        q, v = self._joints_of_servos(np.concatenate([x[: self.nq], v_next]))
+        return np.asarray((efforts + kp * (q + self.time_step * v) + kd * v) / kp)
+
+    def neutral_input(self, x: np.ndarray) -> np.ndarray:
+        """(..., nu) of servos the positions that their joints have in x (..., nx); 0 of other inputs."""
+        return self._joints_of_servos(x)[0]
+
+    def _joints_of_servos(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities (..., nu) of the joints of commanded positions in states x (..., nx); else 0."""
+        which, every = self.inputs.commanded, actuators(self.plant)
+        driven = [every[i].joint() for i in self.inputs.actuator[which]]
+        states = x if self.coupling is None else self.coupling.state(x)
+        q, v = np.zeros((2, *np.shape(x)[:-1], self.nu))
+        q[..., which] = states[..., [joint.position_start() for joint in driven]]
+        v[..., which] = states[..., [self.plant.num_positions() + joint.velocity_start() for joint in driven]]
+        return q, v
+
+    @property
     def num_constraints(self) -> int:
         """How many act in the plant beside those of mimic joints that are reduced."""
         return int(self.plant.num_constraints()) - self.held
+
+    def finite_state(self, subject: str, x: ArrayLike) -> np.ndarray:
+        """`x` (nx,) as an array; ShapeError, which names what floats, or NonFiniteError where it is no state."""
+        try:
+            return finite_array(subject, x, (self.nx,))
+        except ShapeError as error:
+            floating = [self.plant.get_body(i).name() for i in sorted(self.plant.GetFloatingBaseBodies())]
+            if not floating:
+                raise
+            why = f'{" and ".join(floating)} floats, with 13 states; base="weld" fixes a robot to the world'
+            raise ShapeError(subject, got=np.shape(x), expected=(self.nx,), because=why) from error
 
     def places(self, joint: Any) -> tuple[range, range]:
         """Where the coordinates of a joint are in q and in v; empty of a joint that only follows another."""
@@ -394,13 +457,13 @@ class Model(ShowsItsRepr):
         twin = Twin(
             scalar, diagram, plant, scene_graph, root, context, defaults, self.inputs, self.forces, self.coupling
         )
-        if self.inputs.ports:
+        if self.inputs.ports or self.inputs.commanded.any():
             twin.set_input(np.zeros(self.nu).astype(scalar))
         return twin
 
     @cached_property
     def pd_targets(self) -> dict[Any, np.ndarray]:
-        """What PD-controlled actuators hold, by model instance: their joints' default positions, at rest.
+        """What PD-controlled actuators hold where no input commands it: their joints' default positions, at rest.
 
         Without a target Drake drops the controllers and the actuation input of that instance. A port that the
         user's diagram connects is left to it.
@@ -409,7 +472,7 @@ class Model(ShowsItsRepr):
         for instance in instances(self.plant):
             driven = [a for a in actuators(self.plant) if a.model_instance() == instance]
             port = self.plant.get_desired_state_input_port(instance)
-            if any(a.has_controller() for a in driven) and not self.feeds(port):
+            if any(a.has_controller() for a in driven) and not self.servos and not self.feeds(port):
                 positions = [float(q) for a in driven for q in a.joint().default_positions()]
                 targets[instance] = np.array(positions + [0.0] * len(positions))
         return targets
@@ -449,6 +512,8 @@ def load_model(
     near_rigid: float | None = None,
     stiffness: float | None = None,
     dissipation: float | None = None,
+    inputs: str | None = None,
+    gains: Sequence[float] | Mapping[str, Sequence[float]] | None = None,
     isolated: bool = False,
 ) -> Model:
     """The robot in a URDF, SDF, MJCF (.xml) or .dmd.yaml file as a discrete model.
@@ -492,6 +557,13 @@ def load_model(
             own default is 1e6. Where two shapes touch it is k1 k2 / (k1 + k2): half of it, where both have it.
         dissipation: [s/m] Hunt and Crossley's, of similar and lagged contact, of shapes for which the file gives none;
             Drake's own default is 50.
+        inputs: "position" makes the inputs commanded positions [rad or m] of servos, within the joints' limits: Drake's
+            PD control moves each joint there, with an effort within its motor's limit. "effort" makes them efforts, in
+            the file's servos beside what holds the joints' default positions. None takes positions where the file has
+            servos (MJCF's <position>, Drake's controller_gains), else efforts.
+        gains: (kp, kd) of the servos [N m/rad and N m s/rad, or N/m and N s/m], for all revolute and prismatic joints
+            that mimic no other, or by the name of the joint; a joint without an actuator gets one of its name. None
+            takes the file's.
         isolated: Whether the file is first read, and a step made, in a process of its own with at most 60 s and 1 GiB:
             Drake's parsers crash on some damaged meshes, and would end this process. It takes a few seconds.
 
@@ -519,6 +591,7 @@ def load_model(
     _check_choice("meshes", meshes, TREATMENTS)
     check_contact(contact)
     check_mimic(mimic)
+    check_servos(inputs, gains)
     body_forces = check_body_forces(body_forces)
     source = _as_path(path)
     config = MultibodyPlantConfig(
@@ -541,6 +614,7 @@ def load_model(
         "fix_joints": as_names("fix_joints", fix_joints),
         "packages": as_packages(packages),
         "body_forces": body_forces,
+        "gains": as_gains(gains),
     }
     if isolated:
         check_in_child_process(source, options)
@@ -557,6 +631,7 @@ def load_model(
         plant.Finalize()
     except DRAKES_REFUSALS as error:
         raise ModelError(f"{source}: expected a model that Drake can finalize; Drake says: {error}") from error
+    notes += damp_servos(plant, read.facts) if gains is None else ()
     coupling = coupling_of(plant, mimics)
     add_body_forces(builder, plant, body_forces)
     diagram = builder.Build()
@@ -579,6 +654,7 @@ def load_model(
         coupling=coupling,
         body_forces=body_forces,
         facts=read.facts,
+        servos=inputs != "effort",
     )
     model.options = options
     return model
@@ -741,6 +817,7 @@ def _repaired(
             reduced = couple(plant, mimics)
             notes += reduced if choice == "reduce" else ()
         notes += add_actuators(plant, options["actuators"], facts)
+        notes += add_servos(plant, options["inputs"], options["gains"], facts)
         if weld_base is not None:
             weld_link(plant, weld_base)
         notes += hold_base(plant, base)

@@ -33,6 +33,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import (
     FrameIndex,
+    PdControllerGains,
     PrismaticJoint,
     PrismaticSpring,
     RevoluteJoint,
@@ -41,7 +42,7 @@ from pydrake.multibody.tree import (
 )
 from scipy.sparse.csgraph import connected_components
 
-from drake_diff._base.arrays import LARGEST, Array
+from drake_diff._base.arrays import LARGEST, Array, finite_array
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.model.contact_geometry import collision_geometries
 from drake_diff.model.file_facts import FileFacts, Mimic
@@ -50,6 +51,8 @@ from drake_diff.model.plant import actuators, bodies, joints, labelled, named
 
 GROUND_FRICTION = 0.5  # of ground=True: what Drake's SceneGraph gives to geometry without a friction of its own
 Actuated = str | tuple[str, ...] | dict[str, float | None] | None
+INPUTS = ("position", "effort")
+Gains = tuple[float, float]
 
 
 def as_actuated(value: Any) -> Actuated:
@@ -124,7 +127,73 @@ def add_actuators(plant: MultibodyPlant, asked: Actuated, facts: FileFacts) -> t
     return tuple(notes)
 
 
-def _chosen(plant: MultibodyPlant, asked: str | Collection[str], facts: FileFacts) -> dict[str, Any]:
+def check_servos(inputs: str | None, gains: Any) -> None:
+    """UnknownNameError where `inputs` is none of INPUTS nor None, InputError where gains have no servos."""
+    if inputs is not None and inputs not in INPUTS:
+        raise UnknownNameError("inputs", got=inputs, known=INPUTS)
+    if gains is not None and inputs != "position":
+        raise InputError("inputs", got=f"{inputs!r} and gains", expected='"position", which they are of')
+
+
+def as_gains(value: Any) -> Gains | dict[str, Gains] | None:
+    """The argument `gains` as it is kept; InputError where it is no pair of kp above 0 and kd of at least 0."""
+    if isinstance(value, Mapping):
+        return {str(name): _pair(f"gains[{name!r}]", pair) for name, pair in value.items()}
+    return None if value is None else _pair("gains", value)
+
+
+def _pair(subject: str, value: Any) -> Gains:
+    kp, kd = finite_array(subject, value, (2,)).tolist()
+    if not (kp > 0 and kd >= 0):
+        raise InputError(subject, got=(kp, kd), expected="(kp, kd) with kp above 0 and kd at least 0")
+    return kp, kd
+
+
+def add_servos(
+    plant: MultibodyPlant, inputs: str | None, gains: Gains | dict[str, Gains] | None, facts: FileFacts
+) -> tuple[str, ...]:
+    """Give the actuators of joints the gains of servos, and the joints actuators that have none."""
+    if inputs != "position":
+        return ()
+    if gains is None:
+        without = [actuator.name() for actuator in actuators(plant) if not actuator.has_controller()]
+        if without or not actuators(plant):
+            expected = "(kp, kd): the file has no servo of " + (", ".join(without) or "any joint")
+            raise InputError("gains", got=None, expected=expected)
+        return ()
+    indices = [actuator.joint().index() for actuator in actuators(plant)]
+    driven = [name for name, joint in labelled(joints(plant)).items() if joint.index() in indices]
+    chosen = _chosen(plant, list(gains) if isinstance(gains, dict) else driven, facts, "gains")
+    chosen |= {} if isinstance(gains, dict) else _chosen(plant, "all", facts)
+    notes = add_actuators(plant, tuple(n for n, joint in chosen.items() if joint.index() not in indices), facts)
+    by_joint = {actuator.joint().index(): actuator for actuator in actuators(plant)}
+    for name, joint in chosen.items():
+        kp, kd = gains[name] if isinstance(gains, dict) else gains
+        by_joint[joint.index()].set_controller_gains(PdControllerGains(p=kp, d=kd))
+    return (*notes, f"{len(chosen)} inputs are commanded positions, with the gains given: {', '.join(chosen)}.")
+
+
+def damp_servos(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
+    """Give servos that MJCF gives a damping ratio their kv [N m s/rad or N s/m], once the plant is finalized.
+
+    That is 2 ratio sqrt(kp / w), where w is the joint's own entry of the inverse mass matrix in the file's pose.
+    """
+    damped = []
+    for actuator in actuators(plant):
+        joint = actuator.joint()
+        says = facts.joints.get(_key(plant, joint))
+        if says is not None and says.damping_ratio and actuator.has_controller():
+            inverse, i = np.linalg.inv(plant.CalcMassMatrix(plant.CreateDefaultContext())), joint.velocity_start()
+            kp = actuator.get_controller_gains().p
+            kd = 2 * says.damping_ratio * float(np.sqrt(kp / inverse[i, i]))
+            actuator.set_controller_gains(PdControllerGains(p=kp, d=kd))
+            damped.append(f"{actuator.name()} ({kd:.4g})")
+    return (f"Gains kv of servos by their damping ratios: {', '.join(damped)}.",) if damped else ()
+
+
+def _chosen(
+    plant: MultibodyPlant, asked: str | Collection[str], facts: FileFacts, subject: str = "actuators"
+) -> dict[str, Any]:
     """The joints that are asked for, by name; UnknownNameError or InputError where one cannot be driven."""
     possible = {name: joint for name, joint in labelled(joints(plant)).items() if can_be_driven(joint)}
     copies = {name for name, joint in possible.items() if _key(plant, joint) in facts.followers}
@@ -133,9 +202,9 @@ def _chosen(plant: MultibodyPlant, asked: str | Collection[str], facts: FileFact
         return {name: j for name, j in possible.items() if j.index() not in driven and name not in copies}
     for name in asked:
         if name not in possible:
-            raise UnknownNameError("actuators: revolute or prismatic joint", got=name, known=possible)
+            raise UnknownNameError(f"{subject}: revolute or prismatic joint", got=name, known=possible)
         if name in copies:
-            raise InputError("actuators", got=repr(name), expected=f"no joint that mimics another, as {name} does")
+            raise InputError(subject, got=repr(name), expected=f"no joint that mimics another, as {name} does")
     return {name: possible[name] for name in asked}
 
 

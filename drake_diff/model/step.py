@@ -53,7 +53,7 @@ def step(
 def check_point(model: Model, x: ArrayLike, u: ArrayLike | None) -> tuple[Array, Array]:
     """`x` and `u` as finite arrays of the model's sizes."""
     no_input = u is None and model.nu == 0
-    return finite_array("x", x, (model.nx,)), finite_array("u", [] if no_input else u, (model.nu,))
+    return model.finite_state("x", x), finite_array("u", [] if no_input else u, (model.nu,))
 
 
 def set_state(twin: Twin, x: Any) -> None:

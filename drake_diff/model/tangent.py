@@ -143,10 +143,11 @@ def sample_states(model: Model, count: int, seed: int = 0) -> list[SampledState]
     """`count` states, every other one touching where contact can be found; the same seed gives the same states."""
     random = np.random.default_rng(seed)
     lower, upper = model.inputs.lower, model.inputs.upper
-    limit = np.minimum(np.abs(lower), np.abs(upper))
+    limit = model.effort_limits
     effort = EFFORT * np.where(limit < 1e6, limit, 1.0)
     middle = np.zeros(model.nu)
-    for i in np.flatnonzero((lower >= 0) | (upper <= 0)).tolist():  # a force that cannot change its sign
+    one_way = ((lower >= 0) | (upper <= 0)) & ~model.inputs.commanded
+    for i in np.flatnonzero(one_way).tolist():  # a force that cannot change its sign
         near = lower[i] if lower[i] >= 0 else upper[i]
         far = float(np.clip(near + ONE_WAY * (1 if lower[i] >= 0 else -1), lower[i], upper[i]))
         middle[i], effort[i] = (near + far) / 2, EFFORT * abs(far - near)
@@ -156,7 +157,8 @@ def sample_states(model: Model, count: int, seed: int = 0) -> list[SampledState]
         x = _touching(model, random) if touches and i % 2 else None
         kind = FREE if x is None else CONTACT
         x = _free(model, random) if x is None else x
-        samples.append(SampledState(kind, frozen(x), frozen(middle + effort * random.uniform(-1, 1, model.nu))))
+        u = model.commands(x, x[model.nq :], middle + effort * random.uniform(-1, 1, model.nu))
+        samples.append(SampledState(kind, frozen(x), frozen(u)))
     return samples
 
 

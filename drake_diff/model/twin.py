@@ -10,6 +10,7 @@ from typing import Any, Protocol
 from weakref import WeakSet
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.multibody.tree import MultibodyForces_
 
 from drake_diff._base.arrays import Array
@@ -112,7 +113,20 @@ class Twin:
     @cached_property
     def _actuation(self) -> Any:
         """The plant's own input port where u is its actuation and nothing else, or None."""
-        return self.plant.get_actuation_input_port() if self.inputs.plain else None
+        plain = self.inputs.plain and not self.inputs.commanded.any()
+        return self.plant.get_actuation_input_port() if plain else None
+
+    @cached_property
+    def _servos(self) -> list[tuple[Any, int, NDArray[np.intp], NDArray[np.intp]]]:
+        """The ports of desired states, their sizes, and which of their entries are which of u."""
+        every, ports = actuators(self.plant), []
+        for instance in instances(self.plant):
+            driven = [i for i, a in enumerate(every) if a.model_instance() == instance]
+            entries = np.flatnonzero(self.inputs.commanded & np.isin(self.inputs.actuator, driven))
+            places = np.array([driven.index(i) for i in self.inputs.actuator[entries]], dtype=np.intp)
+            if len(entries):
+                ports.append((self.plant.get_desired_state_input_port(instance), 2 * len(driven), places, entries))
+        return ports
 
     @cached_property
     def _workspace(self) -> Any:
@@ -135,6 +149,22 @@ class Twin:
         for velocities, joint in self._moving_joints:
             coefficients[velocities] = joint.GetDampingVector(self.context)
         return coefficients
+
+    def _implicit_damping(self) -> Any:
+        """(nv,) of the plant: that of joints, and of PD control, h kp + kd, where it is not at its limit."""
+        coefficients, h = self._joint_damping(), self.plant.time_step()
+        efforts = self.plant.get_net_actuation_output_port().Eval(self.context) if self._controlled else ()
+        for i, actuator, velocity in self._controlled:
+            if abs(efforts[i]) < actuator.effort_limit():
+                gains = actuator.get_controller_gains()
+                coefficients[velocity] += h * gains.p + gains.d
+        return coefficients
+
+    @cached_property
+    def _controlled(self) -> list[tuple[int, Any, int]]:
+        """The actuators with PD gains: their numbers, and where the velocities of their joints are."""
+        every = enumerate(actuators(self.plant))
+        return [(i, a, int(a.joint().velocity_start())) for i, a in every if a.has_controller()]
 
     @property
     def position_limits(self) -> tuple[Array, Array]:
@@ -171,7 +201,7 @@ class Twin:
         if self.coupling is None:
             return end
         plant, nq = self.plant, self.plant.num_positions()
-        A = plant.CalcMassMatrix(self.context) + np.diag(plant.time_step() * self._joint_damping())
+        A = plant.CalcMassMatrix(self.context) + np.diag(plant.time_step() * self._implicit_damping())
         v = self.coupling.next_velocities(A, end[nq:])
         q = plant.GetPositions(self.context) + plant.time_step() * self._rates(self.coupling.velocities(v))
         return np.concatenate([q[self.coupling.own_q], v])
@@ -216,7 +246,11 @@ class Twin:
             return
         for number, where in self.inputs.ports:
             self.diagram.get_input_port(number).FixValue(self.root_context, u[where])
-        which = self.inputs.actuator >= 0
+        for port, size, places, entries in self._servos:
+            desired = np.zeros(size).astype(self.scalar)
+            desired[places] = u[entries]
+            port.FixValue(self.context, desired)
+        which = (self.inputs.actuator >= 0) & ~self.inputs.commanded
         if which.any():
             effort = np.zeros(self.plant.num_actuators()).astype(self.scalar)
             effort[self.inputs.actuator[which]] = u[which]

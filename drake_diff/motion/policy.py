@@ -98,6 +98,8 @@ class PD:
         if not model.inputs.plain:
             got = f"the inputs {', '.join(model.input_names)}"
             raise InputError("model", got=got, expected="one whose inputs are its actuators")
+        if model.inputs.commanded.any():
+            raise InputError("model", got="commanded positions as inputs", expected="efforts, which this policy gives")
         if not joints:
             raise InputError("model", got="no actuators", expected="at least one")
         self.x_ref = finite_array("x_ref", model.default_state if x_ref is None else x_ref, (model.nx,))

@@ -172,7 +172,7 @@ def _line(problem: Problem, method: str, seed: int) -> Guess:
     if problem.optimizes_controls and not us.any() and followed is not None:
         us = (followed[:-1] + followed[1:]) / 2
     if problem.optimizes_controls and not us.any():
-        us = us + _holding(problem)
+        us = us + _holding(problem, xs)
     if method == "shooting" and problem.optimizes_controls and not us.any():
         limit = np.minimum(np.abs(problem.bounds.u_lower), np.abs(problem.bounds.u_upper))
         size = np.where(np.isfinite(limit), np.minimum(limit, 100.0), 1.0)
@@ -213,7 +213,10 @@ def another_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:
     xs = way + far * np.maximum(1.0, np.abs(way[-1] - problem.x0)) * sum(waves)
     if problem.initial_state_mask.any():  # a first state that is free is another one too
         xs = xs + far * (1 - s) * np.where(problem.initial_state_mask, random.standard_normal(problem.nx), 0.0)
-    us = np.clip(size * sum(swings), b.u_lower, b.u_upper)
+    us = size * sum(swings)
+    if isinstance(problem.system, Model):
+        us = np.where(problem.system.inputs.commanded, problem.system.neutral_input(xs), us)
+    us = np.clip(us, b.u_lower, b.u_upper)
     first = int(problem.initial_state_is_given)
     xs[first:] = np.clip(xs[first:], b.x_lower, b.x_upper)
     for start in tangent_space(problem.model).quaternions if problem.has_model else ():
@@ -223,21 +226,22 @@ def another_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:
     return xs, us, float(np.clip(problem.start_horizon * LONGER ** random.uniform(-1, 1), *problem.horizon))
 
 
-def _holding(problem: Problem) -> Array:
-    """(nu,) the inputs that hold the first state best for a step, within bounds, where they are not all actuators.
+def _holding(problem: Problem, xs: Array) -> Array:
+    """(N, nu) the inputs that hold the first state best for a step, within bounds, where they are not all actuators.
 
     Rotors and thrusters without thrust do not steer: a quadrotor that falls moves sideways for none of them. Actuators
-    do, and their guess is 0.
+    do, and their guess is 0; that of servos is where their joints are in xs (N+1, nx).
     """
     model = problem.model if isinstance(problem.system, Model) else None
     if model is None or model.inputs.plain:
-        return np.zeros(problem.nu)
+        return np.zeros((len(xs) - 1, problem.nu)) if model is None else model.neutral_input(xs[1:])
     bounds, still = problem.bounds, np.concatenate([problem.x0[: model.nq], np.zeros(model.nv)])
     none = np.clip(np.zeros(model.nu), bounds.u_lower, bounds.u_upper)
     try:
         d = differentiate_step(model, still, none)
     except DrakeDiffError:
-        return none
+        return np.tile(none, (len(xs) - 1, 1))
     by_u, missing = d.B[model.nq :], d.B[model.nq :] @ none - d.x_next[model.nq :]
     inputs = np.clip(np.linalg.lstsq(by_u, missing, rcond=None)[0], bounds.u_lower, bounds.u_upper)
-    return np.asarray(np.where(np.abs(inputs) > ROUNDED * np.abs(inputs).max(), inputs, none))
+    held = np.where(np.abs(inputs) > ROUNDED * np.abs(inputs).max(), inputs, none)
+    return np.where(model.inputs.commanded, model.neutral_input(xs[1:]), held)

@@ -68,8 +68,9 @@ def solve(  # type: ignore[misc]  # its keywords are written here alone
     """Solve `problem`, certify the derivatives that were used, and measure the result again on Drake's plant.
 
     "auto" chains methods until one is verified: collocation where the model is smooth, or where every coordinate is
-    driven and nothing touches in x0; else, or where that fails, iLQR (with a continuation where the guess touches
-    nothing that matters), whose result the next one starts from.
+    driven and nothing touches in x0; shooting where inputs are commanded positions and nothing touches in x0; else, or
+    where that fails, iLQR (with a continuation where the guess touches nothing that matters), whose result the next
+    one starts from.
     A collocation that finds no motion from a straight line is tried from other first guesses, random ones by `seed`.
     `Solution.options["chain"]` says what was tried, why, and how it ended.
 
@@ -473,13 +474,8 @@ def _attempts(problem: Any, asked: Attempt, given: Any, solutions: list[Any]) ->
         yield from _in_continuous_time(problem, asked.by(method, reason), given, solutions)
         return
     first = asked.by(method, reason)
-    explanation = "nothing touches at first, and every coordinate is driven"
-    free = asked.by("collocation", explanation)
-    by_steps = method == "ilqr" or (method == "shooting" and problem.couplings)
-    if by_steps and _is_free_at_first(problem) and _is_possible(problem, free):
-        yield free, given
-        yield from _other_guesses(problem, free, given, solutions)
-        yield from _kept_apart(problem, free, solutions)
+    if method == "ilqr" or (method == "shooting" and problem.couplings):
+        yield from _without_contact(problem, asked, given, solutions)
     yield first, given
     if method == "collocation":
         yield from _other_guesses(problem, first, given, solutions)
@@ -498,6 +494,19 @@ def _attempts(problem: Any, asked: Attempt, given: Any, solutions: list[Any]) ->
             guess = solutions[-1]
         after = "collocation" if method == "collocation" else "shooting"
         yield asked.by(after, "from the motion that iLQR found"), guess
+
+
+def _without_contact(
+    problem: Problem, asked: Attempt, given: Any, solutions: list[Any]
+) -> Iterator[tuple[Attempt, Any]]:
+    """Before a method by steps: collocation of what is driven whole, or shooting for servos, which a line suits."""
+    free = asked.by("collocation", "nothing touches at first, and every coordinate is driven")
+    if _is_free_at_first(problem) and _is_possible(problem, free):
+        yield free, given
+        yield from _other_guesses(problem, free, given, solutions)
+        yield from _kept_apart(problem, free, solutions)
+    elif problem.model.inputs.commanded.any() and not _touches_at_first(problem):
+        yield asked.by("shooting", "a straight line of commanded positions is near a motion"), given
 
 
 def _in_continuous_time(

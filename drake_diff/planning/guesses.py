@@ -24,7 +24,7 @@ from drake_diff.model.repairs import frame_named
 from drake_diff.model.step import advance, set_state
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, Obstacle, clearances
-from drake_diff.planning.robot import HOLD_SHARE, TOUCHING, Robot, drive, effort_limits, floating, share_to_hold, shares
+from drake_diff.planning.robot import HOLD_SHARE, TOUCHING, Robot, drive, floating, share_to_hold, shares
 
 # Postures that keep goals.
 REACHED = 1e-6  # [m]
@@ -458,7 +458,8 @@ def _timed(robot: Robot, name: str, postures_at: Callable[[Array], Array], durat
         us.append(u)
         xs.append(x_next)
     depth = max(robot.overlap(x[: model.nq]) for x in xs[:: max(1, steps // 25)])
-    return MotionGuess(name, model, np.array(xs), np.array(us), float(np.max(shares(model, np.array(us)))), depth)
+    effort = float(np.max(shares(model, model.efforts(np.array(xs[1:]), np.array(us)))))
+    return MotionGuess(name, model, np.array(xs), np.array(us), effort, depth)
 
 
 def _inputs(model: Model, x: Array, wanted: Array) -> tuple[Array, Array]:
@@ -468,15 +469,18 @@ def _inputs(model: Model, x: Array, wanted: Array) -> tuple[Array, Array]:
     change = wanted - x[nq:]
     # The step's own equation, whose damping acts on the velocity after it; probing the step would meet joint limits.
     needed = twin.inverse_dynamics(change / h) + twin.damping() * change
-    effect = h * np.linalg.solve(twin.mass_matrix() + h * np.diag(twin.damping()), model.actuation)
-    u = np.linalg.lstsq(model.actuation, needed, rcond=None)[0]
+    per_input = model.servo_gains[0]
+    by_effort = h * np.linalg.solve(twin.mass_matrix() + h * np.diag(twin.damping()), model.actuation)
+    efforts = np.linalg.lstsq(model.actuation, needed, rcond=None)[0]
+    effect, u = by_effort * per_input, model.commands(x, wanted, efforts)
     for i in range(CORRECTIONS + 1):
         x_next = np.array(advance(twin, x, u))
         off = wanted - x_next[nq:]
         if i == CORRECTIONS or np.max(np.abs(off), initial=0.0) < EXACT:
             break
         if i == 1:  # the equation has no controllers in the plant, nor thrusters that turn with their body
-            effect = np.array([np.array(advance(twin, x, u + d))[nq:] - x_next[nq:] for d in np.eye(model.nu)]).T
+            probes = [np.array(advance(twin, x, u + d))[nq:] - x_next[nq:] for d in np.diag(1 / per_input)]
+            effect = np.array(probes).T * per_input
         u = u + np.linalg.lstsq(effect, off, rcond=None)[0]
     return np.asarray(u), x_next
 
@@ -499,7 +503,7 @@ def by_controller(
     None where Drake cannot take a step of it.
     """
     x = np.concatenate([robot.q, np.zeros(model.nv)])
-    limits = np.minimum(effort_limits(model), 1e4)
+    limits = np.minimum(model.effort_limits, 1e4)
     xs, us = [x], []
     try:
         effect = drive(model, robot.q)
@@ -510,11 +514,13 @@ def by_controller(
             s = np.array(min(1.0, 1.25 * (k + 1) / steps))
             aim = robot.q[joint_q] + reach * smooth(s) * (target[joint_q] - robot.q[joint_q])
             u = gain * (PULL * (aim - x[joint_q]) - DAMP * x[model.nq + joint_v])
-            u = np.clip(u, -OF_PULL * limits, OF_PULL * limits)
+            efforts = np.clip(u, -OF_PULL * limits, OF_PULL * limits)
+            u = model.commands(x, x[model.nq :], efforts)
             x = np.array(advance(model.double, x, u))
             xs.append(x)
             us.append(u)
     except SimulationError:
         return None
     depth = max(robot.overlap(x[: model.nq]) for x in xs) if model is robot.apart else 0.0
-    return MotionGuess(name, model, np.array(xs), np.array(us), float(np.max(shares(model, np.array(us)))), depth)
+    effort = float(np.max(shares(model, model.efforts(np.array(xs[1:]), np.array(us)))))
+    return MotionGuess(name, model, np.array(xs), np.array(us), effort, depth)

@@ -39,7 +39,7 @@ from drake_diff.planning.guesses import (
     postures,
     read_goals,
 )
-from drake_diff.planning.robot import TOUCHING, Robot, effort_limits, load_robot, of_joints
+from drake_diff.planning.robot import TOUCHING, Robot, load_robot, of_joints
 from drake_diff.runs.directory import check_place, is_taken, name_of, written_whole
 from drake_diff.runs.measurement import measure
 from drake_diff.runs.plan_record import PlanRecord
@@ -149,6 +149,7 @@ def plan(
     seed: int = 0,
     restarts: int = 0,
     meshes: bool = True,
+    packages: Mapping[str, str | Path] | None = None,
     report: Report | None = None,
 ) -> Plan:
     """Load a robot file, mend what it leaves out, plan a motion to a goal, write the run and verify it.
@@ -163,6 +164,7 @@ def plan(
         seed: Of what is drawn; the same seed gives the same plan.
         restarts: How many more first guesses each search is given, to list other optima and to keep the cheapest.
         meshes: Whether the directory gets a copy of the meshes; see `save`.
+        packages: The folders of the file's packages by their names; see `load_model`.
         report: Gets a stage and a sentence now and then.
 
     Returns:
@@ -194,7 +196,7 @@ def plan(
         weld = "the least time is sought without contact" if time else ""
         for _ in range(2):
             note("load", path.name)
-            ready = load_robot(path, seed, weld)
+            ready = load_robot(path, seed, weld, packages)
             if not folders:
                 directory = Path(out) if out is not None else Path("artifacts") / f"plan_{ready.model.name}"
                 folders.append(stack.enter_context(written_whole(directory)))
@@ -338,7 +340,7 @@ def _of_driven(robot: Robot, task: Goals, least: str | None, seed: int) -> Itera
     for target in postures(robot, task, seed):
         guesses = _guesses(space, target, seed)
         for guess in guesses[:2]:
-            if robot.model.nv <= SMALL or least:
+            if least or (robot.model.nv <= SMALL and not robot.model.inputs.commanded.any()):
                 yield _collocated(robot, task, guess, least)
             if not least:
                 yield _feasible(robot, task, guess)
@@ -348,6 +350,9 @@ def _check_that_limits_bound_time(model: Model) -> None:
     """InputError where joints are as fast as one likes: without limits of effort or of speed there is no least time."""
     fast = [v.name for v in model.contract.velocities if not v.lower < v.upper or np.isinf([v.lower, v.upper]).any()]
     strong = [u.name for u in model.contract.inputs if np.isinf([u.lower, u.upper]).any()]
+    if model.inputs.commanded.any():
+        expected = "inputs that are efforts: the least time is sought by collocation, which takes no servos"
+        raise InputError('time="least"', got="commanded positions", expected=expected)
     if fast and strong:
         got = f"no limit of {', '.join(fast[:4])} nor of {', '.join(strong[:4])}"
         raise InputError('time="least"', got=got, expected="limits of every speed or of every motor in the file")
@@ -474,8 +479,9 @@ def _of_passive(robot: Robot, task: Goals) -> Iterator[_Attempt]:
 
 
 def _effort(model: Model) -> QuadraticCost:
-    limits = effort_limits(model)
+    limits = model.effort_limits
     size = np.where(np.isfinite(limits) & (limits > 0), limits, 1.0)
+    size[model.inputs.commanded] = np.inf  # their efforts are no function of the inputs alone
     speeds = np.concatenate([np.zeros(model.nq), np.full(model.nv, SPEED_WEIGHT)])
     return QuadraticCost(Q=np.diag(speeds), R=np.diag(1.0 / size**2))
 

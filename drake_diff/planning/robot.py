@@ -4,7 +4,7 @@ What the file leaves out is mended, each repair a sentence: motors, thrusters of
 """
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from drake_diff._base.values import Refusal
 from drake_diff.derivatives.analytic import analytic_of
 from drake_diff.exceptions import DrakeDiffError, ModelError, ModelWarning, SimulationError
 from drake_diff.legs.feet import Legs
-from drake_diff.legs.standing import Rest, input_limits, stand
+from drake_diff.legs.standing import Rest, stand
 from drake_diff.model.contact import overlaps
 from drake_diff.model.inputs import BodyForce
 from drake_diff.model.model import Model, load_model
@@ -109,12 +109,13 @@ class _Draft:
         self.mend(f"{why}: fixed (fix_joints)", fix_joints=fixed)
 
 
-def load_robot(path: Path, seed: int, weld: str = "") -> Robot:
+def load_robot(path: Path, seed: int, weld: str = "", packages: Mapping[str, str | Path] | None = None) -> Robot:
     """The robot in a file, mended where it has to be; ModelError where nothing in it can be driven.
 
-    What floats and can stand on feet does so, unless `weld` says why it is to be fixed to the world.
+    What floats and can stand on feet does so, unless `weld` says why it is to be fixed to the world. `packages` are the
+    folders of packages by their names.
     """
-    draft = _Draft(path, {"time_step": TIME_STEP})
+    draft = _Draft(path, {"time_step": TIME_STEP, "packages": packages})
     _reduce_followers(draft)
     _add_motors(draft)
     if draft.model.plant.GetFloatingBaseBodies() and joints(draft.model.plant):
@@ -203,7 +204,7 @@ def _fix_massless(draft: _Draft) -> None:
 def _why_not(model: Model) -> str:
     """What Drake says of a step from the model's own state; empty where it takes it."""
     try:
-        advance(model.double, model.default_state, np.zeros(model.nu))
+        advance(model.double, model.default_state, model.neutral_input(model.default_state))
     except SimulationError as error:
         return str(error)
     return ""
@@ -319,7 +320,7 @@ def _few(names: Iterable[str]) -> str:
 
 
 def drive(model: Model, q: Array) -> Array:
-    """(nv, nu) what each input adds to the velocities in a step from posture q (nq,), as the step's equation says."""
+    """(nv, nu) what each effort adds to the velocities in a step from posture q (nq,), as the step's equation says."""
     set_state(model.double, np.concatenate([q, np.zeros(model.nv)]))
     h = model.time_step
     mass = model.double.mass_matrix() + h * np.diag(model.double.damping())
@@ -417,15 +418,10 @@ def shares_to_hold(model: Model, q: Array) -> Array:
     return shares(model, np.linalg.lstsq(model.actuation, needed, rcond=None)[0])
 
 
-def shares(model: Model, us: Array) -> Array:
-    """(..., nu) of the effort limits, in inputs us (..., nu); 0 where there is none."""
-    limits = effort_limits(model)
-    return np.asarray(np.abs(us) / np.where((limits > 0) & np.isfinite(limits), limits, np.inf))
-
-
-def effort_limits(model: Model) -> Array:
-    """(nu,) the smaller of the two limits of each input, infinite where there is none."""
-    return np.asarray(np.min(np.abs(input_limits(model)), axis=0))
+def shares(model: Model, efforts: Array) -> Array:
+    """(..., nu) of the effort limits, in efforts (..., nu); 0 where there is none."""
+    limits = model.effort_limits
+    return np.asarray(np.abs(efforts) / np.where((limits > 0) & np.isfinite(limits), limits, np.inf))
 
 
 def ranges(model: Model) -> tuple[Array, Array]:

@@ -158,7 +158,7 @@ HINGE = f'<body name="a" pos="0 0 1"><joint name="j" axis="0 1 0" {{}}/>{GEOM}{{
 def test_an_effort_is_limited_at_the_joint(tmp_path, attributes, actuator, limit, gains):
     """The torque is gear times force, and a position servo of gear g has the stiffness g^2 kp at the joint."""
     path = write(tmp_path, HINGE.format(attributes, ""), more=f"<actuator>{actuator}</actuator>")
-    model = load(path)
+    model = load(path, inputs="effort")
     (found,) = actuators(model.plant)
     assert found.effort_limit() == max(-model.inputs.lower[0], model.inputs.upper[0]) == limit
     if gains is None:

@@ -185,8 +185,9 @@ def _make_region(asked: TerminalSet, model: Model, bounds: Bounds) -> Region:
         raise ModelError("TerminalSet: the state has quaternions, and the set is one of states that can be subtracted")
     if np.any((x_goal <= bounds.x_lower) | (x_goal >= bounds.x_upper)):
         raise InputError("TerminalSet.x_goal", got=x_goal.tolist(), expected="a state within its bounds, not on one")
-    d = differentiate_step(model, x_goal, np.zeros(model.nu))
-    u_goal = np.asarray(np.linalg.lstsq(d.B, x_goal - d.x_next, rcond=None)[0])
+    neutral = model.neutral_input(x_goal)
+    d = differentiate_step(model, x_goal, neutral)
+    u_goal = neutral + np.asarray(np.linalg.lstsq(d.B, x_goal - d.x_next, rcond=None)[0])
     if np.any((u_goal <= bounds.u_lower) | (u_goal >= bounds.u_upper)):
         got = f"a state that takes u = {u_goal.round(4).tolist()}"
         raise InputError("TerminalSet.x_goal", got=got, expected="one that inputs within their limits hold")

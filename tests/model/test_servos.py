@@ -1,0 +1,316 @@
+"""Commanded positions as inputs: the step by hand, servos of MJCF by MuJoCo's own forces, plans that MuJoCo follows."""
+
+import pickle
+import warnings
+
+import mujoco
+import numpy as np
+import pytest
+from pydrake.multibody.tree import PdControllerGains
+
+import drake_diff as dd
+from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.model.plant import actuators
+from drake_diff.planning import plan
+
+SLIDE = """<robot name="slide"><link name="base"/><link name="cart"><inertial><mass value="{mass}"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="track" type="prismatic">
+<parent link="base"/><child link="cart"/><axis xyz="1 0 0"/><limit lower="-3" upper="2" effort="{limit}" velocity="50"/>
+</joint></robot>"""
+
+
+def load(path, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return dd.load_model(path, **{"time_step": 0.01, **options})
+
+
+def slide(folder, mass=2.0, limit=40.0, **options):
+    path = folder / "slide.urdf"
+    path.write_text(SLIDE.format(mass=mass, limit=limit))
+    return load(path, base="base", inputs="position", **options)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_step_is_that_of_the_closed_form_and_so_are_its_derivatives(tmp_path, seed):
+    """m (v' - v) = h clip(kp (u - q - h v') - kd v', -limit, limit), linear in v' where nothing is cut off."""
+    random = np.random.default_rng(seed)
+    (mass, kp, kd), h = random.uniform((0.1, 1, 0), (9, 70, 9)), random.choice([0.002, 0.05])
+    model = slide(tmp_path, mass, time_step=h, gains=(kp, kd))
+    assert model.input_names == ("track",)
+    term = model.contract.inputs[0]
+    assert (term.unit, term.lower, term.upper) == ("m", -3, 2)
+    (q, v), u = random.uniform(-0.3, 0.3, 2), float(random.uniform(-0.1, 0.1))
+    total = mass + h * kd + h * h * kp
+    v_next = (mass * v + h * kp * (u - q)) / total
+    assert abs(kp * (u - q - h * v_next) - kd * v_next) < 40, "the case is one within the limit"
+    # 1e-12: one division in double precision, of numbers up to 300.
+    np.testing.assert_allclose(dd.step(model, [q, v], [u]), [q + h * v_next, v_next], rtol=0, atol=1e-12)
+    rows = np.array([[-h * kp, mass, h * kp]]) / total
+    for method in ("auto", "autodiff", "implicit", "analytic"):
+        d = dd.differentiate_step(model, [q, v], [u], method=method)
+        np.testing.assert_allclose(np.hstack([d.A, d.B])[1:], rows, rtol=0, atol=1e-10, err_msg=method)
+    far = 1.9 if u > q else -2.9
+    pushed = v + h * np.sign(far) * 40 / mass
+    stiff = slide(tmp_path, mass, time_step=h, gains=(1e4, 0.0))
+    np.testing.assert_allclose(dd.step(stiff, [q, v], [far])[1], pushed, rtol=0, atol=1e-9)
+    assert not np.any(dd.differentiate_step(stiff, [q, v], [far]).B), "at the motor's limit no command has an effect"
+
+
+def test_commands_and_efforts_are_each_the_other_way_round(tmp_path):
+    model, random = slide(tmp_path, gains=(50.0, 4.0)), np.random.default_rng(0)
+    x, effort = random.uniform(-0.5, 0.5, 2), np.array([7.0])
+    v_next = np.array([x[1] + 0.01 * 7.0 / 2.0])  # m dv = h F, by hand
+    u = model.commands(x, v_next, effort)
+    x_next = dd.step(model, x, u)
+    np.testing.assert_allclose(x_next[1:], v_next, rtol=0, atol=1e-12)  # one step in double precision
+    np.testing.assert_allclose(model.efforts(x_next, u), effort, rtol=0, atol=1e-11)
+    assert model.neutral_input(x) == x[0]
+    assert model.effort_limits == 40
+
+
+def test_a_certificate_sees_a_wrong_gain(tmp_path):
+    """One thousandth more of kp in the AutoDiffXd plant changes the slope by the command alone: q is the command."""
+    model = slide(tmp_path, gains=(50.0, 4.0))
+    assert dd.certify(model, [0.3, 0.0], [0.3], method="autodiff").verdict == "agree"
+    actuators(model.autodiff.plant)[0].set_controller_gains(PdControllerGains(p=50.05, d=4.0))
+    assert dd.certify(model, [0.3, 0.0], [0.3], method="autodiff").verdict != "agree"
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "says"),
+    [
+        ({"gains": (1, 1)}, InputError, '"position"'),
+        ({"inputs": "position"}, InputError, "force"),
+        ({"inputs": "torque"}, UnknownNameError, "effort"),
+        ({"inputs": "position", "gains": (0, 1)}, InputError, "kp above 0"),
+        ({"inputs": "position", "gains": (1, -1)}, InputError, "kd at least 0"),
+        ({"inputs": "position", "gains": {"rail": (1, 1)}}, UnknownNameError, "slide"),
+        ({"inputs": "position", "gains": {"slide": (1, 1, 1)}}, InputError, "slide"),
+    ],
+)
+def test_bad_options_are_named(options, error, says):
+    with pytest.raises(error, match=says):
+        load("models/cart_pole.urdf", **options)
+
+
+def test_a_joint_without_an_actuator_gets_one_of_its_name():
+    """The cart has a motor of 20 N, which keeps its name and limit; the pole has none."""
+    model = load("models/cart_pole.urdf", inputs="position", gains={"slide": (50.0, 5.0), "hinge": (2.0, 0.1)})
+    assert model.input_names == ("force", "hinge")
+    assert model.effort_limits.tolist() == [20.0, np.inf]
+    assert [term.unit for term in model.contract.inputs] == ["m", "rad"]
+    again = pickle.loads(pickle.dumps(model.at_time_step(0.02)))
+    assert again.servo_gains[0].tolist() == [50.0, 2.0]
+    with pytest.raises(InputError, match="commanded positions"):
+        dd.PD(model, 1.0, 0.1)
+
+
+def test_servos_act_on_joints_that_follow_others(tmp_path):
+    """Two slides, q1 = -2 q0 + 0.3, a servo on each: the step of the one coordinate by hand."""
+    path, (m0, m1), (kp, kd), h = tmp_path / "m.xml", (1.5, 0.4), ((30.0, 2.0), (50.0, 1.0)), 0.01
+    slides = "".join(
+        f'<body name="b{i}"><joint name="j{i}" type="slide" axis="1 0 0"/><geom size="0.1" mass="{m}" contype="0" '
+        'conaffinity="0"/></body>'
+        for i, m in enumerate((m0, m1))
+    )
+    servos = "".join(f'<position joint="j{i}" kp="{kp[i]}" kv="{kd[i]}"/>' for i in (0, 1))
+    tied = '<equality><joint joint1="j1" joint2="j0" polycoef="0.3 -2 0 0 0"/></equality>'
+    path.write_text(f'<mujoco model="m"><worldbody>{slides}</worldbody>{tied}<actuator>{servos}</actuator></mujoco>')
+    model, (q, v), u = load(path, mimic="reduce", time_step=h), (0.2, -0.4), np.array([0.1, -0.3])
+    r = np.array([1.0, -2.0])  # J of both joints
+    mass = m0 + 4 * m1
+    total = mass + h * (h * np.array(kp) + kd) @ r**2
+    v_next = (mass * v + h * (np.array(kp) * r) @ (u - r * q - [0.0, 0.3])) / total
+    np.testing.assert_allclose(dd.step(model, [q, v], u), [q + h * v_next, v_next], rtol=0, atol=1e-12)  # rounding
+    rows = np.concatenate([[-h * (np.array(kp) @ r**2), mass], h * np.array(kp) * r]) / total
+    for method in ("autodiff", "implicit"):
+        d = dd.differentiate_step(model, [q, v], u, method=method)
+        np.testing.assert_allclose(np.hstack([d.A, d.B])[1], rows, rtol=0, atol=1e-10, err_msg=method)
+    x_next = dd.step(model, [q, v], u)
+    efforts = model.efforts(x_next, u)
+    np.testing.assert_allclose(model.commands(np.array([q, v]), x_next[1:], efforts), u, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(r @ efforts, mass * (v_next - v) / h, rtol=0, atol=1e-9)
+
+
+def mjcf(body, servos, defaults="", more=""):
+    parts = f"{defaults}<worldbody>{body}</worldbody>{more}<actuator>{servos}</actuator>"
+    return f'<mujoco model="m"><compiler angle="radian"/>{parts}</mujoco>'
+
+
+LINK = (
+    '<body name="b{i}" pos="0 0 0.2"><joint name="j{i}" {joint}/>'
+    '<geom type="capsule" fromto="0 0 0 0 0 0.2" size="0.02" mass="{mass}" contype="0" conaffinity="0"/>'
+)
+
+
+def random_servos(random):
+    """A chain of hinges and slides with servos in each way that MJCF has of writing them."""
+    count, body, motors = int(random.integers(1, 5)), "", ""
+    for i in range(count):
+        low, high = sorted(random.uniform(-2, 2, 2))
+        kind, axis = random.choice(["hinge", "slide"]), random.choice(["1 0 0", "0 1 0", "0 0 1"])
+        joint = f'type="{kind}" axis="{axis}" range="{low} {high}" limited="true" armature="{random.uniform(0, 0.2)}"'
+        body += LINK.format(i=i, joint=joint, mass=random.uniform(0.1, 2))
+        kp, kv, gear, force = random.uniform(1, 90), random.uniform(0, 5), random.uniform(0.3, 3), random.uniform(1, 9)
+        gear = gear * random.choice([-1, 1])
+        common = f'name="m{i}" joint="j{i}" gear="{gear}"' + random.choice(["", f' forcerange="{-force} {force}"'])
+        ranged = random.choice(["", f' ctrlrange="{low / 2} {high / 2}"'])
+        motors += random.choice(
+            [
+                f'<position {common}{ranged} kp="{kp}" kv="{kv}"/>',
+                f'<position {common}{ranged} kp="{kp}" dampratio="{kv}"/>',
+                f'<position {common} kp="{kp}" inheritrange="{random.uniform(0.2, 1.5)}"/>',
+                f'<position class="servo" {common}{ranged}/>',
+                f'<general {common}{ranged} gainprm="{kp}" biastype="affine" biasprm="0 {-kp} {-kv}"/>',
+                f'<general {common} gainprm="{kp}" ctrlrange="-1 1"/>',
+                f'<motor {common} ctrlrange="-{kp} {kp}"/>',
+            ]
+        )
+    defaults = f'<default><default class="servo"><position kp="{random.uniform(1, 50)}" kv="1"/></default></default>'
+    return mjcf(body + "</body>" * count, motors, defaults)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_servos_of_mjcf_exert_what_they_do_in_mujoco(tmp_path, seed):
+    """MuJoCo's own `qfrc_actuator` under our command times the gear is our effort, with its ranges of controls."""
+    random, compared = np.random.default_rng([11, seed]), 0
+    for _ in range(4):
+        path = tmp_path / "m.xml"
+        path.write_text(random_servos(random))
+        theirs = mujoco.MjModel.from_xml_path(str(path))
+        model, data = load(path), mujoco.MjData(theirs)
+        number = [mujoco.mj_name2id(theirs, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in model.input_names]
+        gear = theirs.actuator_gear[number, 0]
+        servo = model.inputs.commanded
+        assert servo.tolist() == [theirs.actuator_biasprm[n, 1] != 0 for n in number]
+        for i, n in enumerate(number):
+            joint = theirs.jnt_range[theirs.actuator_trnid[n, 0]]
+            if servo[i]:
+                control = np.sort(theirs.actuator_ctrlrange[n] / gear[i])
+                ends = control if theirs.actuator_ctrllimited[n] else joint
+                found = model.inputs.lower[i], model.inputs.upper[i]
+                np.testing.assert_allclose(found, ends, rtol=1e-12, atol=1e-15)  # a product and a quotient
+        for _ in range(5):
+            q, v = random.uniform(-1, 1, model.nq), random.uniform(-1, 1, model.nv)
+            effort = np.clip(random.normal(0, 5, model.nu), -model.effort_limits, model.effort_limits)
+            x = np.concatenate([q, v])
+            u = np.clip(model.neutral_input(x) + effort / model.servo_gains[0], model.inputs.lower, model.inputs.upper)
+            data.qpos, data.qvel = q, v
+            by_control = np.where(servo, 1 / gear, gear * theirs.actuator_gainprm[number, 0])
+            data.ctrl[number] = u / by_control
+            mujoco.mj_forward(theirs, data)
+            ours = np.clip(model.efforts(x, u), -model.effort_limits, model.effort_limits)
+            in_joints = data.qfrc_actuator[theirs.jnt_dofadr[theirs.actuator_trnid[number, 0]]]
+            # 1e-9: products of gears and gains in another order, and the mass matrix of a damping ratio.
+            np.testing.assert_allclose(ours, in_joints, rtol=1e-9, atol=1e-12)
+            compared += 1
+    assert compared == 20
+
+
+@pytest.mark.parametrize(
+    ("actuator", "says"),
+    [
+        ('<position name="p" joint="j0" kp="5" forcerange="-1 3"/>', "line 1: .* as hard to both sides"),
+        ('<position name="p" joint="j0" kp="5" timeconst="0.1"/>', None),
+    ],
+)
+def test_servos_that_drake_has_not_are_refused_or_told(tmp_path, actuator, says):
+    path = tmp_path / "m.xml"
+    joint = 'axis="0 1 0" range="-1 1"'
+    body = LINK.format(i=0, joint=joint, mass=1)
+    path.write_text(mjcf(body + "</body>", actuator))
+    if says:
+        with pytest.raises(ModelError, match=says):
+            load(path)
+    else:
+        assert any("timeconst" in note for note in load(path).notes)
+
+
+def test_efforts_are_the_inputs_where_they_are_asked_for(tmp_path):
+    path = tmp_path / "m.xml"
+    servo = '<position name="p" joint="j0" kp="5" kv="1" forcerange="-3 3"/>'
+    body = LINK.format(i=0, joint='axis="0 1 0" range="-1 1"', mass=1)
+    path.write_text(mjcf(body + "</body>", servo))
+    model = load(path, inputs="effort")
+    assert (model.contract.inputs[0].unit, model.contract.inputs[0].upper) == ("N m", 3)
+    assert load(path).contract.inputs[0].unit == "rad"
+
+
+# A desk arm with weak servos, an arm with a gripper whose fingers are tied, a hand of four fingers: shapes of SO-101,
+# Panda and Allegro, with their gains, limits and armatures.
+def chain(rows, prefix=""):
+    opened = ""
+    for i, (height, axis, low, high, mass, more) in enumerate(rows):
+        opened += (
+            f'<body name="{prefix}l{i}" pos="0 0 {height}"><joint name="{prefix}j{i}" axis="{axis}" '
+            f'range="{low} {high}" {more}/><geom type="capsule" fromto="0 0 0 0 0 {height}" size="0.01" mass="{mass}" '
+            'contype="0" conaffinity="0"/>'
+        )
+    return opened
+
+
+def desk_arm():
+    weak = 'damping="0.6" armature="0.028"'
+    axes, masses = ["0 0 1", "0 1 0", "0 1 0", "0 1 0", "0 0 1", "0 1 0"], [0.12, 0.16, 0.15, 0.07, 0.09, 0.02]
+    rows = [(0.08, axis, -1.7, 1.7, mass, weak) for axis, mass in zip(axes, masses, strict=True)]
+    servos = "".join(
+        f'<position name="a{i}" joint="j{i}" kp="17.8" forcerange="-3.35 3.35" inheritrange="1"/>' for i in range(6)
+    )
+    return mjcf(chain(rows) + "</body>" * 6, servos)
+
+
+def arm_with_gripper():
+    joint = 'damping="1" armature="0.1"'
+    axes = ["0 0 1", "0 1 0", "0 0 1", "0 -1 0", "0 0 1", "0 -1 0", "0 0 1"]
+    masses, gains, forces = [4.9, 0.6, 3.2, 3.6, 1.2, 1.7, 0.7], [4500] * 4 + [2000] * 3, [87] * 4 + [12] * 3
+    rows = [(0.15, axis, -2.8, 2.8, mass, joint) for axis, mass in zip(axes, masses, strict=True)]
+    fingers = "".join(
+        f'<body name="f{i}" pos="0 0 0.2"><joint name="g{i}" type="slide" axis="0 {side} 0" range="0 0.04" {joint}/>'
+        '<geom type="box" size="0.01 0.01 0.02" mass="0.02" contype="0" conaffinity="0"/></body>'
+        for i, side in enumerate((1, -1))
+    )
+    servos = "".join(
+        f'<general name="a{i}" joint="j{i}" gainprm="{kp}" biastype="affine" biasprm="0 {-kp} {-kp / 10}" '
+        f'forcerange="{-force} {force}"/>'
+        for i, (kp, force) in enumerate(zip(gains, forces, strict=True))
+    )
+    tied = '<equality><joint joint1="g0" joint2="g1"/></equality>'
+    servos += '<position name="grip" joint="g0" kp="100" kv="10" forcerange="-100 100"/>'
+    return mjcf(chain(rows) + fingers + "</body>" * 7, servos, more=tied)
+
+
+def hand():
+    joint, body, servos = 'armature="0.0003" damping="0.1"', "", ""
+    for f in range(4):
+        rows = [(0.03, "0 0 1" if i == 0 else "0 1 0", -0.4, 1.5, 0.03, joint) for i in range(4)]
+        body += f'<body name="base{f}" pos="0 {0.05 * f} 0">' + chain(rows, f"f{f}") + "</body>" * 5
+        servos += "".join(
+            f'<position name="f{f}a{i}" joint="f{f}j{i}" kp="1" forcerange="-0.7 0.7" ctrlrange="-0.4 1.5"/>'
+            for i in range(4)
+        )
+    return mjcf(body, servos)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", [desk_arm, arm_with_gripper, hand])
+def test_a_plan_for_servos_is_followed_in_mujoco(tmp_path, robot, monkeypatch):
+    """Its inputs, held as MuJoCo's `ctrl` over each step, lead to within 0.03 rad of its states all along."""
+    monkeypatch.setattr("drake_diff.planning.planner.BUDGET", 600.0)  # [s] enough for a slow machine
+    path = tmp_path / "robot.xml"
+    path.write_text(robot())
+    done = plan(path, out=tmp_path / "run", seed=1)
+    assert done.success, repr(done)
+    solution, model = done.solution, done.model
+    theirs = mujoco.MjModel.from_xml_path(str(path))
+    theirs.opt.timestep = model.time_step / 20
+    data = mujoco.MjData(theirs)
+    states = solution.xs if model.coupling is None else model.coupling.state(solution.xs)
+    positions = states[:, : theirs.nq]  # both number the joints in the order of the file
+    data.qpos = positions[0]
+    for u, after in zip(solution.us, positions[1:], strict=True):
+        for name, value in zip(model.input_names, u, strict=True):
+            data.ctrl[mujoco.mj_name2id(theirs, mujoco.mjtObj.mjOBJ_ACTUATOR, name)] = value
+        mujoco.mj_step(theirs, data, 20)
+        assert np.max(np.abs(data.qpos - after)) < 0.03  # [rad or m] what the issue of servos asks for
+    assert np.max(np.ptp(positions, axis=0)) > 0.2, "it goes somewhere"
