@@ -70,7 +70,8 @@ def _knot_checks(s: Any) -> Iterator[Check]:
     wanted = {"goal": (-1, problem.goal), "start": (0, problem.start)}
     wanted |= {f"waypoint at knot {k}": (int(s.knots[k]), x) for k, x in problem.waypoints.items()}
     for name, (row, x) in wanted.items():
-        off = np.nan_to_num(np.where(np.isnan(x), 0.0, np.abs(xs[row] - x)), nan=np.inf)
+        distance = xs[row] - x if name == "start" else problem.distance(xs[row], x)
+        off = np.nan_to_num(np.where(np.isnan(x), 0.0, np.abs(distance)), nan=np.inf)
         _, i = _worst(off[None], limits)
         if name == "start" or not np.all(np.isnan(x)):
             is_end = name in ("goal", "start")

@@ -179,7 +179,7 @@ def why_blind(problem: Problem, variables: ShootingVariables, z: Array) -> str:
     effect = np.abs(last).max(axis=1, initial=0.0)
     xs = variables.states(z)
     wrong = np.abs(problem.goal_error(xs[-1])) > FEASIBILITY_TOLERANCE * problem.state_scales(xs)
-    deaf = np.flatnonzero(wrong & (effect < NO_EFFECT))
+    deaf = np.flatnonzero(wrong & (effect < NO_EFFECT) & ~problem.is_orientation)
     if not len(deaf):
         missed = next(_unmoved_goals(problem, xs[-1], last, problem.spans(xs, variables.unpack(z)[1])), "")
         return missed and f"{missed}{_what_is_apart(problem, xs)}"

@@ -218,7 +218,7 @@ def _held(plan: _Plan) -> HeldPlan:
 def _change(solution: Solution, by: Any) -> Change:
     problem = solution.problem
     if isinstance(by, str) and by in ENDS:
-        state = problem.start if by == "x0" else problem.goal
+        state = problem.start if by == "x0" else np.where(problem.is_orientation, np.nan, problem.goal)
         ends = np.flatnonzero(~np.isnan(state))
         if not len(ends):
             raise InputError("by", got=repr(by), expected="an end that is given: all of its entries are free")

@@ -328,6 +328,39 @@ def test_half_a_turn_away_is_no_gap_in_the_derivatives(pendulum):
     np.testing.assert_allclose(np.linalg.norm(f(at[:2])), 2.0, rtol=1e-12)
 
 
+@pytest.mark.slow
+def test_a_satellite_turns_by_every_method_whatever_the_sign_of_its_goal(tmp_path):
+    """By 90 degrees at rest: the least of two forces' squares is 24 I^2 angle^2 / T^3, in steps of T / 20 nearly so.
+
+    The discrete step lets a quaternion's length grow by 0.5 % on the way, so that no state has the goal's entries.
+    """
+    (tmp_path / "sat.sdf").write_text(
+        '<sdf version="1.9"><model name="sat"><link name="bus"><inertial><mass>10</mass><inertia><ixx>0.4</ixx>'
+        "<iyy>0.7</iyy><izz>0.9</izz></inertia></inertial></link></model></sdf>"
+    )
+    pair = [
+        dd.model.BodyForce(name, "bus", point=(0, s / 2, 0), direction=(-s, 0, 0), lower=-50.0, upper=50.0)
+        for name, s in {"left": 1, "right": -1}.items()
+    ]
+    model = dd.load_model(tmp_path / "sat.sdf", time_step=0.2, gravity=(0, 0, 0), body_forces=pair)
+    x0, goal = model.default_state, model.default_state
+    goal[[0, 3]] = np.sqrt(0.5)
+    costs, least = [], 24 * 0.9**2 * (np.pi / 2) ** 2 / 4**3
+    for sign, method in ((1, "ilqr"), (-1, "ilqr"), (-1, "shooting")):
+        goal[:4] *= sign
+        problem = dd.Problem(model, x0=x0, num_steps=20, running_cost=dd.QuadraticCost(R=np.eye(2)), x_goal=goal)
+        solution = dd.solve(problem, method=method)
+        assert solution.success, solution.message
+        assert np.linalg.norm(solution.xs[-1, :4]) > 1.001
+        assert problem.goal_error(solution.xs[-1]) == pytest.approx(np.zeros(model.nx), abs=1e-5)
+        costs.append(solution.cost)
+    assert costs == pytest.approx([costs[0]] * 3, rel=1e-6)
+    assert least < costs[0] < 1.01 * least  # as many steps take 1 / (1 - 1/20^2) of it where nothing turns
+    turned = solution.xs[-1].copy()
+    turned[:4] = np.cos(0.1), 0, 0, np.sin(0.1)
+    assert np.max(np.abs(problem.goal_error(turned))) > 0.1
+
+
 ARMS = [
     ("ur5_robot.urdf", "tool0", {}),
     pytest.param("panda.urdf", "panda_hand", {"mimic": "reduce"}, marks=pytest.mark.long),

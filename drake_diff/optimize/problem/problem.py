@@ -56,6 +56,17 @@ from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics, bounds_o
 from drake_diff.optimize.problem.goals import LAST, Goal, GoalConstraint, WithGoals, in_words
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, doubts_of
 
+
+class _Parallel:
+    """Zero (3,) where the quaternion at `entries` of a state is a multiple of `wanted` (4,)."""
+
+    def __init__(self, entries: slice, wanted: Array):
+        self.entries, self.across = entries, np.linalg.svd(wanted[None])[2][1:]
+
+    def __call__(self, x: Any) -> Any:
+        return self.across @ x[self.entries]
+
+
 OPTIMIZABLE = ("controls", "initial_state", "parameters")
 # A parameter that cannot be negative stays above this part of its first value, unless a bound is given.
 SMALLEST_PART = 1e-3
@@ -312,7 +323,17 @@ class Problem(PicklesItsFields, ShowsItsRepr):
     @cached_property
     def kept(self) -> tuple[Constraint, ...]:
         """All that a motion has to keep beside its bounds: the constraints, and those that the goals come to."""
-        return (*self.constraints, *self.kept_goals)
+        return (*self.constraints, *self.kept_goals, *self._orientations)
+
+    @cached_property
+    def _orientations(self) -> tuple[Constraint, ...]:
+        """Those of free bodies at waypoints and goal: a quaternion's length is free, as it grows in steps."""
+        none, asked = np.zeros(3), {**self.waypoints, self.num_steps: self.goal}
+        return tuple(
+            Constraint(_Parallel(q, state[q]), none, none, [knot], f"orientation from {self.state_names[q.start]} on")
+            for knot, state in asked.items()
+            for q in self._orientations_of(state)
+        )
 
     @cached_property
     def kept_goals(self) -> tuple[GoalConstraint, ...]:
@@ -392,6 +413,9 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         for knot, wanted in {0: self.start, **self.waypoints, self.num_steps: self.goal}.items():
             for side in sides:
                 side[knot] = np.where(np.isnan(wanted), side[knot], wanted)
+            for entries in self._orientations_of(wanted) if knot else ():  # which `kept` asks for
+                for side, bounds in zip(sides, (self.bounds.x_lower, self.bounds.x_upper), strict=True):
+                    side[knot, entries] = bounds[entries]
         return sides[0], sides[1]
 
     def knots_of(self, c: Constraint, *, input_at_end: bool) -> tuple[int, ...]:
@@ -434,7 +458,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             worst = max((c.excess(xs[k], us[min(k, len(us) - 1)]), int(k)) for k in rows)
             excesses[c.label] = max(worst, excesses.get(c.label, worst))
         for knot, wanted in self.waypoints.items():
-            distance = np.abs(xs[where[knot]] - wanted)[~np.isnan(wanted)]
+            distance = np.abs(self.distance(xs[where[knot]], wanted))
             excesses[f"waypoint at knot {knot}"] = (float(np.max(distance, initial=0.0)), int(where[knot]))
         return excesses | excess_of(self.coupled_steps() if coupled is None else coupled, xs, us, where)
 
@@ -548,9 +572,28 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return [] if self.moved is None else vectors_of(self.moved)
 
     def goal_error(self, x: Array) -> Array:
-        """(nx,) the distance of `x` from the goal, 0 where the goal is free; by a quaternion's nearer sign."""
-        goal = self._with_the_signs_of(x, self.goal)
-        return np.where(np.isnan(goal), 0.0, x - goal)
+        """(nx,) the distance of `x` from the goal; see `distance`."""
+        return self.distance(x, self.goal)
+
+    def distance(self, x: Array, wanted: Array) -> Array:
+        """(nx,) of `x` from a state `wanted`, 0 where that is free; of quaternions whatever their lengths and signs."""
+        state, wanted = np.array(x), self._with_the_signs_of(x, wanted)
+        for entries in self._orientations_of(wanted):
+            state[entries] *= np.linalg.norm(wanted[entries]) / np.linalg.norm(state[entries])
+        return np.where(np.isnan(wanted), 0.0, state - wanted)
+
+    def _orientations_of(self, wanted: Array) -> list[slice]:
+        """Where the quaternions are that a state `wanted` (nx,) gives whole."""
+        every = [slice(start, start + 4) for start in self._quaternions]
+        return [entries for entries in every if not np.isnan(wanted[entries]).any()]
+
+    @cached_property
+    def is_orientation(self) -> Indices:
+        """(nx,) whether an entry of the goal is part of an orientation: a row of `kept` asks for it."""
+        mask = np.zeros(self.nx, dtype=bool)
+        for entries in self._orientations_of(self.goal):
+            mask[entries] = True
+        return mask
 
     def cost_of_parameters(self, values: Array) -> float:
         """What `parameter_cost` says of the values (np,), a part of the cost; 0 where there is none."""

@@ -89,7 +89,7 @@ class Rolling:
         if len(which):
             labels, states = tuple(problem.state_names[i] for i in which), Selected(which, self.nx + self.nu)
             yield RowLimits.unpriced(labels, states, 1, lower[:, which], upper[:, which])
-        for c in problem.kept:
+        for c in (*problem.constraints, *problem.kept_goals):
             if self.staying is not None and isinstance(c, GoalConstraint) and c.knots == LAST:
                 continue  # the plan keeps it, and its end is stayed at
             lower, upper = (np.tile(side, rows) for side in _wide(c))
