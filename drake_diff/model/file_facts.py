@@ -12,10 +12,13 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import count
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import quoteattr
 
+import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains
+from scipy.spatial.transform import Rotation
 
 from drake_diff.exceptions import ModelError
 from drake_diff.model.plant import actuators
@@ -249,7 +252,7 @@ class FileFacts:
 
     `followers` are the joints that mimic another one. `disabled` is what MJCF switches off and Drake has all the same:
     contact, constraint, gravity. `left_out` are the joints of actuators of MJCF that Drake does not read, `touching` is
-    what MJCF lets touch, by model instance.
+    what MJCF lets touch, by model instance. `thrusters` are the fields of a BodyForce for each motor of a site.
     """
 
     joints: dict[Key, JointSays] = field(default_factory=dict)
@@ -258,6 +261,7 @@ class FileFacts:
     disabled: set[str] = field(default_factory=set)
     left_out: set[Key] = field(default_factory=set)
     touching: dict[str, TouchFilter] = field(default_factory=dict)
+    thrusters: list[dict[str, Any]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -400,6 +404,60 @@ class Mjcf:
             middle, half = (ends[0] + ends[1]) / 2, inherited * (ends[1] - ends[0]) / 2
             control = middle - half, middle + half
         return (min(e / gear for e in control), max(e / gear for e in control)) if control and gear else None
+
+    def thrusters(self) -> Iterator[tuple[Element, dict[str, Any]]]:
+        """The motors of sites that push along a line, with or without a moment about it, as fields of a BodyForce."""
+        sites = {
+            self.attributes(site).get("name"): site
+            for world in self.root.findall("worldbody")
+            for site in world.iter("site")
+        }
+        for element in (e for section in self.root.findall("actuator") for e in section.children):
+            says = self.attributes(element)
+            site, bias = sites.get(says.get("site")), says.get("biastype", "none")
+            gain = _first(says.get("gainprm", "1"), 1.0) if element.tag == "general" else 1.0
+            is_motor = element.tag == "motor" or (
+                element.tag == "general" and bias == says.get("dyntype", "none") == "none"
+            )
+            gear = np.array([*_numbers(says.get("gear", "1")), *np.zeros(6)][:6])
+            force, moment = gear[:3], gear[3:]
+            if not (is_motor and site and site.parent and site.parent.get("name") and "refsite" not in says):
+                continue
+            if not force.any() or np.linalg.norm(np.cross(force, moment)) > 1e-9 * np.linalg.norm(force):
+                continue
+            size, pose = float(np.linalg.norm(force)), self.attributes(site)
+            ranges = [(self._range(says, "ctrl"), gain), (self._range(says, "force"), 1.0)]
+            ends = [sorted(size * factor * end for end in given) for given, factor in ranges if given]
+            yield (
+                element,
+                {
+                    "name": says.get("name") or says["site"],
+                    "body": site.parent.get("name"),
+                    "point": (_numbers(pose.get("pos", "0 0 0")) or [0.0, 0.0, 0.0]),
+                    "direction": (self._turn(pose) @ force / size).tolist(),
+                    "moment_ratio": float(force @ moment) / size**2,
+                    "lower": max((e[0] for e in ends), default=-math.inf),
+                    "upper": min((e[1] for e in ends), default=math.inf),
+                },
+            )
+
+    def _turn(self, says: Attributes) -> np.ndarray:
+        """(3, 3) the orientation that the attributes of an element give."""
+        unit = math.pi / 180 if self.degrees else 1.0
+        if quat := _numbers(says.get("quat", "")):
+            return Rotation.from_quat([*quat[1:], quat[0]]).as_matrix()
+        if axis := _numbers(says.get("axisangle", "")):
+            return Rotation.from_rotvec(unit * axis[3] * np.array(axis[:3]) / np.linalg.norm(axis[:3])).as_matrix()
+        if euler := _numbers(says.get("euler", "")):
+            return Rotation.from_euler(self._compiler("eulerseq", "xyz").swapcase(), unit * np.array(euler)).as_matrix()
+        if axes := _numbers(says.get("xyaxes", "")):
+            x, y = np.array(axes[:3]), np.array(axes[3:])
+            x = x / np.linalg.norm(x)
+            y = y - (x @ y) * x
+            return np.column_stack([x, y / np.linalg.norm(y), np.cross(x, y / np.linalg.norm(y))])
+        if z := _numbers(says.get("zaxis", "")):
+            return Rotation.align_vectors([z], [[0.0, 0.0, 1.0]])[0].as_matrix()
+        return np.eye(3)
 
     def mimics(self, instance: str) -> Iterator[Mimic]:
         """Joints that follow another one linearly, of the robot that is called `instance`."""
@@ -574,6 +632,9 @@ def _read_mjcf(mjcf: Mjcf, name: str, facts: FileFacts) -> None:
     facts.followers.update({(name, mimic.follower): mimic for mimic in mjcf.mimics(name)})
     facts.disabled.update(mjcf.disabled)
     facts.touching[name] = mjcf.touching
+    for element, thruster in list(mjcf.thrusters()):
+        facts.thrusters.append(thruster)
+        mjcf.xml.remove(element)
     facts.left_out.update((name, actuator.joint) for actuator in mjcf.actuators if not actuator.read)
 
 

@@ -389,7 +389,11 @@ class _Reading:
         self.xml = xml = text_of(path, self.notes)
         if xml is None:
             return None
+        before = len(self.facts.thrusters)
         read_facts(xml, instance, self.facts)
+        names = [thruster["name"] for thruster in self.facts.thrusters[before:]]
+        if names:
+            self.notes.append(f"{len(names)} motors of sites became forces on bodies: {', '.join(names)}.")
         read_meshes(self.meshes, xml, path, self.parser.package_map())
         if xml.changed:
             make_absolute(xml, path)

@@ -412,7 +412,7 @@ def flight(robot: Robot, places: Mapping[str, Array], seed: int) -> MotionGuess:
     for _ in range(1 if places else FLIGHTS):
         way = np.zeros(model.nv)
         for _, _, v in () if places else free:
-            way[v + 3 : v + 6] = np.array(FLY_FAR) * random.uniform(-1, 1, 3) + np.array([0.0, 0.0, FLY_UP])
+            way[v + 3 : v + 6] = flown(random)
             way[v + 2] = FLY_TURNED * random.uniform(-1, 1)
         for name, position in places.items():
             v = _carrier(robot, name)
@@ -428,6 +428,11 @@ def flight(robot: Robot, places: Mapping[str, Array], seed: int) -> MotionGuess:
         if guesses[-1].depth <= TOUCHING:
             break
     return min(guesses, key=lambda guess: guess.depth)
+
+
+def flown(random: np.random.Generator) -> Array:
+    """(3,) [m] a way to go through the air, drawn at random."""
+    return np.array(FLY_FAR) * random.uniform(-1, 1, 3) + np.array([0.0, 0.0, FLY_UP])
 
 
 def _carrier(robot: Robot, name: str) -> int:

@@ -15,6 +15,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.values import Refusal, ShowsItsRepr
 from drake_diff.certificates.audit import audit
 from drake_diff.certificates.finding import Finding
+from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, ModelWarning, WriteError
 from drake_diff.legs.feet import Legs
 from drake_diff.legs.standing import Rest, random_shift, shift_to
@@ -35,11 +36,12 @@ from drake_diff.planning.guesses import (
     along,
     by_controller,
     flight,
+    flown,
     lines,
     postures,
     read_goals,
 )
-from drake_diff.planning.robot import TOUCHING, Robot, load_robot, of_joints
+from drake_diff.planning.robot import TOUCHING, Robot, floating, load_robot, of_joints
 from drake_diff.runs.directory import check_place, is_taken, name_of, written_whole
 from drake_diff.runs.measurement import measure
 from drake_diff.runs.plan_record import PlanRecord
@@ -308,13 +310,31 @@ def _attempts(robot: Robot, task: Goals, least: str | None, seed: int) -> Iterat
         return
     Space.around(robot, task.avoid).check("start", robot.q)
     if robot.model.body_forces:
-        yield _feasible(robot, task, flight(robot, task.frames, seed))
+        yield from _of_flying(robot, task, seed)
     elif robot.is_fully_driven:
         yield from _of_driven(robot, task, least, seed)
     elif task.is_free:
         yield from _of_reachable(robot, task, seed)
     else:
         yield from _of_passive(robot, task)
+
+
+def _of_flying(robot: Robot, task: Goals, seed: int) -> Iterator[_Attempt]:
+    """What thrusters carry: along a guess where they push and turn it in any direction, else with least effort."""
+    guess = flight(robot, task.frames, seed)
+    model, x0 = guess.model, guess.xs[0]
+    effect = differentiate_step(model, x0, model.neutral_input(x0)).B[model.nq :]
+    if np.linalg.matrix_rank(effect) == model.nv:
+        yield _feasible(robot, task, guess)
+        return
+    x_goal = x0.copy()  # as it is now turned, at rest
+    for _, q, _ in floating(model):
+        x_goal[q + 4 : q + 7] = np.nan if task.frames else x0[q + 4 : q + 7] + flown(np.random.default_rng([seed, 4]))
+    for longer in (1, 2):
+        steps = longer * guess.num_steps
+        problem = _problem(task, guess, x_goal, running_cost=_effort(model), num_steps=steps)
+        options = {"method": "collocation", "time_limit": BUDGET_OF_LEAST, "options": Options(refine=True)}
+        yield _Attempt(f"least effort in {steps} steps", robot, problem, None, options)
 
 
 def _of_standing(robot: Robot, standing: tuple[Legs, Rest], task: Goals, seed: int) -> Iterator[_Attempt]:
@@ -400,14 +420,9 @@ def _feasible(robot: Robot, task: Goals, guess: MotionGuess) -> _Attempt:
 
 def _problem(task: Goals, guess: MotionGuess, x_goal: Array, **asked: Any) -> Problem:
     goals = [FrameGoal(name, position=position) for name, position in task.frames.items()]
+    asked = {"num_steps": guess.num_steps, **asked}
     return Problem(
-        guess.model,
-        x0=guess.xs[0],
-        x_goal=x_goal,
-        num_steps=guess.num_steps,
-        goals=[*goals, *task.avoid],
-        bounds=_bounds(guess.model),
-        **asked,
+        guess.model, x0=guess.xs[0], x_goal=x_goal, goals=[*goals, *task.avoid], bounds=_bounds(guess.model), **asked
     )
 
 

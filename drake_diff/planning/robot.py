@@ -268,7 +268,7 @@ def _placed(draft: _Draft, random: np.random.Generator) -> Robot:
     model, repairs = draft.model, draft.repairs
     lower, upper = ranges(model)
     first = inside(model, lower, upper)
-    touches, flies = bool(model.contract.contact.collision_pairs), bool(draft.options.get("body_forces"))
+    touches, flies = bool(model.contract.contact.collision_pairs), bool(model.body_forces)
     apart = draft.read(contact=False) if touches else model
     driven = is_fully_driven(apart)
     shapes, holds = model if touches else None, apart if driven else None

@@ -314,3 +314,56 @@ def test_a_plan_for_servos_is_followed_in_mujoco(tmp_path, robot, monkeypatch):
         mujoco.mj_step(theirs, data, 20)
         assert np.max(np.abs(data.qpos - after)) < 0.03  # [rad or m] what the issue of servos asks for
     assert np.max(np.ptp(positions, axis=0)) > 0.2, "it goes somewhere"
+
+
+def random_site(random, i):
+    """A site with an orientation in one of the ways that MJCF has."""
+    numbers = {
+        name: " ".join(map(str, random.normal(size=size)))
+        for name, size in (("quat", 4), ("euler", 3), ("axisangle", 4), ("xyaxes", 6), ("zaxis", 3))
+    }
+    name = random.choice(["", *numbers])
+    turned = f'{name}="{numbers[name]}"' if name else ""
+    return f'<site name="s{i}" pos="{" ".join(map(str, random.normal(size=3)))}" {turned}/>'
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_motors_of_sites_push_as_they_do_in_mujoco(tmp_path, seed):
+    """Two hinged bodies with a thruster each, with a moment about its line: MuJoCo's `qfrc_actuator` is ours."""
+    random, path = np.random.default_rng([12, seed]), tmp_path / "m.xml"
+    bodies, motors = "", ""
+    for i in range(2):
+        axis = random.choice(["1 0 0", "0 1 0", "0 0 1"])
+        body = LINK.format(i=i, joint=f'axis="{axis}"', mass=1)
+        bodies += body + random_site(random, i)
+        force, ratio = random.normal(size=3), random.normal()
+        gear = " ".join(map(str, [*force, *(ratio * force)]))
+        motors += f'<motor name="t{i}" site="s{i}" gear="{gear}" ctrlrange="-1 {random.uniform(1, 5)}"/>'
+    sequence = random.choice(["xyz", "XYZ", "zyx", "XZX"])
+    text = mjcf(bodies + "</body></body>", motors).replace('"radian"', f'"radian" eulerseq="{sequence}"')
+    path.write_text(text)
+    theirs = mujoco.MjModel.from_xml_path(str(path))
+    model, data = load(path), mujoco.MjData(theirs)
+    assert model.input_names == ("t0", "t1")
+    size = np.linalg.norm(theirs.actuator_gear[:, :3], axis=1)
+    ends = size[:, None] * theirs.actuator_ctrlrange
+    np.testing.assert_allclose(np.column_stack([model.inputs.lower, model.inputs.upper]), ends, rtol=1e-12)  # a product
+    for _ in range(5):
+        x, control = random.normal(size=4), random.uniform(-1, 1, 2)
+        data.qpos, data.qvel, data.ctrl = x[:2], x[2:], control
+        mujoco.mj_forward(theirs, data)
+        model.double.set_state(x)
+        model.double.set_input(size * control)
+        # 1e-9: poses of two links in double precision
+        np.testing.assert_allclose(model.double.applied_force(), data.qfrc_actuator, rtol=1e-9, atol=1e-9)
+
+
+def test_a_motor_of_a_site_that_is_no_thruster_is_left_out_and_told(tmp_path):
+    """A moment alone, or beside the line of the force, is no BodyForce."""
+    path = tmp_path / "m.xml"
+    motors = '<motor name="twist" site="s" gear="0 0 0 0 0 1"/><motor name="skew" site="s" gear="1 0 0 0 1 0"/>'
+    body = LINK.format(i=0, joint='axis="0 1 0"', mass=1) + '<site name="s"/></body>'
+    path.write_text(mjcf(body, motors))
+    model = load(path)
+    assert model.nu == 0
+    assert any("twist" in note and "skew" in note and "left out" in note for note in model.notes)

@@ -67,3 +67,27 @@ def test_what_floats_without_a_mass_is_refused(tmp_path):
     path.write_text('<robot name="tool"><link name="tool"/></robot>')
     with pytest.raises(ModelError, match=r"tool floats.*no mass"):
         plan(path, out=tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_a_quadrotor_of_mjcf_flies_by_its_own_rotors(tmp_path):
+    """Four motors of sites, which push upward alone: it tilts on its way, and hovers at the end."""
+    rotors = {"a": (0.14, 0.18, 0.02), "b": (0.14, -0.18, -0.02), "c": (-0.14, -0.18, 0.02), "d": (-0.14, 0.18, -0.02)}
+    sites = "".join(f'<site name="{name}" pos="{x} {y} 0.05"/>' for name, (x, y, _) in rotors.items())
+    motors = "".join(
+        f'<motor name="{name}" site="{name}" gear="0 0 1 0 0 {ratio}" ctrlrange="0 13"/>'
+        for name, (_, _, ratio) in rotors.items()
+    )
+    (tmp_path / "x4.xml").write_text(
+        '<mujoco model="x4"><worldbody><body name="x4" pos="0 0 1"><freejoint/>'
+        f'<inertial pos="0 0 0" mass="1.3" diaginertia="0.04 0.025 0.06"/>{sites}</body></worldbody>'
+        f"<actuator>{motors}</actuator></mujoco>"
+    )
+    done = plan(tmp_path / "x4.xml", goals={"x4": [1.5, 0.0, 1.2]}, out=tmp_path / "run")
+    assert done.success, repr(done)
+    us, xs = done.solution.us, done.solution.xs
+    assert us.min() >= 0
+    assert us.max() <= 13
+    assert np.linalg.norm(xs[-1, 4:7] - [1.5, 0.0, 1.2]) < 5e-3
+    assert np.abs(xs[:, 1:4]).max() > 0.02  # it tilts
+    assert us[-1].sum() == pytest.approx(1.3 * 9.81, rel=0.3)
