@@ -56,7 +56,7 @@ def audit(model: Model, x: ArrayLike | None = None, u: ArrayLike | None = None) 
     Args:
         model: the model to look at; it is left as it was.
         x: (nx,) the state [q; v], the model's default state if left out.
-        u: (nu,) [N or N m] the input, zero if left out.
+        u: (nu,) [N or N m] the input, zero, or where servos are, if left out.
 
     Returns:
         A list of `Finding`, sorted by severity; empty if there is nothing to say. It prints one below the other.

@@ -142,7 +142,7 @@ FILES = {
         + joint("last", "tip", "end")
         + "</robot>",
     ),
-    "left_out": MJCF.format("", "", '<actuator><general name="servo" joint="j" gainprm="5"/></actuator>'),
+    "left_out": MJCF.format("", "", '<actuator><velocity name="servo" joint="j" kv="5"/></actuator>'),
     "left_out 2": MJCF.format("", "", '<actuator><motor name="pull" tendon="t"/></actuator>'),
     "lost_armature": MJCF.format("", 'armature="2"', ""),
     "switched_off": MJCF.format('<option><flag contact="disable"/></option>', "", ""),
@@ -242,8 +242,8 @@ TRAPS = [
     ("ignored", "warning", "ignored 4", {}, "1 <contact> are ignored", None),
     ("ignored", "info", "ignored 5", {}, "1 <gazebo> are ignored", None),
     ("zero_limit", "error", "zero_limit 5", {}, r"wrist\): the velocity limit is 0", {"mimic": "fix"}),
-    ("left_out", "warning", "left_out", {}, r"1 actuators left out, .*: servo \(general of j\)", {"actuators": ["j"]}),
-    ("left_out", "warning", "left_out 2", {}, r"pull \(motor of no joint\)", None),
+    ("left_out", "warning", "left_out", {}, r"1 actuators left out, .*: servo \(velocity of j, line 1\)", {"actuators": ["j"]}),
+    ("left_out", "warning", "left_out 2", {}, r"pull \(motor of no joint, line 1\)", None),
     ("lost_armature", "warning", "lost_armature", {}, r"j\): Drake has the armature", {"actuators": ["j"]}),
     ("switched_off", "warning", "switched_off", {}, r"contact\): the file switches it off", {"contact": False}),
     (
