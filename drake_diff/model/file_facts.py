@@ -29,6 +29,7 @@ KINDS = ("motor", "position")  # of actuators that Drake reads
 ACTUATORS = ("general", *KINDS, "velocity", "intvelocity", "damper", "cylinder", "muscle", "adhesion")
 SHARED = ("gear", "ctrlrange", "ctrllimited", "forcerange", "forcelimited")  # by the defaults of all kinds of these
 SCALAR = ("hinge", "slide")  # the types of joints with one coordinate
+POSES = ("pos", "quat", "axisangle", "euler", "xyaxes", "zaxis")
 FLAGS = ("contact", "constraint", "gravity")  # what <option><flag> may disable and Drake has all the same
 MOST_INCLUDES = 100
 UNSEEN = 2**30  # a mask that no other meets: Drake makes no collision shape of a geom whose masks are both 0
@@ -46,7 +47,7 @@ def as_mujoco_means(xml: XmlText, path: Path, notes: list[str]) -> XmlText:
     if not xml.root.get("model"):
         xml.set(xml.root, "model", path.stem)
         notes.append(f"The model has no name in the file: it is called {path.stem}.")
-    notes += [*_frames_to_bodies(xml), *_motors_and_servos(xml)]
+    notes += [*_frames_to_bodies(xml), *_poses_of_several_joints(xml), *_motors_and_servos(xml)]
     mjcf = Mjcf(xml)
     notes += _unread(mjcf, path)
     for connect in (c for section in xml.root.findall("equality") for c in section.findall("connect")):
@@ -80,6 +81,21 @@ def _frames_to_bodies(xml: XmlText) -> list[str]:
     for frame in frames:
         xml.rename(frame, "body")
     return [f"{len(frames)} <frame>s became bodies without a joint, which is the same."] if frames else []
+
+
+def _poses_of_several_joints(xml: XmlText) -> list[str]:
+    """Give the pose of a body with several joints to a body around it: Drake puts it behind the first of them."""
+    placed = list[str]()
+    for body in (b for world in xml.root.findall("worldbody") for b in world.iter("body")):
+        pose = {name: value for name, value in body.attributes.items() if name in POSES}
+        if pose and len(body.findall("joint")) > 1:
+            attributes = "".join(f" {name}={quoteattr(value)}" for name, value in pose.items())
+            xml.before(body, f"<body name={quoteattr(body.get('name', f'line{body.line}') + '_place')}{attributes}>")
+            xml.after(body, "</body>")
+            for name in pose:
+                xml.drop(body, name)
+            placed.append(body.get("name", "?"))
+    return [f"Poses of bodies with several joints became bodies around them: {', '.join(placed)}."] if placed else []
 
 
 def _motors_and_servos(xml: XmlText) -> list[str]:

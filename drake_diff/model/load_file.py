@@ -394,6 +394,8 @@ class _Reading:
         names = [thruster["name"] for thruster in self.facts.thrusters[before:]]
         if names:
             self.notes.append(f"{len(names)} motors of sites became forces on bodies: {', '.join(names)}.")
+            if any(joint.get("actuatorfrcrange") for joint in xml.root.iter("joint")):
+                self.notes.append("In MuJoCo actuatorfrcrange limits motors of sites too, here it does not.")
         read_meshes(self.meshes, xml, path, self.parser.package_map())
         if xml.changed:
             make_absolute(xml, path)

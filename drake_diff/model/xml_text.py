@@ -133,6 +133,10 @@ class XmlText:
         """Put XML text in front of an element."""
         self._replace(element.start, element.start, text.encode())
 
+    def after(self, element: Element, text: str) -> None:
+        """Put XML text behind an element."""
+        self._replace(element.end, element.end, text.encode())
+
     def append(self, element: Element, text: str) -> None:
         """Put XML text behind all that is inside an element."""
         close = self._end_tag(element)

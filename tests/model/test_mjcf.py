@@ -268,6 +268,34 @@ def test_a_leg_whose_hip_has_two_hinges_swings(tmp_path):
     assert data.qpos[1] < 0.19
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_several_joints_in_a_body_turn_where_the_body_is(tmp_path, seed):
+    """Drake puts the pose of such a body behind its first joint: mass matrix and bias are MuJoCo's, to rounding."""
+    mujoco, random = pytest.importorskip("mujoco"), np.random.default_rng([13, seed])
+
+    def numbers(size):
+        return " ".join(map(str, random.normal(size=size)))
+
+    def joint(name):
+        kind = random.choice(["hinge", "slide"])
+        return f'<joint name="{name}" type="{kind}" axis="{numbers(3)}" pos="{numbers(3)}" ref="{random.normal()}"/>'
+
+    geom = '<geom type="box" size="0.1 0.2 0.3" pos="0.3 0.1 0.2" mass="2" contype="0" conaffinity="0"/>'
+    inner = f'<body name="b" pos="{numbers(3)}" quat="{numbers(4)}">{joint("u")}{joint("v")}{joint("w")}{geom}</body>'
+    outer = f'<body name="a" pos="{numbers(3)}" euler="{numbers(3)}">{joint("s")}{joint("t")}{geom}{inner}</body>'
+    path = write(tmp_path, outer)
+    model, theirs = load(path), mujoco.MjModel.from_xml_path(str(path))
+    assert any("several joints" in note for note in model.notes)
+    data, x = mujoco.MjData(theirs), random.normal(size=model.nx)
+    data.qpos, data.qvel = x[: model.nq], x[model.nq :]
+    mujoco.mj_forward(theirs, data)
+    model.double.set_state(x)
+    rest = model.double.inverse_dynamics(np.zeros(model.nv))
+    np.testing.assert_allclose(rest, data.qfrc_bias, rtol=0, atol=AGREE * np.max(np.abs(data.qfrc_bias)))
+    accelerations = np.linalg.solve(model.double.mass_matrix(), -rest)
+    np.testing.assert_allclose(accelerations, data.qacc, rtol=0, atol=1e-8 * np.max(np.abs(data.qacc)))  # conditioning
+
+
 def test_two_motors_on_a_joint_are_refused(tmp_path):
     """Drake's step drops the torque of the first, with a derivative of 0 that agrees with differences."""
     motors = '<actuator><motor name="big" joint="j" gear="2"/><motor name="small" joint="j" gear="3"/></actuator>'

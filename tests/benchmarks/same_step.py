@@ -1,0 +1,208 @@
+"""Files of a grammar of MJCF, stepped in MuJoCo and here: accelerations must agree, or a finding must name why not.
+
+    python tests/benchmarks/same_step.py [--count 1000] [--seed 0]
+
+Each file is a tree of hinges and slides with random attributes, default classes, compiler options, actuators of every
+kind and couplings. At random states, under random controls within their ranges, MuJoCo's `qacc` without constraints is
+compared with M^-1 (B efforts - rest) of Drake's plant. A difference above 1e-9 of the largest acceleration is reported
+if a note of the model, but for those of BENIGN, or a warning of its audit says what is not as in the file.
+Prints how many files agree, differ with a finding and differ without one, and the findings of files that agree.
+"""
+
+import argparse
+import re
+import tempfile
+import warnings
+from collections import Counter
+from contextlib import suppress
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+import drake_diff as dd
+from drake_diff.exceptions import ModelError
+
+AGREE = 1e-9  # of the largest acceleration: chains of a few bodies in double precision
+STATES = 4
+# Notes of what was done so that the plant is as the file says, or of what no acceleration without contact depends on.
+BENIGN = re.compile(
+    r"attribute '(timestep|integrator|solver|cone)'|Effort limits at the joint|Gains k|<general> actuators read"
+    r"|has no name|Default classes|became forces on bodies|became bodies|tag 'site'|springs? added|Springs"
+    r"|actuators? added|springs of joints|several joints|collision shapes taken away|attribute 'actuatorfrcrange'"
+)
+OF_THE_FILE = ("left_out", "lost_armature", "ignored", "switched_off", "invented_inertia")  # findings of `audit`
+
+
+def choice(random, *options):
+    return options[random.integers(len(options))]
+
+
+def some(random, share, text):
+    return text if random.random() < share else ""
+
+
+def joint(random, name, degrees):
+    unit = 180 / np.pi if degrees else 1.0
+    kind = choice(random, "hinge", "hinge", "slide")
+    scale = unit if kind == "hinge" else 1.0
+    axis = " ".join(map(str, random.normal(size=3)))
+    return (
+        f'<joint name="{name}" type="{kind}" axis="{axis}"'
+        + some(random, 0.5, f' damping="{random.uniform(0, 2)}"')
+        + some(random, 0.4, f' armature="{random.uniform(0, 1)}"')
+        + some(random, 0.3, f' stiffness="{random.uniform(0, 9)}"')
+        + some(random, 0.3, f' springref="{scale * random.uniform(-1, 1)}"')
+        + some(random, 0.2, f' ref="{scale * random.uniform(-1, 1)}"')
+        + some(random, 0.2, f' pos="{random.normal()} 0 {random.normal()}"')
+        + some(random, 0.3, f' range="{-2 * scale} {2 * scale}"')
+        + some(random, 0.03, f' frictionloss="{random.uniform(0.1, 1)}"')
+        + some(random, 0.1, f' actuatorfrcrange="{-random.uniform(1, 5)} {random.uniform(1, 5)}"')
+        + "/>"
+    )
+
+
+def shape(random):
+    kind = choice(random, "sphere", "capsule", "box", "cylinder", "ellipsoid")
+    size = " ".join(str(s) for s in random.uniform(0.05, 0.3, {"sphere": 1, "capsule": 2, "cylinder": 2}.get(kind, 3)))
+    mass = choice(random, "", f' mass="{random.uniform(0.1, 3)}"', f' density="{random.uniform(100, 2000)}"')
+    turned = some(random, 0.4, f' euler="{" ".join(map(str, random.normal(size=3)))}"')
+    return f'<geom type="{kind}" size="{size}" pos="{random.normal()} 0 0.1"{mass}{turned}/>'
+
+
+def body(random, i, degrees, depth):
+    inertial = some(
+        random,
+        0.3,
+        f'<inertial pos="0.1 0 {random.normal()}" mass="{random.uniform(0.1, 4)}" diaginertia="0.1 0.12 0.15"/>',
+    )
+    turned = choice(random, "", f' quat="{" ".join(map(str, random.normal(size=4)))}"')
+    more = some(random, 0.03, ' gravcomp="1"')
+    kind = some(random, 0.3, f' childclass="c{random.integers(2)}"')
+    joints = "".join(joint(random, f"j{i}_{k}", degrees) for k in range(choice(random, 1, 1, 1, 2)))
+    inner = body(random, i + 1, degrees, depth - 1) if depth else ""
+    site = f'<site name="s{i}" pos="0 0.1 {random.normal()}"/>'
+    inside = inertial + joints + shape(random) + site + inner
+    return f'<body name="b{i}" pos="0.2 0 {random.normal()}"{turned}{more}{kind}>{inside}</body>'
+
+
+def actuator(random, k, target):
+    gear = some(random, 0.5, f' gear="{random.uniform(0.3, 4) * choice(random, -1, 1)}"')
+    force = some(random, 0.3, f' forcerange="{-random.uniform(1, 9)} {random.uniform(1, 9)}"')
+    even = some(random, 0.3, ' forcerange="-4 4"')
+    control = some(random, 0.5, ' ctrlrange="-1 1.5"')
+    kp, kv = random.uniform(1, 50), random.uniform(0, 3)
+    name, common = f'name="a{k}"', f'joint="{target}"{gear}{control}'
+    return choice(
+        random,
+        f"<motor {name} {common}{force}/>",
+        f"<motor {name} {common}{force}/>",
+        f'<position {name} {common}{even} kp="{kp}" kv="{kv}"/>',
+        f'<general {name} {common}{even} gainprm="{kp}" biastype="affine" biasprm="0 {-kp} {-kv}"/>',
+        f'<general {name} {common}{force} gainprm="{kp}"/>',
+        f'<motor {name} site="s{target[1]}" gear="0 0 2 0 0 0.1"{control}/>',
+        some(random, 0.2, f'<velocity {name} {common} kv="{kv}"/>') or f"<motor {name} {common}/>",
+    )
+
+
+def text_of(random):
+    """One file of the grammar."""
+    degrees = random.random() < 0.5
+    depth = int(random.integers(0, 4))
+    tree = body(random, 0, degrees, depth)
+    names = re.findall(r'<joint name="(j\d+_\d)"', tree)
+    driven = [name for name in names if random.random() < 0.6]
+    motors = "".join(actuator(random, k, name) for k, name in enumerate(driven))
+    inner = "".join(
+        f'<default class="c{c}"><joint damping="{random.uniform(0, 1)}"/><geom density="{random.uniform(200, 900)}"/>'
+        f"{some(random, 0.5, '<motor gear=' + chr(34) + '2' + chr(34) + '/>')}</default>"
+        for c in range(2)
+    )
+    option = (
+        "<option" + some(random, 0.2, ' gravity="1 0 -3"') + some(random, 0.03, ' density="1.2" viscosity="0.1"') + "/>"
+    )
+    return (
+        f'<mujoco model="m"><compiler angle="{"degree" if degrees else "radian"}"'
+        + some(random, 0.1, ' autolimits="false"')
+        + some(random, 0.1, ' inertiafromgeom="true"')
+        + some(random, 0.1, ' boundmass="0.5" boundinertia="0.01"')
+        + some(random, 0.1, ' settotalmass="5"')
+        + f"/>{option}<default>{inner}</default><worldbody>{tree}</worldbody><actuator>{motors}</actuator></mujoco>"
+    )
+
+
+def gap(path, random):
+    """The largest difference of accelerations, relative to the largest, and what the model says of the file."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model = dd.load_model(path, time_step=0.01, contact=False)
+        told = [f"{f.code}: {f.message}" for f in dd.audit(model) if f.code in OF_THE_FILE]
+        findings = [words for words in told if not BENIGN.search(words)]
+    theirs = mujoco.MjModel.from_xml_path(str(path))
+    theirs.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    data, number = mujoco.MjData(theirs), {}
+    for i in range(theirs.nu):
+        number[mujoco.mj_id2name(theirs, mujoco.mjtObj.mjOBJ_ACTUATOR, i)] = i
+    worst = 0.0
+    for _ in range(STATES):
+        x = random.uniform(-1, 1, model.nx)
+        limited = theirs.actuator_ctrllimited.astype(bool)
+        low, high = np.where(limited[:, None], theirs.actuator_ctrlrange, [-1.0, 1.0]).T
+        control = random.uniform(low, high)
+        data.qpos, data.qvel, data.ctrl = x[: model.nq], x[model.nq :], control
+        mujoco.mj_forward(theirs, data)
+        u = np.zeros(model.nu)
+        for k, name in enumerate(model.input_names):
+            i = number[name]
+            gear = theirs.actuator_gear[i]
+            if model.inputs.commanded[k]:
+                u[k] = control[i] / gear[0]
+                continue
+            sites = theirs.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_SITE
+            u[k] = control[i] * theirs.actuator_gainprm[i, 0] * (np.linalg.norm(gear[:3]) if sites else gear[0])
+            u[k] = np.clip(u[k], model.inputs.lower[k], model.inputs.upper[k])
+        twin = model.double
+        twin.set_state(x)
+        twin.set_input(u)
+        limits = np.where(model.inputs.commanded, model.effort_limits, np.inf)
+        efforts = np.clip(model.efforts(x, u), -limits, limits)
+        needed = model.actuation @ efforts - twin.inverse_dynamics(np.zeros(model.nv))
+        ours = np.linalg.solve(twin.mass_matrix(), needed)
+        worst = max(worst, float(np.max(np.abs(ours - data.qacc)) / max(1.0, np.max(np.abs(data.qacc)))))
+    notes = [note for note in model.notes if not BENIGN.search(note)]
+    return worst, [*notes, *findings]
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--count", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--show", type=int, default=5)
+    asked = parser.parse_args()
+    counts, told, silent = Counter(), Counter(), []
+    with tempfile.TemporaryDirectory() as folder:
+        for i in range(asked.count):
+            random, path = np.random.default_rng([asked.seed, i]), Path(folder) / "m.xml"
+            path.write_text(text_of(random))
+            try:
+                worst, findings = gap(path, random)
+            except ModelError as error:
+                with suppress(ValueError):
+                    mujoco.MjModel.from_xml_path(str(path))
+                    counts["refused here alone, by name"] += 1
+                told[re.sub(r"\d\S*", "#", str(error).split(": ", 1)[1])[:90]] += 1
+                continue
+            kind = "agree" if worst <= AGREE else "differ, with a finding" if findings else "differ, without a finding"
+            counts[kind] += 1
+            told.update(re.sub(r"[\w/.]*\d\S*", "#", f)[:90] for f in findings)
+            if kind == "differ, without a finding":
+                silent.append((i, worst))
+    print(f"{asked.count} files of seed {asked.seed}: " + ", ".join(f"{n} {kind}" for kind, n in counts.most_common()))
+    for words, n in told.most_common(20):
+        print(f"  {n:5} {words}")
+    print("without a finding:", silent[: asked.show])
+    return 1 if silent else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
