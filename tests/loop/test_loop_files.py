@@ -239,7 +239,9 @@ def forged_metric(seed):
     return judged
 
 
-@pytest.mark.parametrize("count", slow_after(0, [10, 40]))
+@pytest.mark.parametrize(
+    "count", [pytest.param(10, marks=pytest.mark.slow), pytest.param(40, marks=[pytest.mark.slow, pytest.mark.long])]
+)
 def test_altered_runs_are_broken_although_everything_written_of_them_agrees(small, folder, monkeypatch, count):
     """Record, trace, pages and seals are all made of the altered rows, by one who says that each part made its row."""
     dd.save(small, folder / "small")

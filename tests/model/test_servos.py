@@ -293,7 +293,9 @@ def hand():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("robot", [desk_arm, arm_with_gripper, hand])
+@pytest.mark.parametrize(
+    "robot", [desk_arm, *(pytest.param(r, marks=pytest.mark.long) for r in (arm_with_gripper, hand))]
+)
 def test_a_plan_for_servos_is_followed_in_mujoco(tmp_path, robot, monkeypatch):
     """Its inputs, held as MuJoCo's `ctrl` over each step, lead to within 0.03 rad of its states all along."""
     monkeypatch.setattr("drake_diff.planning.planner.BUDGET", 600.0)  # [s] enough for a slow machine

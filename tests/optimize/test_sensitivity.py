@@ -192,6 +192,7 @@ def test_discrete_plans_keep_what_holds_them(write_urdf):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @each_row("method", ["ilqr", "shooting"])
 def test_the_length_of_steps_moves_with_the_goal(write_urdf, method):
     """Effort k d^2 / T^3 in N steps of any length, and T: T grows with the root of d, so that dT/dd = T / 2 d."""

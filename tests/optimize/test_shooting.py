@@ -133,6 +133,7 @@ def test_a_cart_pole_swings_up(limit):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_all_of_it_together_is_solved():
     solution = shoot(everything(x_goal=None))
     assert solution.success, solution.message

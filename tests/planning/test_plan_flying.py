@@ -70,6 +70,7 @@ def test_what_floats_without_a_mass_is_refused(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_quadrotor_of_mjcf_flies_by_its_own_rotors(tmp_path):
     """Four motors of sites, which push upward alone: it tilts on its way, and hovers at the end."""
     rotors = {"a": (0.14, 0.18, 0.02), "b": (0.14, -0.18, -0.02), "c": (-0.14, -0.18, 0.02), "d": (-0.14, 0.18, -0.02)}

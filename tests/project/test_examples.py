@@ -198,6 +198,7 @@ def test_the_load_of_the_crane_sways_no_more_than_it_may():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_hand_of_the_panda_reaches_its_target_around_the_ball():
     """By Drake's own kinematics: where the hand is in the end, and where the links' frames are on the way."""
     module = example("panda_around_a_ball")
@@ -279,6 +280,7 @@ def test_the_ball_flies_out_of_the_cup_into_its_target():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @each_row("name, way", [("quadruped_jump", 0.06), ("quadruped_trot", 0.12)])
 def test_the_quadruped_goes_as_its_schedule_says_and_its_record_holds(name, way, tmp_path):
     """Where a foot is said to stand it is on the ground, where not over it, by Drake's own kinematics."""

@@ -22,6 +22,7 @@ NAMES = sorted(path.name for path in MODELS.iterdir())
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @each_row("name", NAMES)
 def test_every_model_here_is_certified_at_every_sampled_state(load, name):
     """Eight states of each model, every other one in contact if the model can touch something."""

@@ -122,6 +122,7 @@ def test_limits_and_folders_that_are_none_are_refused(run, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @each_row("words, refused", [(["--every-model", "--count", "12"], 8), (["--count", "25"], 8)])
 def test_no_strange_directory_ends_this_process_or_leads_the_reader_out(words, refused):
     """The program fails for a crash, a hang, an opened canary, an error without a name, an accepted robot file."""

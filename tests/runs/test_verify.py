@@ -185,6 +185,7 @@ def set_value(index, key, value):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @each_row(
     "section, change, words",
     [
