@@ -234,7 +234,7 @@ class Fallback:
 
     Args:
         mode: "hold" repeats the last command, "damp" applies -damping v at the actuated joints, with v from the
-            estimate, "stop" applies nothing.
+            estimate, "stop" applies nothing. Servos are commanded to where their joints are, by both.
         patience: how many steps of the controller without a measurement are borne.
         damping: of "damp", [N s/m] or [N m s/rad].
 
@@ -260,7 +260,7 @@ class Fallback:
         """(nu,) in place of the controller's."""
         if self.mode == "hold":
             return last
-        if self.mode == "stop" or not model.nu:
+        if self.mode == "stop" or not model.nu or model.inputs.commanded.any():  # servos damp by their own gains
             return model.neutral_input(estimate)
         at_rest = np.concatenate([estimate[: model.nq], np.zeros(model.nv)])
         return np.asarray(PD(model, 0.0, self.damping, x_ref=at_rest)(estimate, 0.0))

@@ -67,6 +67,8 @@ def test_commands_and_efforts_are_each_the_other_way_round(tmp_path):
     np.testing.assert_allclose(model.efforts(x_next, u), effort, rtol=0, atol=1e-11)
     assert model.neutral_input(x) == x[0]
     assert model.effort_limits == 40
+    for mode in ("damp", "stop"):  # a command of 0 would throw the cart to the middle
+        assert dd.loop.Fallback(mode).command(model, x, u) == x[0]
 
 
 def test_a_certificate_sees_a_wrong_gain(tmp_path):
