@@ -321,6 +321,17 @@ def is_below(key: str, sections: Sequence[str]) -> bool:
     return any(key == section or key.startswith((f"{section}.", f"{section}[")) for section in sections)
 
 
+def _turned(record: PlanRecord, x: Array, wanted: Array) -> Array:
+    """A state x (nx,) whose quaternions have the lengths and signs of those that are `wanted`: the same orientation."""
+    contract: dict[str, Any] = dict(record.contract)
+    turned, positions = np.array(x), contract.get("positions", ())
+    for i in (i for i, position in enumerate(positions) if position["name"].endswith("_qw")):
+        q, wanted_q = turned[i : i + 4], wanted[i : i + 4]
+        if not np.isnan(wanted_q).any():
+            q *= np.copysign(np.linalg.norm(wanted_q) / np.linalg.norm(q), q @ wanted_q)
+    return turned
+
+
 def odd_metrics(record: PlanRecord, plan: dict[str, Array]) -> Iterator[str]:
     """Where the metrics of a record are not those of its plan, as far as that can be told without the dynamics."""
     p: dict[str, Any] = dict(record.problem)
@@ -332,7 +343,8 @@ def odd_metrics(record: PlanRecord, plan: dict[str, Array]) -> Iterator[str]:
 
     goal, start = numbers("x_goal", np.nan), numbers("x0", np.nan)
     start[np.array(p["initial_state_free"], dtype=bool)] = np.nan
-    for name, x, wanted in (("goal error", xs[-1], goal), ("initial state error", xs[0], start)):
+    end = _turned(record, xs[-1], goal)
+    for name, x, wanted in (("goal error", end, goal), ("initial state error", xs[0], start)):
         recorded, again = metrics.get(name), finite(float(np.max(np.abs(x - wanted)[~np.isnan(wanted)], initial=0.0)))
         if (recorded is None) != (again is None) or abs((recorded or 0.0) - (again or 0.0)) > ROUNDED * max(
             1.0, again or 0.0

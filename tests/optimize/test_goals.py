@@ -27,6 +27,7 @@ import drake_diff as dd
 from drake_diff.exceptions import InputError, ShapeError, UnknownNameError
 from drake_diff.optimize.knots import Traced, trace
 from drake_diff.optimize.problem.goals import AIMED
+from drake_diff.runs.reproduce import odd_metrics
 
 pytestmark = pytest.mark.solve
 
@@ -356,6 +357,9 @@ def test_a_satellite_turns_by_every_method_whatever_the_sign_of_its_goal(tmp_pat
         costs.append(solution.cost)
     assert costs == pytest.approx([costs[0]] * 3, rel=1e-6)
     assert least < costs[0] < 1.01 * least  # as many steps take 1 / (1 - 1/20^2) of it where nothing turns
+    dd.save(solution, tmp_path / "run")
+    assert dd.verify(tmp_path / "run").holds
+    assert list(odd_metrics(dd.load_record(tmp_path / "run"), dict(np.load(tmp_path / "run" / "plan.npz")))) == []
     turned = solution.xs[-1].copy()
     turned[:4] = np.cos(0.1), 0, 0, np.sin(0.1)
     assert np.max(np.abs(problem.goal_error(turned))) > 0.1
