@@ -631,7 +631,7 @@ def load_model(
         plant.Finalize()
     except DRAKES_REFUSALS as error:
         raise ModelError(f"{source}: expected a model that Drake can finalize; Drake says: {error}") from error
-    notes += damp_servos(plant, read.facts) if gains is None else ()
+    notes += damp_servos(plant, read.facts)
     coupling = coupling_of(plant, mimics)
     body_forces = check_body_forces([*read.facts.thrusters, *body_forces])
     add_body_forces(builder, plant, body_forces)

@@ -170,6 +170,8 @@ def add_servos(
     for name, joint in chosen.items():
         kp, kd = gains[name] if isinstance(gains, dict) else gains
         by_joint[joint.index()].set_controller_gains(PdControllerGains(p=kp, d=kd))
+        if says := facts.joints.get(_key(plant, joint)):
+            facts.joints[_key(plant, joint)] = replace(says, damping_ratio=0.0)
     return (*notes, f"{len(chosen)} inputs are commanded positions, with the gains given: {', '.join(chosen)}.")
 
 
@@ -179,13 +181,13 @@ def damp_servos(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
     That is 2 ratio sqrt(kp / w), where w is the joint's own entry of the inverse mass matrix in the file's pose.
     """
     damped = []
+    with_ratio = {key: says.damping_ratio for key, says in facts.joints.items() if says.damping_ratio}
+    inverse = np.linalg.pinv(plant.CalcMassMatrix(plant.CreateDefaultContext())) if with_ratio else np.zeros((0, 0))
     for actuator in actuators(plant):
-        joint = actuator.joint()
-        says = facts.joints.get(_key(plant, joint))
-        if says is not None and says.damping_ratio and actuator.has_controller():
-            inverse, i = np.linalg.inv(plant.CalcMassMatrix(plant.CreateDefaultContext())), joint.velocity_start()
+        ratio, i = with_ratio.get(_key(plant, actuator.joint())), actuator.joint().velocity_start()
+        if ratio and actuator.has_controller():
             kp = actuator.get_controller_gains().p
-            kd = 2 * says.damping_ratio * float(np.sqrt(kp / inverse[i, i]))
+            kd = 2 * ratio * float(np.sqrt(kp / inverse[i, i]))
             actuator.set_controller_gains(PdControllerGains(p=kp, d=kd))
             damped.append(f"{actuator.name()} ({kd:.4g})")
     return (f"Gains kv of servos by their damping ratios: {', '.join(damped)}.",) if damped else ()

@@ -499,7 +499,7 @@ def _attempts(problem: Any, asked: Attempt, given: Any, solutions: list[Any]) ->
 def _without_contact(
     problem: Problem, asked: Attempt, given: Any, solutions: list[Any]
 ) -> Iterator[tuple[Attempt, Any]]:
-    """Before a method by steps: collocation of what is driven whole, or shooting for servos, which a line suits."""
+    """Before a method by steps: collocation of a fully driven model, or shooting of servos from a straight line."""
     free = asked.by("collocation", "nothing touches at first, and every coordinate is driven")
     if _is_free_at_first(problem) and _is_possible(problem, free):
         yield free, given

@@ -229,6 +229,17 @@ def test_servos_that_drake_has_not_are_refused_or_told(tmp_path, actuator, says)
         assert any("timeconst" in note for note in load(path).notes)
 
 
+def test_gains_of_one_joint_leave_the_damping_ratio_of_another(tmp_path):
+    path = tmp_path / "m.xml"
+    links = "".join(LINK.format(i=i, joint='axis="0 1 0" range="-1 1"', mass=1) for i in range(2)) + "</body></body>"
+    path.write_text(mjcf(links, "".join(f'<position name="p{i}" joint="j{i}" kp="5" dampratio="1"/>' for i in (0, 1))))
+    theirs = mujoco.MjModel.from_xml_path(str(path))
+    model = load(path, inputs="position", gains={"j0": (7.0, 0.5)})
+    assert model.servo_gains[0].tolist() == [7.0, 5.0]
+    # 1e-9: one mass matrix, by two programs
+    np.testing.assert_allclose(model.servo_gains[1], [0.5, -theirs.actuator_biasprm[1, 2]], rtol=1e-9)
+
+
 def test_efforts_are_the_inputs_where_they_are_asked_for(tmp_path):
     path = tmp_path / "m.xml"
     servo = '<position name="p" joint="j0" kp="5" kv="1" forcerange="-3 3"/>'

@@ -217,6 +217,15 @@ def test_a_quaternion_and_its_negative_are_one_goal(load):
     np.testing.assert_array_equal(problem.x_goal, x0)
 
 
+def test_a_quaternion_of_zeros_is_no_orientation(load):
+    """Its direction would be that of any state."""
+    model = load("sphere_on_ground.sdf")
+    goal = np.where(np.arange(model.nx) < 4, 0.0, model.default_state)
+    fields = {"optimize": ("initial_state",), "initial_state_mask": np.arange(model.nx) == 10}
+    with pytest.raises(InputError, match="x_goal: expected an orientation, got a quaternion of zeros"):
+        dd.Problem(model, x0=model.default_state, x_goal=goal, num_steps=5, **fields)
+
+
 def test_a_body_that_turns_on_has_the_signs_of_the_waypoint_before(load):
     """Quarter turns about z: at three of them a quaternion is nearer to the negative of that of x0."""
     model = load("sphere_on_ground.sdf")

@@ -583,7 +583,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return np.where(np.isnan(wanted), 0.0, state - wanted)
 
     def _orientations_of(self, wanted: Array) -> list[slice]:
-        """Where the quaternions are that a state `wanted` (nx,) gives whole."""
+        """Where the quaternions are of which a state `wanted` (nx,) gives all entries."""
         every = [slice(start, start + 4) for start in self._quaternions]
         return [entries for entries in every if not np.isnan(wanted[entries]).any()]
 
@@ -663,6 +663,9 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         if np.any(np.isinf(state)):
             raise InputError(subject, got=state, expected="finite numbers, NaN where free")
         check_inside(subject, state, self.bounds.x_lower, self.bounds.x_upper, self.state_names)
+        for entries in self._orientations_of(state):
+            if not state[entries].any():
+                raise InputError(subject, got="a quaternion of zeros", expected="an orientation")
         return self._with_the_signs_of(before, state)
 
     def _with_the_signs_of(self, x: Array, state: Array) -> Array:
