@@ -104,7 +104,7 @@ def differentiate_equation(form: "Form", steps: Steps, k: int, jacobian: Array) 
     by_next[form.diagonal] += damping
     by_point[:, nq:nx] -= by_next  # through (v' - v) / h and D (v' - v)
     if form.pd:
-        np.add.at(by_point, (slice(None), form.position), pressed * kp * form.ratio)  # two may be of one coordinate
+        np.add.at(by_point.T, form.position, (pressed * kp * form.ratio).T)  # two may be of one coordinate
         by_next += (pressed * (kd + h * kp)) @ form.actuation.T
     step = None if vector.step_entry is None else nx + model.nu + vector.step_entry
     if step is not None:
