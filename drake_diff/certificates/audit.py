@@ -242,14 +242,6 @@ def _undriven(point: Point) -> Found:
         yield Finding("info", "undriven", listed(meant), message, remedy, {"actuators": meant})
 
 
-def _lost_armature(point: Point) -> Found:
-    lost = [row.name for row in point.joints if not row.driven and row.says is not None and row.says.armature]
-    if lost:
-        message = "Drake has the armature of a joint only with an actuator on it: here their inertia is too small"
-        remedy = "load_model(..., actuators=) with these joints"
-        yield Finding("warning", "lost_armature", listed(lost), message, remedy, {"actuators": lost})
-
-
 def _left_out_actuators(point: Point) -> Found:
     missing = [row.name for row in point.joints if row.left_out and not row.driven]
     others = any(not joint for _, joint in point.model.file_facts.left_out)  # of tendons and sites
@@ -426,6 +418,6 @@ _CHECKS = (
     *(refused_pairs, aligned_faces, spheres_on_axes, contact_defaults, unread_compliance, pairs_at_touch),
     *(inseparable, corners_on_both_sides),
     *(_saturated_effort, _zero_effort, _jacobian, _mimics, _constraints),
-    *(_undriven, _lost_armature, _left_out_actuators, _switched_off, _massless, _skipped_meshes, _lost_shapes),
+    *(_undriven, _left_out_actuators, _switched_off, _massless, _skipped_meshes, _lost_shapes),
     *(_falls, _invented_inertia, _ignored, _zero_limits),
 )

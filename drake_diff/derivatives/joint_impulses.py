@@ -176,7 +176,7 @@ def _read(model: Model, constraint: Any) -> tuple[Array, float] | Refusal:
     if model.systems_act:
         return Refusal(f"a constraint acts, and {model.systems_act}")
     if model.nu:
-        plant.get_actuation_input_port().FixValue(context, np.zeros(model.nu))
+        plant.get_actuation_input_port().FixValue(context, np.zeros(plant.num_actuators()))
     try:
         probes = [_probe(model, context, random) for _ in range(PROBES)]
     except RuntimeError as error:

@@ -201,7 +201,7 @@ def _read_form(model: Model) -> Form:
     references = np.zeros((2, len(plant_actuators)))
     for instance, target in model.pd_targets.items():
         driven = [i for i, a in enumerate(plant_actuators) if a.model_instance() == instance]
-        references[:, driven] = np.asarray(target).reshape(2, len(driven))
+        references[:, driven] = np.asarray(target).reshape(2, -1)[:, : len(driven)]
     why = _why_driven(model)
     return Form(
         excluded="constraints act at every step" if model.num_constraints else why or model.systems_act,

@@ -414,7 +414,8 @@ def tree_for_identification(model: Model) -> Tree | Refusal:
         index, pose = placed[link.body]
         if index >= 0:
             inertial[index] += _moved_by(pose) @ numbers_of(link)
-    limits = model.inputs.of_actuators([actuator.effort_limit() for actuator in actuators(model.plant)])
+    motors = actuators(model.plant)
+    limits = model.inputs.of_actuators([actuator.effort_limit() for actuator in motors])
     numbers = Numbers(
         inertial=inertial,
         offset=np.array([link.on_parent.translation() for link in links]).reshape(-1, 3),
@@ -444,7 +445,7 @@ def tree_for_identification(model: Model) -> Tree | Refusal:
         coordinates=coordinates_of(model),
         coupling=model.coupling,
         n=n,
-        actuation=np.asarray(model.inputs.of_actuators(np.asarray(model.plant.MakeActuationMatrix()).T).T),
+        actuation=model.inputs.of_actuators(np.asarray(model.plant.MakeActuationMatrix()).T[: len(motors)]).T,
         placed=placed,
         moved_by={body: _moved_by(pose) for body, (_, pose) in placed.items()},
         bodies={link.body: link for link in bodies},

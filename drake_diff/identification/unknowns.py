@@ -25,7 +25,7 @@ from drake_diff.model.parameters import (
     second_moment,
     to_log_cholesky,
 )
-from drake_diff.model.plant import actuators, bodies, joints, labelled, radius_of_gyration
+from drake_diff.model.plant import bodies, joints, labelled, radius_of_gyration, rotors
 
 MASS, CENTER, INERTIA = "mass", "center_of_mass", "inertia"
 COULOMB, STRENGTH, BIAS = "coulomb_friction", "strength", "bias"
@@ -405,7 +405,7 @@ def _set_bodies(tree: Tree, given: dict[str, Any], inertial: Any, *, as_in_files
 def _set_rotors(model: Model, by_joint: dict[str, Any], given: dict[str, Any], reflected: Any) -> None:
     reflected[:] = 0.0
     joint_names = names_of(model.plant)[1]
-    for label, actuator in labelled(actuators(model.plant)).items():
+    for label, actuator in labelled(rotors(model.plant)).items():
         rotor = given.get(f"{label}.rotor_inertia", actuator.default_rotor_inertia())
         ratio = given.get(f"{label}.gear_ratio", actuator.default_gear_ratio())
         reflected[by_joint[joint_names[actuator.joint().index()]].v_start] += rotor * ratio**2

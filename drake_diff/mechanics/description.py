@@ -18,7 +18,7 @@ from drake_diff._base.values import Refusal
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.model.model import Model
-from drake_diff.model.plant import actuators, bodies, instances, joints, labelled, proximity_property
+from drake_diff.model.plant import actuators, bodies, instances, joints, labelled, proximity_property, rotors
 
 MOVING = ("revolute", "prismatic", "quaternion_floating")
 SHAPES = ("Sphere", "Box", "Cylinder", "Capsule", "HalfSpace")
@@ -271,11 +271,11 @@ def read_links(plant: Any, springs: dict[Any, tuple[float, float]], *, backwards
     link then moves the joint's parent, and its mass and inertia are not that body's.
     """
     body_names, joint_names = names_of(plant)
-    rotors = dict.fromkeys(joint_names, 0.0)
-    for a in actuators(plant):
-        rotors[a.joint().index()] += a.default_rotor_inertia() * a.default_gear_ratio() ** 2
+    reflected = dict.fromkeys(joint_names, 0.0)
+    for a in rotors(plant):
+        reflected[a.joint().index()] += a.default_rotor_inertia() * a.default_gear_ratio() ** 2
     numbered = [(j, j.index()) for j in joints(plant)]
-    waiting = [_link(j, joint_names[i], body_names, rotors[i], springs.get(i, (0.0, 0.0))) for j, i in numbered]
+    waiting = [_link(j, joint_names[i], body_names, reflected[i], springs.get(i, (0.0, 0.0))) for j, i in numbered]
     waiting.sort(key=lambda link: link.v_start)
     placed, ordered = {"world"}, []
     while waiting:

@@ -7,7 +7,7 @@ and other kinds of actuators are left out.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import count
@@ -31,6 +31,8 @@ SHARED = ("gear", "ctrlrange", "ctrllimited", "forcerange", "forcelimited")  # b
 SCALAR = ("hinge", "slide")  # the types of joints with one coordinate
 POSES = ("pos", "quat", "axisangle", "euler", "xyaxes", "zaxis")
 FLAGS = ("contact", "constraint", "gravity")  # what <option><flag> may disable and Drake has all the same
+OF_MASSES = ("boundmass", "boundinertia", "settotalmass")  # attributes of the compiler
+PLACE = "_place"  # the end of the names of bodies that are added around those with several joints
 MOST_INCLUDES = 100
 UNSEEN = 2**30  # a mask that no other meets: Drake makes no collision shape of a geom whose masks are both 0
 
@@ -47,7 +49,7 @@ def as_mujoco_means(xml: XmlText, path: Path, notes: list[str]) -> XmlText:
     if not xml.root.get("model"):
         xml.set(xml.root, "model", path.stem)
         notes.append(f"The model has no name in the file: it is called {path.stem}.")
-    notes += [*_frames_to_bodies(xml), *_poses_of_several_joints(xml), *_motors_and_servos(xml)]
+    notes += [*_frames_to_bodies(xml), *_poses_of_several_joints(xml), *_motors_and_servos(xml), *_velocity_servos(xml)]
     mjcf = Mjcf(xml)
     notes += _unread(mjcf, path)
     for connect in (c for section in xml.root.findall("equality") for c in section.findall("connect")):
@@ -78,9 +80,14 @@ def _frames_to_bodies(xml: XmlText) -> list[str]:
         for frame in world.iter("frame")
         if not any(child.tag in ("joint", "freejoint", "inertial") for child in frame.children)
     ]
+    notes = [f"{len(frames)} <frame>s became bodies without a joint, which is the same."] if frames else []
+    for compiler in xml.root.findall("compiler") if any(frame.find("geom") for frame in frames) else ():
+        for name in (name for name in OF_MASSES[:2] if compiler.get(name)):
+            xml.drop(compiler, name)
+            notes.append(f"Line {compiler.line}: {name} is ignored, as the file has shapes in <frame>s.")
     for frame in frames:
         xml.rename(frame, "body")
-    return [f"{len(frames)} <frame>s became bodies without a joint, which is the same."] if frames else []
+    return notes
 
 
 def _poses_of_several_joints(xml: XmlText) -> list[str]:
@@ -90,12 +97,35 @@ def _poses_of_several_joints(xml: XmlText) -> list[str]:
         pose = {name: value for name, value in body.attributes.items() if name in POSES}
         if pose and len(body.findall("joint")) > 1:
             attributes = "".join(f" {name}={quoteattr(value)}" for name, value in pose.items())
-            xml.before(body, f"<body name={quoteattr(body.get('name', f'line{body.line}') + '_place')}{attributes}>")
+            xml.before(body, f"<body name={quoteattr(body.get('name', f'line{body.line}') + PLACE)}{attributes}>")
             xml.after(body, "</body>")
             for name in pose:
                 xml.drop(body, name)
             placed.append(body.get("name", "?"))
     return [f"Poses of bodies with several joints became bodies around them: {', '.join(placed)}."] if placed else []
+
+
+def _velocity_servos(xml: XmlText) -> list[str]:
+    """Write <velocity> actuators without a limit of force, which Drake does not read, as motors and damping.
+
+    One exerts gear kv (ctrl - gear v): that of a motor of the gear times kv, with a damping of gear^2 kv of its joint.
+    """
+    mjcf, written = Mjcf(xml), list[str]()
+    elements = {e.get("name"): e for world in xml.root.findall("worldbody") for e in world.iter("joint")}
+    for actuator in (e for section in xml.root.findall("actuator") for e in section.findall("velocity")):
+        says = mjcf.attributes(actuator)
+        joint = elements.get(says.get("joint"))
+        if joint is None or "forcerange" in says or mjcf.joints[says["joint"]].sides:
+            continue
+        gear, kv = _first(says.get("gear", "1"), 1.0), _first(says.get("kv", "1"), 1.0)
+        for name, value in ({name: says[name] for name in SHARED if name in says} | {"gear": repr(gear * kv)}).items():
+            xml.set(actuator, name, value)
+        xml.drop(actuator, "kv")
+        xml.rename(actuator, "motor")
+        xml.set(joint, "damping", repr(_first(mjcf.attributes(joint).get("damping", "0")) + gear**2 * kv))
+        written.append(f"{says.get('name', '?')} ({gear * kv:g})")
+    what = "<velocity> servos became motors with damping, whose input is gear kv (in brackets) times ctrl"
+    return [f"{what}: {', '.join(written)}."] if written else []
 
 
 def _motors_and_servos(xml: XmlText) -> list[str]:
@@ -304,10 +334,10 @@ class Mjcf:
 
     def __init__(self, xml: XmlText):
         self.xml, self.root = xml, xml.root
-        self.autolimits = self._compiler("autolimits", "true") == "true"
-        self.degrees = self._compiler("angle", "degree") == "degree"
+        self.autolimits = self.compiler("autolimits", "true") == "true"
+        self.degrees = self.compiler("angle", "degree") == "degree"
 
-    def _compiler(self, name: str, default: str) -> str:
+    def compiler(self, name: str, default: str) -> str:
         given = [element.get(name) for element in self.root.findall("compiler") if element.get(name)]
         return given[-1] if given else default
 
@@ -377,6 +407,12 @@ class Mjcf:
             if any(_numbers(self.attributes(element).get("stiffness", "0")))
         ]
         return len(springs) > sum(joint.spring is not None for joint in self.joints.values())
+
+    @property
+    def weightless(self) -> bool:
+        """Whether the file compensates the gravity of each of its bodies."""
+        bodies = [body for world in self.root.findall("worldbody") for body in world.iter("body")]
+        return all(_first(body.get("gravcomp")) == 1 for body in bodies if not body.get("name").endswith(PLACE))
 
     def _range(self, says: Attributes, name: str) -> Range | None:
         """A range that holds; None where none does."""
@@ -465,7 +501,7 @@ class Mjcf:
         if axis := _numbers(says.get("axisangle", "")):
             return Rotation.from_rotvec(unit * axis[3] * np.array(axis[:3]) / np.linalg.norm(axis[:3])).as_matrix()
         if euler := _numbers(says.get("euler", "")):
-            return Rotation.from_euler(self._compiler("eulerseq", "xyz").swapcase(), unit * np.array(euler)).as_matrix()
+            return Rotation.from_euler(self.compiler("eulerseq", "xyz").swapcase(), unit * np.array(euler)).as_matrix()
         if axes := _numbers(says.get("xyaxes", "")):
             x, y = np.array(axes[:3]), np.array(axes[3:])
             x = x / np.linalg.norm(x)
@@ -563,6 +599,44 @@ def correct(plant: MultibodyPlant, instance: ModelInstanceIndex, mjcf: Mjcf) -> 
     if left:
         notes.append(f"{len(left)} actuators left out, of kinds that Drake does not read: {', '.join(left)}.")
     return notes
+
+
+def compiler_changes_masses(xml: XmlText) -> bool:
+    """Whether the compiler of an MJCF file bounds masses or inertias, or gives their sum."""
+    return any(_first(compiler.get(name)) > 0 for compiler in xml.root.findall("compiler") for name in OF_MASSES)
+
+
+def write_masses(xml: XmlText, read: Callable[[], dict[str, Any]]) -> str:
+    """Write out the masses and inertias that the compiler of MJCF makes: lower bounds of each, and the sum of masses.
+
+    `read` gives the bodies of the file as Drake reads it, by name. Inertias are bounded along the principal axes.
+    """
+    compiler = Mjcf(xml).compiler
+    least, least_inertia, total = (_first(compiler(name, "0")) for name in OF_MASSES)
+    from_shapes = compiler("inertiafromgeom", "auto") == "true"
+    bodies = [body for world in xml.root.findall("worldbody") for body in world.iter("body")]
+    for i, body in enumerate(bodies):
+        xml.set(body, "name", body.get("name") or f"nameless_{i}")
+    read_bodies = read()
+    inertias = [read_bodies[body.get("name")].default_spatial_inertia() for body in bodies]
+    bounds = [0.0 if body.get("name").endswith(PLACE) else least for body in bodies]
+    masses = [max(inertia.get_mass(), bound) for inertia, bound in zip(inertias, bounds, strict=True)]
+    scale = total / sum(masses) if total > 0 and sum(masses) > 0 else 1.0
+    for body, inertia, mass in zip(bodies, inertias, masses, strict=True):
+        had, center = inertia.get_mass(), inertia.get_com()
+        about = inertia.Shift(center).CalcRotationalInertia().CopyToFullMatrix3() if had else np.zeros((3, 3))
+        moments, axes = np.linalg.eigh(about)
+        bounded = scale * (axes * np.maximum(moments, least_inertia)) @ axes.T
+        if mass and (from_shapes or scale != 1 or mass != had or moments[0] < least_inertia):
+            words = " ".join(repr(float(bounded[i])) for i in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
+            for given in body.findall("inertial"):
+                xml.remove(given)
+            middle = " ".join(repr(float(c)) for c in (center if had else np.zeros(3)))
+            xml.append(body, f'<inertial pos="{middle}" mass="{scale * mass!r}" fullinertia="{words}"/>')
+    for element in xml.root.findall("compiler"):
+        for name in (*OF_MASSES, "inertiafromgeom"):  # which would take shapes before what is written
+            xml.drop(element, name)
+    return f"Masses are those of the compiler's bounds and sum ({', '.join(OF_MASSES)})."
 
 
 def _read_class(section: Element, name: str, parent: str, defaults: Defaults) -> None:

@@ -281,7 +281,7 @@ def read_inputs(
     fed = frozenset(i for i in acting if _is_fed(wiring.sources[id(plant), i], chosen))
     driven = [i for i, a in enumerate(actuators(plant)) if whole in fed or ports_of[a.model_instance()] in fed]
     commanded = [servos and a.has_controller() for a in actuators(plant)]
-    rows = _rows_of_actuators(plant, facts, [i for i in range(plant.num_actuators()) if i not in driven], commanded)
+    rows = _rows_of_actuators(plant, facts, [i for i in range(len(commanded)) if i not in driven], commanded)
     input_rows: list[Row] = []
     ports: list[tuple[int, slice]] = []
     first = min(places, default=0)

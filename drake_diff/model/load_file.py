@@ -11,11 +11,12 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, requires, version
 from os.path import isfile
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import yaml
 from pydrake.multibody.parsing import (
@@ -29,7 +30,15 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
 from drake_diff.exceptions import InputError, ModelError
-from drake_diff.model.file_facts import FileFacts, Mjcf, as_mujoco_means, correct, read_facts
+from drake_diff.model.file_facts import (
+    FileFacts,
+    Mjcf,
+    as_mujoco_means,
+    compiler_changes_masses,
+    correct,
+    read_facts,
+    write_masses,
+)
 from drake_diff.model.meshes import DOWNLOADED, FileMeshes, make_absolute, put_meshes, read_meshes
 from drake_diff.model.xml_text import XmlText
 
@@ -281,6 +290,7 @@ def refusal(path: Path, message: str, xml: XmlText | None, notes: list[str]) -> 
 FORMATS = (".urdf", ".sdf", ".xml", ".mjcf", ".dmd.yaml")
 DRAKES_REFUSALS = (RuntimeError, ValueError, IndexError, OverflowError, SystemExit)  # the last is a failed condition
 OF_RANGES = re.compile(r"Asymmetrical effort limits are not supported|collision filter groups are not yet implemented")
+OF_GRAVITY = re.compile(r"attribute 'gravcomp' found in a 'body' tag .* ignored")
 OF_A_SPRING = re.compile(r"attribute '(?:stiffness|springref)' found in a 'joint' tag .* ignored")
 
 # Drake says of every half space that deformable bodies will not touch it, which no model here has.
@@ -397,16 +407,35 @@ class _Reading:
             if any(joint.get("actuatorfrcrange") for joint in xml.root.iter("joint")):
                 self.notes.append("In MuJoCo actuatorfrcrange limits motors of sites too, here it does not.")
         read_meshes(self.meshes, xml, path, self.parser.package_map())
-        if xml.changed:
+        masses = xml.root.tag == "mujoco" and compiler_changes_masses(xml)
+        if xml.changed or masses:
             make_absolute(xml, path)
+        if masses:
+            xml = XmlText(str(xml).encode())  # with the bodies that were added
+            self.notes.append(write_masses(xml, partial(self._read_alone, xml)))
         return xml
+
+    def _read_alone(self, xml: XmlText) -> dict[str, Any]:
+        """The bodies of an MJCF file that is read into a plant of its own, by name."""
+        plant, before = MultibodyPlant(1.0), len(self.notes)
+        parser = Parser(plant)
+        parser.package_map().AddMap(self.parser.package_map())
+        instances = parser.AddModelsFromString(str(xml), "xml")
+        del self.notes[before:]  # which come again
+        bodies = [plant.get_body(index) for index in plant.GetBodyIndices(instances[0])]
+        return {body.name(): body for body in bodies}
 
     def _corrected(self, xml: XmlText | None, instance: ModelInstanceIndex) -> None:
         """Give what was read of an MJCF file the numbers that the file means."""
         if xml is not None and xml.root.tag == "mujoco":
             mjcf = Mjcf(xml)
             self.notes += correct(self.parser.plant(), instance, mjcf)
-            outdated = (OF_RANGES,) if mjcf.has_other_springs else (OF_RANGES, OF_A_SPRING)
+            outdated = [OF_RANGES] + [OF_A_SPRING] * (not mjcf.has_other_springs)
+            plant = self.parser.plant()
+            if mjcf.weightless and plant.num_model_instances() == 3:  # those of the world, of Drake, and this one
+                plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, 0.0])
+                self.notes.append("No gravity, as gravcomp compensates that of every body.")
+                outdated.append(OF_GRAVITY)
             self.notes[:] = [note for note in self.notes if not any(meant.search(note) for meant in outdated)]
 
     def in_own_words(self, message: str) -> str:

@@ -40,11 +40,13 @@ from drake_diff.model.plant import (
     instances,
     instances_with_joints,
     path_to_the_plant,
+    rotors,
     scene_graph_beside,
 )
 from drake_diff.model.repairs import (
     JointCoupling,
     add_actuators,
+    add_armatures,
     add_ground,
     add_servos,
     add_springs,
@@ -240,7 +242,7 @@ class Model(ShowsItsRepr):
     @property
     def by_effort(self) -> np.ndarray:
         """(nv, actuators): the generalized force by the efforts of all actuators."""
-        B = np.asarray(self.plant.MakeActuationMatrix())
+        B = np.asarray(self.plant.MakeActuationMatrix())[:, : len(actuators(self.plant))]
         return B if self.coupling is None else self.coupling.spread.T @ B
 
     @property
@@ -415,7 +417,7 @@ class Model(ShowsItsRepr):
         except RuntimeError as error:
             raise ModelError(f"the model cannot be converted to AutoDiffXd: {error}") from error
         plant = follow(diagram, self.path)
-        for ours, twin in zip(actuators(self.plant), actuators(plant), strict=True):
+        for ours, twin in zip(rotors(self.plant), rotors(plant), strict=True):
             if ours.has_controller():
                 gains = ours.get_controller_gains()
                 twin.set_controller_gains(PdControllerGains(p=gains.p, d=gains.d))
@@ -470,7 +472,7 @@ class Model(ShowsItsRepr):
         """
         targets = {}
         for instance in instances(self.plant):
-            driven = [a for a in actuators(self.plant) if a.model_instance() == instance]
+            driven = [a for a in rotors(self.plant) if a.model_instance() == instance]
             port = self.plant.get_desired_state_input_port(instance)
             if any(a.has_controller() for a in driven) and not self.servos and not self.feeds(port):
                 positions = [float(q) for a in driven for q in a.joint().default_positions()]
@@ -822,6 +824,7 @@ def _repaired(
         if weld_base is not None:
             weld_link(plant, weld_base)
         notes += hold_base(plant, base)
+        notes += add_armatures(plant, facts)
         notes += add_springs(plant, facts)
         notes += () if options["contact"] else take_away_contact(plant, scene_graph)
         return notes + add_ground(plant, options["ground"]), mimics if choice == "reduce" else ()

@@ -13,6 +13,7 @@ from drake_diff.exceptions import ModelError, UnknownNameError
 
 _SCENE_GRAPHS = (SceneGraph_[float], SceneGraph_[AutoDiffXd])
 
+ARMATURE = "armature of "  # how the actuators of joints begin that nothing drives: Drake has rotors on actuators alone
 FLOATING = ("quaternion_floating", "rpy_floating")  # the types of joints that hold nothing
 DiagramPath = tuple[int, ...]  # the position among the subsystems, level by level
 
@@ -39,7 +40,12 @@ def joints(plant: Any) -> list[Any]:
 
 
 def actuators(plant: Any) -> list[Any]:
-    """Every actuator, in the order of the actuation input."""
+    """Every actuator that can be driven, in the order of the actuation input, where those of ARMATURE come last."""
+    return [actuator for actuator in rotors(plant) if not actuator.name().startswith(ARMATURE)]
+
+
+def rotors(plant: Any) -> list[Any]:
+    """Every actuator of Drake's, also those that nothing drives and that give their joints an armature."""
     return [plant.get_joint_actuator(JointActuatorIndex(int(i))) for i in plant.GetJointActuatorIndices()]
 
 

@@ -47,7 +47,7 @@ from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.model.contact_geometry import collision_geometries
 from drake_diff.model.file_facts import FileFacts, Mimic
 from drake_diff.model.load_file import DRAKES_REFUSALS
-from drake_diff.model.plant import actuators, bodies, joints, labelled, named
+from drake_diff.model.plant import ARMATURE, actuators, bodies, joints, labelled, named
 
 GROUND_FRICTION = 0.5  # of ground=True: what Drake's SceneGraph gives to geometry without a friction of its own
 Actuated = str | tuple[str, ...] | dict[str, float | None] | None
@@ -125,6 +125,18 @@ def add_actuators(plant: MultibodyPlant, asked: Actuated, facts: FileFacts) -> t
     if opened:
         notes.append(f"Limits of 0 of driven joints taken as none: {', '.join(opened)}.")
     return tuple(notes)
+
+
+def add_armatures(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
+    """Give joints without an actuator the armature that MJCF gives them: Drake has it on actuators alone."""
+    driven, added = {actuator.joint().index() for actuator in actuators(plant)}, []
+    for joint in joints(plant):
+        says = facts.joints.get(_key(plant, joint))
+        if says is not None and says.armature and joint.index() not in driven and can_be_driven(joint):
+            rotor = plant.AddJointActuator(ARMATURE + joint.name(), joint)
+            rotor.set_default_rotor_inertia(says.armature)
+            added.append(f"{joint.name()} ({says.armature:g})")
+    return (f"Armature of joints that nothing drives: {', '.join(added)}.",) if added else ()
 
 
 def check_servos(inputs: str | None, gains: Any) -> None:

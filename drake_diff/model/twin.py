@@ -114,6 +114,7 @@ class Twin:
     def _actuation(self) -> Any:
         """The plant's own input port where u is its actuation and nothing else, or None."""
         plain = self.inputs.plain and not self.inputs.commanded.any()
+        plain = plain and self.plant.num_actuators() == len(self.inputs.names)
         return self.plant.get_actuation_input_port() if plain else None
 
     @cached_property
@@ -125,7 +126,8 @@ class Twin:
             entries = np.flatnonzero(self.inputs.commanded & np.isin(self.inputs.actuator, driven))
             places = np.array([driven.index(i) for i in self.inputs.actuator[entries]], dtype=np.intp)
             if len(entries):
-                ports.append((self.plant.get_desired_state_input_port(instance), 2 * len(driven), places, entries))
+                port = self.plant.get_desired_state_input_port(instance)
+                ports.append((port, port.size(), places, entries))
         return ports
 
     @cached_property

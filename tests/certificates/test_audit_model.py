@@ -26,7 +26,6 @@ CODES = [
     "zero_limit",
     "corners_miss",
     "left_out",
-    "lost_armature",
     "switched_off",
 ]
 INERTIA = '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>'
@@ -142,9 +141,8 @@ FILES = {
         + joint("last", "tip", "end")
         + "</robot>",
     ),
-    "left_out": MJCF.format("", "", '<actuator><velocity name="servo" joint="j" kv="5"/></actuator>'),
+    "left_out": MJCF.format("", "", '<actuator><damper name="servo" joint="j" kv="5"/></actuator>'),
     "left_out 2": MJCF.format("", "", '<actuator><motor name="pull" tendon="t"/></actuator>'),
-    "lost_armature": MJCF.format("", 'armature="2"', ""),
     "switched_off": MJCF.format('<option><flag contact="disable"/></option>', "", ""),
     "switched_off 2": MJCF.format('<option><flag gravity="disable"/></option>', "", ""),
     "never_apart": sdf(""),
@@ -247,11 +245,10 @@ TRAPS = [
         "warning",
         "left_out",
         {},
-        r"1 actuators left out, .*: servo \(velocity of j, line 1\)",
+        r"1 actuators left out, .*: servo \(damper of j, line 1\)",
         {"actuators": ["j"]},
     ),
     ("left_out", "warning", "left_out 2", {}, r"pull \(motor of no joint, line 1\)", None),
-    ("lost_armature", "warning", "lost_armature", {}, r"j\): Drake has the armature", {"actuators": ["j"]}),
     ("switched_off", "warning", "switched_off", {}, r"contact\): the file switches it off", {"contact": False}),
     (
         "switched_off",

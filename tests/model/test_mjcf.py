@@ -13,7 +13,7 @@ from pydrake.multibody.tree import MultibodyForces
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError
 from drake_diff.model.named_files import named_files
-from drake_diff.model.plant import actuators, joints
+from drake_diff.model.plant import actuators, bodies, joints
 
 GEOM = '<geom size="0.1" mass="1"/>'
 AGREE = 1e-9  # relative: both sum up a chain of a few bodies in double precision
@@ -120,8 +120,115 @@ def test_a_random_file_is_read_as_mujoco_reads_it(tmp_path, seed):
     random = np.random.default_rng(seed)
     text = random_file(random)
     (tmp_path / "m.xml").write_text(text)
-    model = load(tmp_path / "m.xml", actuators="all")  # without an actuator Drake has no armature
+    model = load(tmp_path / "m.xml")
     assert gap_to_mujoco(text, model, random) < AGREE
+
+
+ARM = (
+    f'<body name="a" pos="0 0 1"><joint name="j" axis="0 1 0" armature="0.2"/>{GEOM}<body name="b" pos="0.5 0 0">'
+    f'<joint name="k" axis="0 1 1" armature="0.7"/><geom size="0.1" pos="0 0.2 0.3"/></body></body>'
+)
+
+
+@each_row(
+    "actuator",
+    [
+        '<motor name="u" joint="j"/>',
+        '<motor name="u" joint="k"/>',
+        '<position name="u" joint="j" kp="30" kv="2"/>',
+        "",
+    ],
+)
+def test_a_joint_that_nothing_drives_has_its_armature(tmp_path, actuator):
+    """Drake has it on actuators alone; the ones that are added are no inputs."""
+    path = write(tmp_path, ARM, more=f"<actuator>{actuator}</actuator>")
+    model, other = load(path), load(path, actuators="all", inputs="effort")
+    assert model.input_names == (("u",) if actuator else ())
+    np.testing.assert_array_equal(
+        model.plant.CalcMassMatrix(context_of(model)), other.plant.CalcMassMatrix(context_of(other))
+    )
+    assert gap_to_mujoco(path.read_text(), model, np.random.default_rng(0)) < AGREE
+    x, u = np.array([0.3, 0.2, 0.1, -0.4]), np.full(model.nu, 0.5)
+    dd.certify(model, x, u).require()
+    assert np.all(dd.step(model.changed(time_step=0.005), x, u) != dd.step(model, x, u))
+
+
+def context_of(model):
+    context = model.plant.CreateDefaultContext()
+    model.plant.SetPositions(context, [0.3, 0.2])
+    return context
+
+
+def test_an_export_says_the_armature_of_a_joint_that_nothing_drives_or_is_refused(tmp_path):
+    from drake_diff.export import export_model
+
+    model = load(write(tmp_path, ARM, more='<actuator><motor name="u" joint="j"/></actuator>'))
+    export_model(model, tmp_path / "mjcf", target="mjcf")
+    again = load(tmp_path / "mjcf" / "model.xml")
+    np.testing.assert_allclose(dd.step(again, np.ones(4), [1.0]), dd.step(model, np.ones(4), [1.0]), rtol=1e-12)
+    with pytest.raises(ModelError, match="armature"):
+        export_model(model, tmp_path / "urdf", target="urdf")
+
+
+@each_row(
+    "compiler, masses",
+    [
+        ("", (1.0, 0.1, 2.0)),
+        ('boundmass="0.5"', (1.0, 0.5, 2.0)),
+        ('boundinertia="0.04"', (1.0, 0.1, 2.0)),
+        ('settotalmass="6.2"', (2.0, 0.2, 4.0)),
+        ('boundmass="0.5" settotalmass="7" boundinertia="0.04" inertiafromgeom="auto"', (2.0, 1.0, 4.0)),
+        ('inertiafromgeom="true" boundmass="0.001"', (1.0, 0.1, 0.3)),
+    ],
+)
+def test_the_compiler_s_masses_are_mujoco_s(tmp_path, compiler, masses):
+    body = (
+        '<body pos="0 0 1"><joint name="j" axis="0 1 0"/><geom type="box" size="0.1 0.2 0.3" mass="1" pos="0.1 0 0"/>'
+        '<body name="b" pos="0 0 1" euler="30 0 0"><geom size="0.1" mass="0.04" pos="0 0.2 0"/>'
+        '<geom type="box" size="0.1 0.03 0.2" mass="0.06" euler="20 30 0"/>'
+        '<body name="c" pos="1 0 0"><joint name="k" type="slide"/><joint name="l" axis="1 0 0" pos="0 0.1 0.3"/>'
+        '<inertial pos="0 0.1 0" mass="2" fullinertia="1 1.2 1.5 0.1 0.1 0.1"/><geom size="0.2" mass="0.3"/></body>'
+        "</body></body>"
+    )
+    path = write(tmp_path, body, defaults=f"<compiler {compiler}/>")
+    model = load(path)
+    found = [m for b in bodies(model.plant) if (m := b.default_mass()) > 0]
+    np.testing.assert_allclose(found, masses, rtol=1e-12)
+    assert gap_to_mujoco(path.read_text(), model, np.random.default_rng(0)) < AGREE
+
+
+def test_bounds_of_masses_are_told_where_shapes_are_in_frames(tmp_path):
+    body = HINGE.format("", '<frame pos="0 0 1"><geom size="0.1" mass="0.1"/></frame>')
+    model = load(write(tmp_path, body, defaults='<compiler boundmass="0.5"/>'))
+    assert "boundmass is ignored" in str(model.notes)
+
+
+@each_row("each, gravity", [((1, 1), 0.0), ((1, 0), 9.81), ((0.5, 0.5), 9.81)])
+def test_gravity_that_is_compensated_on_every_body_is_none(tmp_path, each, gravity):
+    first, second = each
+    body = (
+        f'<body gravcomp="{first}"><joint name="j" axis="0 1 0"/><geom size="0.1" pos="1 0 0"/>'
+        f'<body gravcomp="{second}"><joint name="k" axis="0 1 0"/><geom size="0.1" pos="1 0 0"/></body></body>'
+    )
+    model = load(write(tmp_path, body))
+    assert np.linalg.norm(model.contract.gravity) == gravity
+    assert ("gravcomp' found in a 'body' tag is currently unsupported" in str(model.notes)) == (gravity > 0)
+
+
+def test_a_velocity_servo_is_a_motor_with_damping(tmp_path):
+    """gear kv (ctrl - gear v), which MuJoCo exerts; one with a limit of force is left out."""
+    mujoco = pytest.importorskip("mujoco")
+    servo = '<velocity name="{}" joint="j" kv="{}" gear="-3" ctrlrange="-2 2"{}/>'
+    more = f"<actuator>{servo.format('u', 5, '')}</actuator>"
+    path = write(tmp_path, HINGE.format('damping="0.4"', ""), more=more)
+    model, data = load(path), mujoco.MjData(other := mujoco.MjModel.from_xml_path(str(path)))
+    data.qvel, data.ctrl = 0.7, 1.2
+    mujoco.mj_forward(other, data)
+    (damping,) = model.double.damping()
+    assert model.contract.inputs[0].upper == 30.0
+    assert -3 * 5 * 1.2 + 0.4 * 0.7 - damping * 0.7 == pytest.approx(data.qfrc_actuator[0], abs=1e-12)
+    path = write(tmp_path, HINGE.format("", ""), more=more.replace("/></act", ' forcerange="-1 1"/></act'))
+    assert "1 actuators left out" in str(load(path).notes)
 
 
 def effort_range(path):
