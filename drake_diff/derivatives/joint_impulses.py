@@ -10,7 +10,9 @@ and w = j diag(A)^-1 j' its effective inverse mass, h the time step:
   in two steps at the velocity before the step or without constraints;
 - a controller: h times its effort, so 1 / R = h (h kp + kd) and v_hat = R h (u - kp (q - q_ref) + kd v_ref), |g| at
   most h times the effort limit; gains too stiff for the time step, R < b w, are lowered by one factor until R = b w;
-- a coupler q_0 = ratio q_1 + offset that is off by d: v_hat = -d / 2h, R = b w.
+- a coupler q_0 = ratio q_1 + offset that is off by d: v_hat = -d / 2h, R = b w;
+- a point of a body that is held at one of another, off by g in world axes: three with the Jacobian J of the difference
+  of their velocities, v_hat = -g / 2h, R = b |J diag(A)^-1 J'| / 3, in the norm of Frobenius.
 
 b = 0.1^2 / (4 pi^2) is Drake's near-rigid factor (Castro, Permenter and Han, "An unconstrained convex formulation of
 compliant contact", 2022).
@@ -44,7 +46,7 @@ LIMIT_WINDOW = 2.0  # of how far a joint moves in a step: where Drake looks for 
 class JointImpulses:
     """S of them in each of N problems; one whose bounds are both 0 does not act."""
 
-    direction: Array  # (S, nv) j
+    direction: Array  # (S, nv) j, or (N, S, nv) where those of points of loops are among them
     target: Array  # (N, S) v_hat [m/s or rad/s]
     compliance: Array  # (N, S) R [1/kg or 1/(kg m^2)]
     lower: Array  # (N, S) [N s or N m s]
@@ -52,7 +54,8 @@ class JointImpulses:
 
     def subset(self, which: Indices) -> "JointImpulses":
         """Those of some of the problems."""
-        return JointImpulses(self.direction, *(array[which] for array in self._of_problems))
+        direction = self.direction if self.direction.ndim == 2 else self.direction[which]
+        return JointImpulses(direction, *(array[which] for array in self._of_problems))
 
     @property
     def _of_problems(self) -> tuple[Array, ...]:
@@ -60,7 +63,7 @@ class JointImpulses:
 
     def reach(self) -> NDArray[np.bool_]:
         """(N, nv) which degrees of freedom they may move."""
-        return np.asarray((self.lower < self.upper) @ (self.direction != 0))
+        return np.asarray(((self.lower < self.upper)[:, None, :] @ (self.direction != 0))[:, 0])
 
     def evaluate(self, v: Array) -> tuple[Array, Array]:
         """The impulses (N, S) at the velocities v (N, nv), and their derivatives (N, S) by -j . v', none at a bound."""
@@ -72,7 +75,25 @@ class JointImpulses:
 def gather(parts: Sequence[JointImpulses]) -> JointImpulses:
     """All of some parts as one."""
     of_problems = zip(*(impulses._of_problems for impulses in parts), strict=True)
-    return JointImpulses(np.vstack([impulses.direction for impulses in parts]), *map(np.hstack, of_problems))
+    directions = [impulses.direction for impulses in parts]
+    if any(direction.ndim == 3 for direction in directions):
+        count = len(parts[0].target)
+        directions = [np.broadcast_to(d, (count, *d.shape[-2:])) for d in directions]
+    return JointImpulses(np.concatenate(directions, axis=-2), *map(np.hstack, of_problems))
+
+
+def impulses_of_loops(jacobian: Array, gap: Array, diagonal: Array, h: float) -> JointImpulses:
+    """Of L points in N problems that are held at others.
+
+    `jacobian` (N, L, 3, nv) is that of the difference of their velocities, `gap` (N, L, 3) the difference of places,
+    `diagonal` (N, nv) that of A.
+    """
+    count, L = gap.shape[:2]
+    delassus = np.einsum("nlav,nv,nlbv->nlab", jacobian, 1 / diagonal, jacobian)
+    compliance = np.repeat(NEAR_RIGID * np.linalg.norm(delassus, axis=(-2, -1)) / 3, 3, axis=1)
+    infinite = np.full((count, 3 * L), np.inf)
+    target = -gap.reshape(count, -1) / (2 * h)
+    return JointImpulses(jacobian.reshape(count, 3 * L, -1), target, compliance, -infinite, infinite)
 
 
 def limit_impulses(limits: Array, q: Array, v: Array, free: Array, diagonal: Array, h: float) -> list[JointImpulses]:
@@ -138,8 +159,10 @@ def couplers_of(model: Model) -> Couplers | Refusal:
         return model.cache("couplers", lambda: _known(model), of_structure=True)
 
     def read() -> Couplers | Refusal:
-        couplers = []
+        couplers, of_loops = [], [pair.constraint for pair in model.file_facts.held_points]
         for constraint in model.plant.GetConstraintIds():
+            if constraint in of_loops:
+                continue
             if not model.plant.GetConstraintActiveStatus(model.double.context, constraint):
                 continue
             coupler = _read(model, constraint)

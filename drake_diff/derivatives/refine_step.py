@@ -38,11 +38,13 @@ from drake_diff.derivatives.joint_impulses import (
     JointImpulses,
     couplers_of,
     gather,
+    impulses_of_loops,
     limit_impulses,
     single_joints,
 )
 from drake_diff.derivatives.smooth_step import Form, form_of
 from drake_diff.model.contract import SAP_RELATIVE_TOLERANCE
+from drake_diff.model.loops import relative_motion
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied
 from drake_diff.model.plant import joints, proximity_property
@@ -117,8 +119,9 @@ class ConvexSteps:
         """The balance at v (N, nv)."""
         j, (pull, stiffness) = self.joints.direction, self.joints.evaluate(v)
         by_contacts, curvature = self.contacts.evaluate(v)
-        given = (j.T @ pull[..., None])[..., 0] + by_contacts
-        curvature += self.A + j.T @ (stiffness[..., None] * j)
+        across = j.swapaxes(-1, -2)
+        given = (across @ pull[..., None])[..., 0] + by_contacts
+        curvature += self.A + across @ (stiffness[..., None] * j)
         had = (self.A @ v[..., None])[..., 0]
         return Balance(had - self.momentum - given, given, curvature)
 
@@ -344,6 +347,7 @@ class _Read:
     mass: Array  # (nv, nv)
     bias: Array  # (nv,) the force that no acceleration needs, less those that act
     contacts: list[tuple[Array, ...]]  # of both bodies `_motions`; the point, normal, phi, and material (2, 4)
+    held: tuple[Array, Array]  # `relative_motion` of the model's held points
 
 
 def _read(model: Model, settings: _Settings) -> _Read | Refusal:
@@ -352,7 +356,8 @@ def _read(model: Model, settings: _Settings) -> _Read | Refusal:
     if isinstance(contacts, Refusal):
         return contacts
     mass = model.plant.CalcMassMatrix(model.double.context)
-    return _Read(settings, mass, model.double.inverse_dynamics(np.zeros(model.nv)), contacts)
+    held = relative_motion(model.plant, model.double.context, model.file_facts.held_points)
+    return _Read(settings, mass, model.double.inverse_dynamics(np.zeros(model.nv)), contacts, held)
 
 
 def _contacts(model: Model, settings: _Settings) -> list[tuple[Array, ...]] | Refusal:
@@ -428,6 +433,9 @@ def _problems(
         parts.append(pd.impulses(q, us[:, which] - command, weights, h))
     if isinstance(couplers, Couplers) and len(couplers.offset):
         parts.append(couplers.impulses(q, weights, h))
+    if model.file_facts.held_points:
+        jacobians, differences = (np.array([r.held[i] for r in read]) for i in (0, 1))
+        parts.append(impulses_of_loops(jacobians, differences, weights, h))
     return ConvexSteps(A, momentum, _contact_impulses(model, read, v, weights), gather(parts), _same_tree(model))
 
 

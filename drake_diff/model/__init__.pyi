@@ -1,3 +1,4 @@
+from .assembly import assembled as assembled
 from .contact import SoftContact as SoftContact
 from .contact import contact_modes as contact_modes
 from .contact import softened as softened

@@ -21,6 +21,7 @@ from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains
 from scipy.spatial.transform import Rotation
 
 from drake_diff.exceptions import ModelError
+from drake_diff.model.loops import APART, WORLD, HeldBodies, HeldPoints, loops_of_sdf
 from drake_diff.model.plant import actuators
 from drake_diff.model.xml_text import Element, XmlText
 
@@ -49,19 +50,12 @@ def as_mujoco_means(xml: XmlText, path: Path, notes: list[str]) -> XmlText:
     if not xml.root.get("model"):
         xml.set(xml.root, "model", path.stem)
         notes.append(f"The model has no name in the file: it is called {path.stem}.")
-    notes += [*_frames_to_bodies(xml), *_poses_of_several_joints(xml), *_motors_and_servos(xml), *_velocity_servos(xml)]
+    notes += [*_frames_to_bodies(xml), *_poses_of_several_joints(xml)]
+    if joined := _tendons_of_one_joint(xml):
+        notes, xml = notes + joined, xml.read_again()
+    notes += [*_motors_and_servos(xml), *_velocity_servos(xml)]
     mjcf = Mjcf(xml)
     notes += _unread(mjcf, path)
-    for connect in (c for section in xml.root.findall("equality") for c in section.findall("connect")):
-        says = mjcf.attributes(connect)
-        if says.get("active") == "false":
-            xml.remove(connect)
-            notes.append(f"{path}:{connect.line}: a <connect> that is not active was left out.")
-        elif says.get("body1") and says.get("body2", "world") == "world":
-            raise ModelError(
-                f"{path}:{connect.line}: <connect> holds {says['body1']} to the world, and a step with such a "
-                "constraint ends the process in Drake: let its body2 be a body without a joint, in <worldbody>"
-            )
     paired = {name for pair in mjcf.touching.pairs for name in pair}
     for geom in (g for section in xml.root.findall("worldbody") for g in section.iter("geom")):
         if geom.get("name") in paired and not any(mjcf.masks(geom)):
@@ -105,6 +99,34 @@ def _poses_of_several_joints(xml: XmlText) -> list[str]:
     return [f"Poses of bodies with several joints became bodies around them: {', '.join(placed)}."] if placed else []
 
 
+def _tendons_of_one_joint(xml: XmlText) -> list[str]:
+    """Let an actuator of a <fixed> tendon drive a joint, where the others of the tendon follow that in proportion."""
+    mjcf, written = Mjcf(xml), list[str]()
+    follows = {mimic.follower: mimic for mimic in mjcf.mimics("")}
+    tendons = {t.get("name"): t for section in xml.root.findall("tendon") for t in section.findall("fixed")}
+    for actuator in (e for section in xml.root.findall("actuator") for e in section.children):
+        says = mjcf.attributes(actuator)
+        tendon = tendons.get(says.get("tendon", ""))
+        if tendon is None:
+            continue
+        leaders, total = set[str](), 0.0
+        for part in tendon.findall("joint"):
+            joint, ratio, offset = part.get("joint"), _first(part.get("coef", "1"), 1.0), 0.0
+            for _ in range(len(follows)):
+                if joint in follows:
+                    mimic = follows[joint]
+                    joint, ratio, offset = mimic.leader, ratio * mimic.ratio, offset + ratio * mimic.offset
+            leaders.add(joint if offset == 0 else "")
+            total += ratio
+        if len(leaders) == 1 and total != 0 and leaders < mjcf.joints.keys():
+            (leader,) = leaders
+            xml.set(actuator, "joint", leader)
+            xml.set(actuator, "gear", repr(_first(says.get("gear", "1"), 1.0) * total))
+            xml.drop(actuator, "tendon")
+            written.append(f"{says.get('name', '?')} ({leader})")
+    return [f"Actuators of tendons drive the joint that the others follow: {', '.join(written)}."] if written else []
+
+
 def _velocity_servos(xml: XmlText) -> list[str]:
     """Write <velocity> actuators without a limit of force, which Drake does not read, as motors and damping.
 
@@ -114,7 +136,7 @@ def _velocity_servos(xml: XmlText) -> list[str]:
     elements = {e.get("name"): e for world in xml.root.findall("worldbody") for e in world.iter("joint")}
     for actuator in (e for section in xml.root.findall("actuator") for e in section.findall("velocity")):
         says = mjcf.attributes(actuator)
-        joint = elements.get(says.get("joint"))
+        joint = elements.get(says.get("joint", ""))
         if joint is None or "forcerange" in says or mjcf.joints[says["joint"]].sides:
             continue
         gear, kv = _first(says.get("gear", "1"), 1.0), _first(says.get("kv", "1"), 1.0)
@@ -131,7 +153,8 @@ def _velocity_servos(xml: XmlText) -> list[str]:
 def _motors_and_servos(xml: XmlText) -> list[str]:
     """Write <general> actuators of joints, which Drake does not read, as the motors and servos that they are.
 
-    With gain g and bias (0, -g, -d) one is a servo of kp g and kv d, or of the damping ratio -d where that is below 0.
+    With gain g and bias (b, -k, -d) one is a servo of kp k and kv d, or of the damping ratio -d where that is below 0.
+    Its commanded position is (g ctrl + b) / k.
     """
     mjcf, written = Mjcf(xml), list[str]()
     for element in (e for section in xml.root.findall("actuator") for e in section.findall("general")):
@@ -145,8 +168,10 @@ def _motors_and_servos(xml: XmlText) -> list[str]:
         if not any(bias):
             force = " ".join(f"{end / gain!r}" for end in _numbers(says.get("forcerange", "")))
             kind, more = "motor", {"gear": repr(gear * gain)} | ({"forcerange": force} if force else {})
-        elif bias[0] == 0 and bias[1] == -gain:
-            kind, more = "position", {"kp": repr(gain), "kv" if bias[2] <= 0 else "dampratio": repr(abs(bias[2]))}
+        elif bias[1] < 0:
+            kind, more = "position", {"kp": repr(-bias[1]), "kv" if bias[2] <= 0 else "dampratio": repr(abs(bias[2]))}
+            if (gain, 0.0) != (-bias[1], bias[0]) and (ends := _numbers(says.get("ctrlrange", ""))):
+                more["ctrlrange"] = " ".join(repr((gain * end + bias[0]) / -bias[1]) for end in ends)
         else:
             continue
         for name, value in (shared | more).items():
@@ -187,7 +212,7 @@ def with_includes(xml: XmlText, path: Path) -> XmlText:
         for element, file in includes:
             inner = XmlText(file.read_bytes())
             xml.replace(element, " ".join(inner.content(inner.root).splitlines()))
-        xml = XmlText(str(xml).encode())
+        xml = xml.read_again()
     return xml
 
 
@@ -298,7 +323,8 @@ class FileFacts:
 
     `followers` are the joints that mimic another one. `disabled` is what MJCF switches off and Drake has all the same:
     contact, constraint, gravity. `left_out` are the joints of actuators of MJCF that Drake does not read, `touching` is
-    what MJCF lets touch, by model instance. `thrusters` are the fields of a BodyForce for each motor of a site.
+    what MJCF lets touch, by model instance. `thrusters` are the fields of a BodyForce for each motor of a site. `loops`
+    are what is held together, `held_points` by what the plant holds it.
     """
 
     joints: dict[Key, JointSays] = field(default_factory=dict)
@@ -308,6 +334,8 @@ class FileFacts:
     left_out: set[Key] = field(default_factory=set)
     touching: dict[str, TouchFilter] = field(default_factory=dict)
     thrusters: list[dict[str, Any]] = field(default_factory=list)
+    loops: list[HeldBodies] = field(default_factory=list)
+    held_points: list[HeldPoints] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -397,6 +425,12 @@ class Mjcf:
                 )
         return joints
 
+    @cached_property
+    def sites(self) -> dict[str, Element]:
+        """Those that have a name."""
+        sites = [site for world in self.root.findall("worldbody") for site in world.iter("site")]
+        return {name: site for site in sites if (name := self.attributes(site).get("name"))}
+
     @property
     def has_other_springs(self) -> bool:
         """Whether a joint has a spring that is not among `joints`: one of a ball, one without a name, a polynomial."""
@@ -459,14 +493,9 @@ class Mjcf:
 
     def thrusters(self) -> Iterator[tuple[Element, dict[str, Any]]]:
         """The motors of sites that push along a line, with or without a moment about it, as fields of a BodyForce."""
-        sites = {
-            self.attributes(site).get("name"): site
-            for world in self.root.findall("worldbody")
-            for site in world.iter("site")
-        }
         for element in (e for section in self.root.findall("actuator") for e in section.children):
             says = self.attributes(element)
-            site, bias = sites.get(says.get("site")), says.get("biastype", "none")
+            site, bias = self.sites.get(says.get("site", "")), says.get("biastype", "none")
             gain = _first(says.get("gainprm", "1"), 1.0) if element.tag == "general" else 1.0
             is_motor = element.tag == "motor" or (
                 element.tag == "general" and bias == says.get("dyntype", "none") == "none"
@@ -492,6 +521,31 @@ class Mjcf:
                     "upper": min((e[1] for e in ends), default=math.inf),
                 },
             )
+
+    def loops(self, instance: str) -> Iterator[tuple[Element, HeldBodies | None]]:
+        """Each <connect> and <weld>, and what it holds together; None of one that is not active."""
+        for element in (e for section in self.root.findall("equality") for e in section.children):
+            says = self.defaults[MAIN].get("equality", {}) | element.attributes
+            if element.tag not in ("connect", "weld"):
+                continue
+            if says.get("active", "true") == "false":
+                yield element, None
+            elif "site1" in says:
+                yield element, self._loop_of_sites(instance, element, says)
+            elif element.tag == "connect":
+                anchor = tuple([*_numbers(says.get("anchor", "")), 0.0, 0.0, 0.0][:3])
+                yield element, HeldBodies(instance, says.get("body1", WORLD), says.get("body2", WORLD), (anchor,))
+            else:
+                yield element, _loop_of_weld(instance, says)
+
+    def _loop_of_sites(self, instance: str, element: Element, says: Attributes) -> HeldBodies:
+        first, second = (self.sites.get(says.get(name, "")) for name in ("site1", "site2"))
+        if element.tag == "weld" or not (first and first.parent and second and second.parent):
+            raise ModelError(f"line {element.line}: expected a <connect> of two sites, or bodies")
+        points, others = ((tuple(_numbers(self.attributes(s).get("pos", "0 0 0"))),) for s in (first, second))
+        return HeldBodies(
+            instance, first.parent.get("name") or WORLD, second.parent.get("name") or WORLD, points, others
+        )
 
     def _turn(self, says: Attributes) -> np.ndarray:
         """(3, 3) the orientation that the attributes of an element give."""
@@ -639,6 +693,19 @@ def write_masses(xml: XmlText, read: Callable[[], dict[str, Any]]) -> str:
     return f"Masses are those of the compiler's bounds and sum ({', '.join(OF_MASSES)})."
 
 
+def _loop_of_weld(instance: str, says: Attributes) -> HeldBodies:
+    """The anchor in the second body and two points beside it, where relpose puts them, else where they are."""
+    anchor = np.array([*_numbers(says.get("anchor", "")), 0.0, 0.0, 0.0][:3])
+    points = tuple(tuple((anchor + step).tolist()) for step in (np.zeros(3), *(APART * np.eye(3)[:2])))
+    first, second, pose = says.get("body1", WORLD), says.get("body2", WORLD), _numbers(says.get("relpose", ""))
+    if len(pose) != 7 or not any(pose[3:]):
+        return HeldBodies(instance, second, first, points)
+    turn = Rotation.from_quat([*pose[4:], pose[3]])
+    return HeldBodies(
+        instance, first, second, tuple(tuple(point) for point in (turn.apply(points) + pose[:3]).tolist()), points
+    )
+
+
 def _read_class(section: Element, name: str, parent: str, defaults: Defaults) -> None:
     inherited = {tag: dict(attributes) for tag, attributes in defaults.get(parent, {}).items()}
     tags = defaults.setdefault(name, {})
@@ -695,9 +762,9 @@ def read_facts(xml: XmlText, instance: str | None, facts: FileFacts) -> None:
     if root.tag == "mujoco":
         _read_mjcf(Mjcf(xml), instance or root.get("model"), facts)
     for model in root.findall("model"):  # of SDF
-        _read_sdf(model, instance or model.get("name"), facts)
+        _read_sdf(xml, model, instance or model.get("name"), facts)
     for model in (model for world in root.findall("world") for model in world.findall("model")):
-        _read_sdf(model, model.get("name"), facts)
+        _read_sdf(xml, model, model.get("name"), facts)
 
 
 def _read_urdf(robot: Element, name: str, facts: FileFacts) -> None:
@@ -725,6 +792,9 @@ def _read_mjcf(mjcf: Mjcf, name: str, facts: FileFacts) -> None:
     for element, thruster in list(mjcf.thrusters()):
         facts.thrusters.append(thruster)
         mjcf.xml.remove(element)
+    for element, loop in list(mjcf.loops(name)):
+        facts.loops.extend([] if loop is None else [loop])
+        mjcf.xml.remove(element)
     facts.left_out.update((name, actuator.joint) for actuator in mjcf.actuators if not actuator.read)
 
 
@@ -745,7 +815,8 @@ def _link_of_urdf(link: Element) -> LinkSays:
     )
 
 
-def _read_sdf(model: Element, name: str, facts: FileFacts) -> None:
+def _read_sdf(xml: XmlText, model: Element, name: str, facts: FileFacts) -> None:
+    facts.loops.extend(loops_of_sdf(xml, model, name))
     for joint in model.findall("joint"):
         effort, key = _text(joint, "axis", "limit", "effort"), (name, joint.get("name"))
         facts.joints[key] = JointSays(effort, passive=effort == 0)
@@ -767,7 +838,7 @@ def _read_sdf(model: Element, name: str, facts: FileFacts) -> None:
         says = LinkSays(mass, _sum(diagonal), len(link.findall("collision")), not automatic)
         facts.links[name, link.get("name")] = says
     for inner in model.findall("model"):
-        _read_sdf(inner, f"{name}::{inner.get('name')}", facts)
+        _read_sdf(xml, inner, f"{name}::{inner.get('name')}", facts)
 
 
 def _text(element: Element, *path: str) -> float | None:

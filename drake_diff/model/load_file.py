@@ -411,7 +411,7 @@ class _Reading:
         if xml.changed or masses:
             make_absolute(xml, path)
         if masses:
-            xml = XmlText(str(xml).encode())  # with the bodies that were added
+            xml = xml.read_again()  # with the bodies that were added
             self.notes.append(write_masses(xml, partial(self._read_alone, xml)))
         return xml
 

@@ -33,6 +33,7 @@ from drake_diff.model.contract import Contract, read_contract
 from drake_diff.model.file_facts import FileFacts, Mimic
 from drake_diff.model.inputs import TIMES, BodyForce, add_body_forces, check_body_forces, read_inputs
 from drake_diff.model.load_file import DRAKES_REFUSALS, as_packages, read_into, warn_of_newer_versions
+from drake_diff.model.loops import close_loops, find_points
 from drake_diff.model.meshes import TREATMENTS
 from drake_diff.model.plant import (
     actuators,
@@ -622,7 +623,9 @@ def load_model(
         check_in_child_process(source, options)
     read = read_into(plant, source, options["packages"], meshes)
     repairs, mimics = _repaired(plant, scene_graph, source, read.facts, options)
-    notes = read.notes + repairs
+    held_points, closed = close_loops(plant, read.facts.loops)
+    read.facts.held_points.extend(held_points)
+    notes = read.notes + repairs + closed
     if notes:
         warnings.warn("\n  ".join([f"{source.name}:", *notes]), ModelWarning, stacklevel=2)
     notes += () if contact_geometry is None else replace_collision_geometry(plant, scene_graph, contact_geometry)
@@ -633,6 +636,7 @@ def load_model(
         plant.Finalize()
     except DRAKES_REFUSALS as error:
         raise ModelError(f"{source}: expected a model that Drake can finalize; Drake says: {error}") from error
+    find_points(plant, held_points)
     notes += damp_servos(plant, read.facts)
     coupling = coupling_of(plant, mimics)
     body_forces = check_body_forces([*read.facts.thrusters, *body_forces])

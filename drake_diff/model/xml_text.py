@@ -58,11 +58,11 @@ class XmlText:
     """An XML file's text that can be changed in place.
 
     Raises ModelError, with the line, where the text is no XML; it has no cause where the text is XML that is not read:
-    too deep, or with entities.
+    too deep, or with entities. `changed` says that the text is not the file's.
     """
 
-    def __init__(self, data: bytes):
-        self.data = data
+    def __init__(self, data: bytes, *, changed: bool = False):
+        self.data, self._was_changed = data, changed
         # Drake takes a comment with -- in it, which no XML may have; lines and positions stay.
         self._tags = re.sub(rb"<!--.*?-->", lambda match: re.sub(rb"[^\n]", b" ", match[0]), data, flags=re.DOTALL)
         self._changes: list[tuple[int, int, bytes]] = []
@@ -186,7 +186,11 @@ class XmlText:
     @property
     def changed(self) -> bool:
         """Whether anything was changed."""
-        return bool(self._changes)
+        return self._was_changed or bool(self._changes)
+
+    def read_again(self) -> "XmlText":
+        """The text as it is now, with the places and attributes that its elements have in it."""
+        return XmlText(str(self).encode(), changed=self.changed)
 
     def __str__(self) -> str:
         """The text with all changes; of two in one place the outer one counts."""

@@ -269,7 +269,7 @@ class Meter:
         """Of the step from `x` to `x_next` (nx,) that was taken last, and of the state `x`."""
         self.measure_state(x)
         self.ends.append(x_next)
-        self.efforts.append(np.array(self.net_actuation.Eval(self.context)))
+        self.efforts.append(np.array(self.net_actuation.Eval(self.context))[: self.actuation.shape[1]])
         self.applied.append(self.model.double.applied_force() if self.model.inputs.fed else self.still)
         self.contacts.append(contacts_of_the_step(self.model) if self.can_touch else ())
         contact = self._contact_force() if self.contacts[-1] else self.still

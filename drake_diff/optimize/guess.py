@@ -13,6 +13,7 @@ from pydrake.trajectories import Trajectory
 from drake_diff._base.arrays import Array, finite_array, positive_float
 from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import DrakeDiffError, InputError, ShapeError
+from drake_diff.model.assembly import closed
 from drake_diff.model.model import Model
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.problem.cost import TimedCost
@@ -191,10 +192,23 @@ def _way(problem: Problem) -> tuple[Array, Array | None]:
     cost = problem.running_cost
     reference = cost.followed(problem.start_horizon * s[:, 0]) if isinstance(cost, TimedCost) else None
     if reference is None:
-        return line, None
+        return _with_closed_loops(problem, line), None
     xs, us = reference
     bent = xs + (1 - s) * (problem.x0 - xs[0]) + s * (np.where(np.isnan(goal), xs[-1], goal) - xs[-1])
     return np.where(np.isnan(bent), line, bent), us
+
+
+def _with_closed_loops(problem: Problem, xs: Array) -> Array:
+    """xs (N+1, nx) with loops closed where the coordinates of the goal let them."""
+    if not problem.has_model or not problem.model.file_facts.held_points:
+        return xs
+    model = problem.model
+    fixed, postures = ~np.isnan(problem.goal[: model.nq]), [xs[0, : model.nq]]
+    for x in xs[1:]:
+        near = np.where(fixed, x[: model.nq], postures[-1])
+        q = closed(model, near, fixed)
+        postures.append(near if q is None else q)
+    return np.hstack([postures, xs[:, model.nq :]])
 
 
 def another_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:

@@ -80,12 +80,13 @@ class Optimality:
 
 
 def final_state_norms(linearization: list[StepDerivatives]) -> Array:
-    """(N+1,) |d x_N / d x_k|, the largest singular value, from the derivatives of N steps."""
+    """(N+1,) |d x_N / d x_k|, the largest singular value, from the derivatives of N steps; it may be infinite."""
     product = np.eye(len(linearization[-1].x_next))
     norms = [1.0]
     for d in reversed(linearization):
-        product = product @ d.A
-        norms.append(float(np.linalg.norm(product, 2)))
+        with np.errstate(over="ignore", invalid="ignore"):
+            product = product @ d.A
+        norms.append(float(np.linalg.norm(product, 2)) if np.all(np.isfinite(product)) else np.inf)
     return frozen(norms[::-1])
 
 

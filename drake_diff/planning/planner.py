@@ -57,7 +57,7 @@ FEW = 40  # steps of a least time, which is refined: a slow guess has more than 
 FINE, COARSE = 1e-5, 1e-4  # errors of an interval; inputs that jump need ever more intervals for less
 BESIDE = 0.05  # [rad or m] the range of each joint around a guess that a motion is kept near
 LOOKS = 3  # of the ten places in each step, those at which overlap is looked for are so many apart
-BUDGET, BUDGET_OF_LEAST = 40.0, 120.0  # [s] on the clock, of one attempt: another one needs no search
+BUDGET, LONG_BUDGET = 40.0, 120.0  # [s] on the clock, of one attempt: another one needs no search
 REACHES = ((0.5, 50), (0.25, 50), (0.1, 50), (0.1, 25), (0.1, 12))  # part of the way, and steps to go it
 # Where shapes must touch: spheres have derivatives, and their contact is the same in steps of other lengths.
 GENTLE: dict[str, Any] = {"time_step": 0.005, "meshes": "spheres", "contact_geometry": "corner_spheres"}
@@ -333,7 +333,7 @@ def _of_flying(robot: Robot, task: Goals, seed: int) -> Iterator[_Attempt]:
     for longer in (1, 2):
         steps = longer * guess.num_steps
         problem = _problem(task, guess, x_goal, running_cost=_effort(model), num_steps=steps)
-        options = {"method": "collocation", "time_limit": BUDGET_OF_LEAST, "options": Options(refine=True)}
+        options = {"method": "collocation", "time_limit": LONG_BUDGET, "options": Options(refine=True)}
         yield _Attempt(f"least effort in {steps} steps", robot, problem, None, options)
 
 
@@ -403,7 +403,7 @@ def _collocated(robot: Robot, task: Goals, guess: MotionGuess, least: str | None
         asked = {"running_cost": 1.0, "horizon": (FASTER[0] * whole, FASTER[1] * whole)}
     problem = _problem(task, guess, x1, **asked)
     what = "least time" if least else "least effort"
-    error, limit = (COARSE, BUDGET_OF_LEAST) if least else (FINE, BUDGET)
+    error, limit = (COARSE, LONG_BUDGET) if least else (FINE, BUDGET)
     refined = Options(refine=True, error_tolerance=error)
     options = {"method": "collocation", "time_limit": limit, "options": refined}
     name = f"{what} from {guess.name}"
@@ -478,7 +478,10 @@ def _of_passive(robot: Robot, task: Goals) -> Iterator[_Attempt]:
         raise InputError("goal", got=", ".join(task.frames), expected="goals of joints: not every joint has a motor")
     model = robot.model
     x0 = np.concatenate([robot.q, np.zeros(model.nv)])
-    goal = x0.copy()
+    goal, budget = x0.copy(), BUDGET
+    if model.file_facts.held_points:  # all else is where the loops have it
+        goal[:], budget = np.nan, LONG_BUDGET
+        goal[[model.nq + i - (model.nq - model.nv) for i in task.joints]] = 0.0
     goal[list(task.joints)] = list(task.joints.values())
     for steps in (100, 150):
         problem = Problem(
@@ -490,7 +493,7 @@ def _of_passive(robot: Robot, task: Goals) -> Iterator[_Attempt]:
             goals=task.avoid,
             running_cost=_effort(model),
         )
-        yield _Attempt(f"least effort in {steps} steps", robot, problem, None, {"method": "auto", "time_limit": BUDGET})
+        yield _Attempt(f"least effort in {steps} steps", robot, problem, None, {"method": "auto", "time_limit": budget})
 
 
 def _effort(model: Model) -> QuadraticCost:

@@ -18,6 +18,7 @@ from drake_diff.derivatives.analytic import analytic_of
 from drake_diff.exceptions import DrakeDiffError, ModelError, ModelWarning, SimulationError
 from drake_diff.legs.feet import Legs
 from drake_diff.legs.standing import Rest, stand
+from drake_diff.model.assembly import assembled
 from drake_diff.model.contact import overlaps
 from drake_diff.model.inputs import BodyForce
 from drake_diff.model.model import Model, load_model
@@ -141,6 +142,8 @@ def _reduce_followers(draft: _Draft) -> None:
 
 def _add_motors(draft: _Draft) -> None:
     count, had = _movable(draft.model), draft.model.nu
+    if had and draft.model.file_facts.held_points:
+        return  # the other joints of a loop move by it
     if had < (count if count > TEXTBOOK else FEW * count):
         driven = draft.read(actuators="all")
         if driven.nu > had:
@@ -274,6 +277,8 @@ def _placed(draft: _Draft, random: np.random.Generator) -> Robot:
     shapes, holds = model if touches else None, apart if driven else None
     if flies and shapes is not None:
         first = lifted(shapes, first)
+    if model.file_facts.held_points:
+        first = assembled(model, np.concatenate([first, np.zeros(model.nv)]))[: model.nq]
     try:
         posture = start(shapes, holds, first, lower, upper, random)
     except SimulationError as error:

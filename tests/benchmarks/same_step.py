@@ -100,6 +100,7 @@ def actuator(random, k, target):
         f'<position {name} {common}{even} kp="{kp}" kv="{kv}"/>',
         f'<general {name} {common}{even} gainprm="{kp}" biastype="affine" biasprm="0 {-kp} {-kv}"/>',
         f'<general {name} {common}{force} gainprm="{kp}"/>',
+        f'<general {name} {common}{even} gainprm="{kv + 0.1}" biastype="affine" biasprm="0.3 {-kp} {-kv}"/>',
         f'<motor {name} site="s{target[1]}" gear="0 0 2 0 0 0.1"{control}/>',
         some(random, 0.2, f'<velocity {name} {common} kv="{kv}"/>') or f"<motor {name} {common}/>",
     )
@@ -155,7 +156,8 @@ def gap(path, theirs, random):
             i = number[name]
             gear = theirs.actuator_gear[i]
             if model.inputs.commanded[k]:
-                u[k] = control[i] / gear[0]
+                gain, (bias, kp) = theirs.actuator_gainprm[i, 0], theirs.actuator_biasprm[i, :2]
+                u[k] = (gain * control[i] + bias) / -kp / gear[0]
                 continue
             sites = theirs.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_SITE
             u[k] = control[i] * theirs.actuator_gainprm[i, 0] * (np.linalg.norm(gear[:3]) if sites else gear[0])

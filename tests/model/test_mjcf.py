@@ -528,17 +528,6 @@ def test_a_mesh_in_mujocos_own_format_is_read(tmp_path):
         load(path)
 
 
-def test_what_would_end_the_process_in_drake_is_refused_with_its_line(tmp_path):
-    for other in ("", 'body2="world"'):
-        more = f'\n<equality>\n<connect body1="a" {other} anchor="0 0 0"/></equality>'
-        with pytest.raises(ModelError, match=r"m.xml:3: <connect> holds a to the world.*ends the process"):
-            load(write(tmp_path, HINGE.format("", ""), more=more))
-    off = '<equality><connect body1="a" anchor="0 0 0" active="false"/></equality>'
-    model = load(write(tmp_path, HINGE.format("", ""), more=off))
-    assert model.num_constraints == 0
-    dd.step(model, [0.1, 0.2], [])
-
-
 def test_a_missing_mesh_is_named_where_it_should_be(tmp_path, monkeypatch):
     """And no file of that name in the folder that Python happens to run in is taken."""
     (tmp_path / "here").mkdir()

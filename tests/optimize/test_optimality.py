@@ -10,6 +10,8 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff._base.values import Refusal
+from drake_diff.derivatives.step import differentiate_step
+from drake_diff.optimize.optimality import final_state_norms
 
 pytestmark = pytest.mark.solve
 
@@ -125,3 +127,11 @@ def test_plain_dynamics_have_neither():
 def test_parameters_and_a_free_start_are_variables_too(thrown):
     """The ball reaches the place at the cost of none: the optimum is a zero of the residual, so nothing is left."""
     assert thrown.optimality.gradient < 1e-6
+
+
+def test_norms_beyond_all_numbers_are_infinite():
+    """40 steps, each of which takes differences times 1e10."""
+    d = differentiate_step(dd.load_model(MODELS / "cart_pole.urdf", time_step=H), np.zeros(4), [0.0])
+    norms = final_state_norms([dataclasses.replace(d, A=1e10 * np.eye(4))] * 40)
+    assert norms[-2] == 1e10
+    assert norms[0] == np.inf

@@ -82,6 +82,8 @@ def _read(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
     couplers, tree = couplers_of(model), compiled_tree(description)
     if isinstance(couplers, Refusal):
         return couplers
+    if model.file_facts.held_points:
+        return Refusal("loops are closed")
     if tree is None:
         return Refusal("a free body is not joined to the world by its own frame")
     pairs, unknown = read_all_pairs(model), ""

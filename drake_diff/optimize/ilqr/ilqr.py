@@ -186,12 +186,13 @@ class _Search:
     def _scales(self, jacobians: Array) -> Scales:
         """Those of the problem by the guess, and by the `jacobians` (N, nx, nx + nc + nu) along it.
 
-        None in contact, whose stiffness says nothing of how far states go; that of a limit is met at few knots.
+        None in contact or with closed loops, whose stiffness says nothing of how far states go; that of a limit is met
+        at few knots.
         """
         from drake_diff.optimize.knots import costs_of  # loads CasADi
 
         problem, (xs, us), nx = self.problem, self.motion.point, self.problem.nx
-        if problem.model.contract.contact.collision_pairs:
+        if problem.model.contract.contact.collision_pairs or problem.model.num_constraints:
             return UNSCALED
         h = self.design.time_step(self.design.values(self.motion.c))
         by_knot = np.delete(jacobians, np.s_[nx : nx + len(self.motion.c)], axis=2) - np.eye(nx, nx + problem.nu)

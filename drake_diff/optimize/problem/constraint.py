@@ -302,8 +302,16 @@ def resolve_bounds(
 
 
 def plant_limits(model: Model) -> dict[str, Array]:
-    """A model's own limits, by the fields' names of `Bounds`."""
+    """A model's own limits, by the fields' names of `Bounds`.
+
+    Without those of positions that no motor moves, where loops are closed: a finger's link may rest on its limit, and
+    Drake's force there is nearly rigid.
+    """
     (q_lower, q_upper), (v_lower, v_upper) = model.position_limits, model.velocity_limits
+    if model.file_facts.held_points:
+        follows = np.ones(model.nq, dtype=bool)
+        follows[np.flatnonzero(np.any(model.actuation != 0, axis=1)) + model.nq - model.nv] = False
+        q_lower, q_upper = np.where(follows, -np.inf, q_lower), np.where(follows, np.inf, q_upper)
     return {
         "x_lower": np.concatenate([q_lower, v_lower]),
         "x_upper": np.concatenate([q_upper, v_upper]),

@@ -25,6 +25,7 @@ from drake_diff._base.arrays import (
 from drake_diff._base.autodiff import ORDINARY, named, user_function
 from drake_diff._base.values import PicklesItsFields, ShowsItsRepr
 from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, ShapeError, UnknownNameError
+from drake_diff.model.assembly import check_closed
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import TIME_STEP, ParameterVector, applied, select
 from drake_diff.model.tangent import tangent_space
@@ -180,6 +181,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
                 given = given.to_dict()
             self._set("parameters", select(system, given))
             limits = plant_limits(system)
+            check_closed(system, "x0", self.x0)
         else:
             all_of_them = (
                 self.optimizes_parameters and isinstance(self.parameters, (tuple, list)) and not self.parameters

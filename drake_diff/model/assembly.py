@@ -1,0 +1,86 @@
+"""Postures in which loops are closed: the points of each pair are where the other's are."""
+
+from collections.abc import Collection
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drake_diff._base.arrays import Array, finite_array
+from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.model.loops import relative_motion
+from drake_diff.model.model import Model
+from drake_diff.model.step import set_state
+
+OPEN = 1e-2  # of the same: from there a step moves the loop by what no plan means
+CLOSED = 1e-9  # of the distance of points from their bodies' origins
+MOST = 50  # steps of Newton's method; from what can be assembled it takes below ten
+LONGEST = 0.5  # [rad or m] of a step: farther ones miss the posture nearby
+
+
+def gap(model: Model, q: ArrayLike) -> tuple[float, float]:
+    """[m] how far the points of a pair are apart in posture q (nq,) at most, and from their bodies' origins."""
+    held = model.file_facts.held_points
+    set_state(model.double, np.concatenate([finite_array("q", q, (model.nq,)), np.zeros(model.nv)]))
+    _, apart = relative_motion(model.plant, model.double.context, held)
+    size = max((float(np.linalg.norm(point)) for pair in held for point in pair.points), default=0.0)
+    return max((float(np.linalg.norm(difference)) for difference in apart), default=0.0), size
+
+
+def check_closed(model: Model, subject: str, x: Array) -> None:
+    """InputError where x (nx,) leaves a loop of the model open."""
+    apart, size = gap(model, x[: model.nq]) if model.file_facts.held_points else (0.0, 0.0)
+    if apart > OPEN * size:
+        expected = f"a closed loop, as dd.model.assembled(model, {subject}) makes it"
+        raise InputError(subject, got=f"points {apart:.3g} m apart that the file holds together", expected=expected)
+
+
+def assembled(model: Model, x: ArrayLike, *, keep: Collection[str] = ()) -> Array:
+    """The state near `x` in which the loops of a model are closed, as <connect> of MJCF does, at the same velocities.
+
+    Args:
+        model: Any; one without loops has its state already.
+        x: (nx,) where to begin.
+        keep: The names of positions, as in `Model.state_names`, that stay as they are: those of motors, as a rule.
+
+    Returns:
+        (nx,) by Newton's method with the least change of velocities for each step.
+
+    Raises:
+        UnknownNameError: One of `keep` is no position.
+        ModelError: The loops cannot be closed from there.
+
+    Example:
+        >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
+        >>> dd.model.assembled(model, [0.3, 0.0])
+        array([0.3, 0. ])
+    """
+    state = np.array(finite_array("x", x, (model.nx,)))
+    for name in keep:
+        if name not in model.position_names:
+            raise UnknownNameError("position to keep", got=name, known=model.position_names)
+    fixed = np.isin(model.position_names, list(keep))
+    q = closed(model, state[: model.nq], fixed)
+    if q is None:
+        apart, _ = gap(model, state[: model.nq])
+        raise ModelError(f"the loops cannot be closed from there, where points are {apart:.3g} m apart; keep less")
+    return np.concatenate([q, state[model.nq :]])
+
+
+def closed(model: Model, q: Array, fixed: NDArray[np.bool_]) -> Array | None:
+    """The posture near q (nq,) in which loops are closed; what is `fixed` (nq,) stays. None where none was found."""
+    held, plant, context = model.file_facts.held_points, model.plant, model.double.context
+    q, free = np.array(q), np.ones(model.nv, dtype=bool)
+    free[np.flatnonzero(fixed) - (model.nq - model.nv)] = False  # joints come behind the quaternion of what floats
+    for _ in range(MOST if held else 0):
+        apart, size = gap(model, q)
+        if apart <= CLOSED * size:
+            return q
+        jacobian, difference = relative_motion(plant, context, held)
+        rows = jacobian.reshape(-1, jacobian.shape[-1])
+        if model.coupling is not None:
+            rows = rows @ model.coupling.spread
+        change = np.zeros(model.nv)
+        change[free] = -np.linalg.lstsq(rows[:, free], difference.ravel(), rcond=None)[0]
+        change /= max(1.0, float(np.abs(change).max()) / LONGEST)
+        q = q + np.asarray(model.double.rates(change))
+    return None if held else q

@@ -1,0 +1,324 @@
+"""Loops: points of two bodies that <connect>, <weld> or a joint of SDF holds together."""
+
+import dataclasses
+import warnings
+
+import numpy as np
+import pytest
+from helpers.table import each_row
+
+import drake_diff as dd
+from drake_diff.exceptions import InputError, ModelError, UnknownNameError
+from drake_diff.model.assembly import gap
+from drake_diff.planning import plan
+
+L, WIDTH, MASS, BAR = 0.3, 0.4, 0.7, 0.5  # [m, m, kg, kg] a parallelogram: two equal cranks and the bar between them
+G = 9.81
+
+
+def load(path, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return dd.load_model(path, **{"time_step": 0.001, **options})
+
+
+def parallelogram(tmp_path, equality=None, more=""):
+    """Cranks that hang down from two hinges; the bar is the first crank's child."""
+    rod = f'<inertial pos="0 0 {-L / 2}" mass="{MASS}" diaginertia="{MASS * L**2 / 12} {MASS * L**2 / 12} 1e-4"/>'
+    bar = f'<inertial pos="{WIDTH / 2} 0 0" mass="{BAR}" diaginertia="1e-4 0.01 0.01"/>'
+    equality = equality or f'<connect body1="bar" body2="second" anchor="{WIDTH} 0 0"/>'
+    path = tmp_path / "loop.xml"
+    path.write_text(
+        f'<mujoco model="loop"><worldbody><body name="first" pos="0 0 1"><joint name="a" axis="0 1 0"/>{rod}'
+        f'<body name="bar" pos="0 0 {-L}"><joint name="b" axis="0 1 0"/>{bar}'
+        f'<site name="end" pos="{WIDTH} 0 0"/></body></body>'
+        f'<body name="second" pos="{WIDTH} 0 1"><joint name="c" axis="0 1 0"/>{rod}<site name="tip" pos="0 0 {-L}"/>'
+        f"</body>{more}</worldbody><equality>{equality}</equality>"
+        '<actuator><motor name="m" joint="a" ctrlrange="-9 9"/></actuator></mujoco>'
+    )
+    return path
+
+
+SDF_LINK = (
+    '<link name="{}"><pose>{} 0 0 0</pose><inertial><pose>0.1 0 0.1 0 0 0</pose><mass>0.4</mass><inertia>'
+    "<ixx>0.01</ixx><iyy>0.01</iyy><izz>0.01</izz></inertia></inertial></link>"
+)
+
+
+def sdf(tmp_path, kind="revolute", effort="0", expressed=""):
+    """The hinges of a four-bar whose planes are tilted by 0.3 rad about x, of a hinge at 1 m height."""
+    axis = f"<axis><xyz{expressed}>0 1 0</xyz><limit><effort>{{}}</effort></limit></axis>"
+
+    def joint(name, parent, child, effort, kind="revolute", pose=""):
+        return (
+            f'<joint name="{name}" type="{kind}">{pose}<parent>{parent}</parent><child>{child}</child>'
+            f"{axis.format(effort)}</joint>"
+        )
+
+    links = SDF_LINK.format("crank", "0 0 1") + SDF_LINK.format("bar", "0 0 1.2") + SDF_LINK.format("rocker", "0.5 0 1")
+    path = tmp_path / "loop.sdf"
+    closing = joint("last", "bar", "rocker", effort, kind, '<pose relative_to="rocker">0 0 0.3 0 0 0</pose>')
+    path.write_text(
+        f'<sdf version="1.9"><model name="loop">{links}{joint("j", "world", "crank", 5)}'
+        f"{joint('k', 'crank', 'bar', 0)}{joint('l', 'world', 'rocker', 0)}{closing}</model></sdf>"
+    )
+    return path
+
+
+def gaps(model, x):
+    """[m] between the points of each pair."""
+    plant, context = model.plant, model.plant.CreateDefaultContext()
+    plant.SetPositions(context, x[: model.nq])
+    return [
+        np.linalg.norm(np.subtract(*(plant.EvalBodyPoseInWorld(context, plant.get_body(i)) @ p for i, p in ends)))
+        for ends in (zip(pair.bodies, pair.points, strict=True) for pair in model.file_facts.held_points)
+    ]
+
+
+@each_row(
+    "equality",
+    [
+        None,
+        '<connect site1="end" site2="tip"/>',
+        f'<connect body1="second" body2="bar" anchor="0 0 {-L}"/>',
+        f'<connect body1="bar" body2="second" anchor="{WIDTH} 0 0"/><connect body1="bar" active="false"/>',
+    ],
+)
+def test_a_parallelogram_swings_as_a_pendulum(tmp_path, equality):
+    """Each crank turns by the same angle and the bar by none: (2 m L^2 / 3 + M L^2) a = u - (m + M) g L sin(angle).
+
+    The points are held nearly rigidly: Drake's compliance gives way by (0.1 / 2 pi)^2 = 2.5e-4 of the motion.
+    """
+    model = load(parallelogram(tmp_path, equality))
+    angle, u = 0.4, 1.5
+    x = np.array([angle, -angle, angle, 0.0, 0.0, 0.0])
+    x[:3] *= -1  # a positive turn about y moves what hangs to -x
+    assert max(gaps(model, x)) < 1e-12
+    end = dd.step(model, x, [u])
+    wanted = (u + (MASS + BAR) * G * L * np.sin(angle)) / (2 * MASS * L**2 / 3 + BAR * L**2)
+    np.testing.assert_allclose(end[3:] / model.time_step, np.array([1, -1, 1]) * wanted, rtol=5e-4)
+    certificate = dd.certify(model, x + 0.01, [u])
+    certificate.require()
+    assert "solved to rounding" in str(certificate)
+
+
+@each_row(
+    "connect, moves",
+    [
+        (
+            '<connect body1="first" anchor="0 0 -0.1"/>',
+            False,
+        ),  # on the world a ball constraint ends the process in Drake
+        ('<connect body1="first" body2="world" anchor="0 0 -0.1"/>', False),
+        ('<connect body1="first" body2="world" anchor="0 0 -0.1" active="false"/>', True),
+    ],
+)
+def test_a_body_is_held_at_the_world(tmp_path, connect, moves):
+    model = load(parallelogram(tmp_path, connect), gravity=[0, 0, 0])
+    assert model.num_constraints == (0 if moves else 1)
+    x = dd.step(model, np.zeros(6), [1.0])
+    assert (abs(x[3]) > 1e-3) == moves
+    dd.certify(model, x, [1.0]).require()
+
+
+def test_a_gap_closes_within_some_steps(tmp_path):
+    """The constraint takes half of the gap away in each step."""
+    model = load(parallelogram(tmp_path), gravity=[0, 0, 0])
+    x = np.array([0.0, 0.01, 0, 0, 0, 0])
+    before = max(gaps(model, x))
+    assert before == pytest.approx(0.01 * WIDTH, rel=1e-3)
+    for _ in range(20):
+        x = dd.step(model, x, [0.0])
+    assert max(gaps(model, x)) < 1e-3 * before
+
+
+@each_row("kind", ["revolute", "ball", "fixed"])
+def test_a_joint_of_sdf_that_closes_a_loop_holds(tmp_path, kind):
+    """A weld leaves nothing to move; the others let the crank turn. Every derivative is right."""
+    model, x = load(sdf(tmp_path, kind), time_step=0.005), np.zeros(6)
+    for _ in range(40):
+        x = dd.step(model, x, [0.2])
+    assert max(gaps(model, x)) < 1e-4  # at 2 rad/s a step of 5 ms leaves (0.01 rad)^2 0.5 m / 2
+    assert (abs(x[0]) > 0.02) == (kind != "fixed")
+    dd.certify(model, x, [1.0]).require()
+
+
+@each_row(
+    "options, words",
+    [
+        ({"kind": "prismatic"}, "line 1: the joint last closes a loop: expected one of ball"),
+        ({"effort": "3"}, "has a motor: drive another joint"),
+        ({"expressed": ' expressed_in="crank"'}, "expected its axis in its own frame"),
+    ],
+)
+def test_a_loop_that_points_cannot_hold_is_refused(tmp_path, options, words):
+    with pytest.raises(ModelError, match=words):
+        load(sdf(tmp_path, **options))
+
+
+@each_row("relpose", ["", 'relpose="0.3 0 0.1 0.8 0 0.6 0"'])
+def test_a_weld_holds_a_body_in_its_pose(tmp_path, relpose):
+    """To another or to the world; a relpose is taken on, as in MuJoCo, where it is not the file's."""
+    free = (
+        '<body name="free" pos="0.2 0.1 0.5"><freejoint/><geom size="0.1" mass="1" contype="0" conaffinity="0"/></body>'
+    )
+    weld = f'<weld body1="first" body2="free" {relpose}/><connect body1="second" anchor="0 0 0.1"/>'
+    model = load(parallelogram(tmp_path, weld, free), gravity=[0, 0, 0])
+    x = model.default_state
+    for _ in range(200):
+        x = dd.step(model, x, [0.0])
+    plant, context = model.plant, model.plant.CreateDefaultContext()
+    plant.SetPositions(context, x[: model.nq])
+    first, body = (plant.EvalBodyPoseInWorld(context, plant.GetBodyByName(name)) for name in ("first", "free"))
+    pose = first.InvertAndCompose(body)
+    wanted = [0.3, 0, 0.1] if relpose else [0.2, 0.1, -0.5]
+    np.testing.assert_allclose(pose.translation(), wanted, atol=1e-3)  # all turns by the jump from the file's pose
+    np.testing.assert_allclose(
+        pose.rotation().ToQuaternion().wxyz(), [0.8, 0, 0.6, 0] if relpose else [1, 0, 0, 0], atol=1e-3
+    )
+
+
+def test_the_motion_is_mujoco_s(tmp_path):
+    """Of the same mechanism for 0.5 s under a torque: MuJoCo's constraint is soft, both are within 5 mrad."""
+    mujoco = pytest.importorskip("mujoco")
+    path = parallelogram(
+        tmp_path,
+        f'<connect body1="bar" body2="second" anchor="{WIDTH} 0 0" solref="0.002 1" solimp="0.9999 0.9999 0.001"/>',
+    )
+    model, other = load(path), mujoco.MjModel.from_xml_path(str(path))
+    other.opt.timestep = model.time_step
+    data, x = mujoco.MjData(other), np.zeros(6)
+    data.ctrl = 3.0
+    for _ in range(500):
+        mujoco.mj_step(other, data)
+        x = dd.step(model, x, [3.0])
+    assert abs(x[0]) > 0.3
+    np.testing.assert_allclose(x[:3], data.qpos, atol=5e-3)
+
+
+def test_other_points_than_the_plants_are_noticed(tmp_path):
+    """The equation that is solved to rounding is then not Drake's, and no derivative is decided by it."""
+    model = load(parallelogram(tmp_path))
+    pair = model.file_facts.held_points[0]
+    model.file_facts.held_points[0] = dataclasses.replace(pair, points=[pair.points[0], pair.points[1] + 1e-4])
+    certificate = dd.certify(model, np.full(6, 0.1), [1.0])
+    assert certificate.verdict == "undecided"
+    assert "the equation is not Drake's" in str(certificate)
+
+
+def test_loops_are_closed_from_a_posture_nearby(tmp_path):
+    """With what is kept the others follow; nothing closes the bar where a crank is kept out of reach."""
+    model = load(parallelogram(tmp_path))
+    x = dd.model.assembled(model, [0.5, 0.0, 0.0, 1.0, 2.0, 3.0], keep=["a_q"])
+    np.testing.assert_allclose(x, [0.5, -0.5, 0.5, 1.0, 2.0, 3.0], atol=1e-7)
+    with pytest.raises(ModelError, match=r"loops cannot be closed from there, where points are 0\.\d+ m apart"):
+        dd.model.assembled(model, [0.5, 0.0, 0.0, 0, 0, 0], keep=["a_q", "b_q", "c_q"])
+    with pytest.raises(UnknownNameError, match="position to keep"):
+        dd.model.assembled(model, x, keep=["crank"])
+    with pytest.raises(InputError, match=r"x0: expected a closed loop, .*points 0\.\d+ m apart"):
+        dd.Problem(model, x0={"a_q": 0.5}, x_goal={"a_q": 0.6}, num_steps=10)
+
+
+@each_row("method", ["ilqr", "shooting"])
+def test_a_crank_is_moved_by_a_verified_plan(tmp_path, method):
+    model = load(parallelogram(tmp_path), time_step=0.01)
+    cost = dd.QuadraticCost(R=[[1.0]])
+    problem = dd.Problem(model, x0=np.zeros(6), x_goal={"a_q": 0.6, "a_w": 0.0}, num_steps=40, running_cost=cost)
+    solution = dd.solve(problem, method=method)
+    assert solution.status is dd.Status.CONVERGED, solution.message
+    np.testing.assert_allclose(solution.xs[-1][:3], [0.6, -0.6, 0.6], atol=1e-4)
+    assert max(max(gaps(model, x)) for x in solution.xs) < 1e-4
+
+
+def finger(side, outward):
+    """A driver and a coupler on one side, a longer link and the finger's root on the other, pinned together."""
+    turn = "" if outward > 0 else 'quat="0 0 0 1"'
+    light = 'diaginertia="2e-6 2e-6 1e-6"'
+    return (
+        f'<body name="{side}_driver" pos="0 {0.03 * outward} 0.05" {turn}><inertial pos="0 0.02 0" mass="0.01" {light}'
+        f'/><joint name="{side}" axis="1 0 0" range="0 0.8" armature="0.005" damping="0.1"/>'
+        f'<body name="{side}_coupler" pos="0 0.03 -0.004"><inertial pos="0 0 0.015" mass="0.014" {light}/>'
+        f'<joint name="{side}_c" axis="1 0 0" range="-1.5 0"/></body></body>'
+        f'<body name="{side}_link" pos="0 {0.013 * outward} 0.06" {turn}><inertial pos="0 0.02 0.02" mass="0.02" '
+        f'{light}/><joint name="{side}_l" axis="1 0 0" range="-0.3 0.8" stiffness="0.05" springref="2.6"/>'
+        f'<body name="{side}_root" pos="0 0.055 0.037"><inertial pos="0 -0.01 0.02" mass="0.03" {light}/>'
+        f'<joint name="{side}_r" axis="1 0 0" range="-0.9 0.9"/></body></body>'
+    )
+
+
+GRIPPER = (
+    '<mujoco model="gripper"><compiler angle="radian"/><worldbody>'
+    f'{finger("right", 1)}{finger("left", -1)}</worldbody><tendon><fixed name="split">'
+    '<joint joint="right" coef="0.5"/><joint joint="left" coef="0.5"/></fixed></tendon><equality>'
+    '<connect anchor="0 0.017 -0.01" body1="right_root" body2="right_coupler"/>'
+    '<connect anchor="0 0.017 -0.01" body1="left_root" body2="left_coupler"/><joint joint1="right" joint2="left"/>'
+    '</equality><actuator><general name="fingers" tendon="split" forcerange="-5 5" ctrlrange="0 255" '
+    'gainprm="0.3137255" biastype="affine" biasprm="0 -100 -10"/></actuator></mujoco>'
+)
+LEG = (
+    '<mujoco model="leg"><worldbody><body name="trunk" pos="0 0 0.8">'
+    '<inertial pos="0 0 0" mass="3" diaginertia="0.02 0.02 0.02"/>'
+    '<joint name="rail" type="slide" axis="0 0 1" damping="1"/>'
+    '<body name="thigh"><joint name="hip" axis="0 1 0" range="-60 60" damping="0.05" armature="0.01"/>'
+    '<inertial pos="0 0 -0.12" mass="0.8" diaginertia="0.006 0.006 0.0005"/>'
+    '<body name="shank" pos="0 0 -0.25"><joint name="knee" axis="0 1 0" range="-120 90"/>'
+    '<inertial pos="0 0 -0.1" mass="0.4" diaginertia="0.003 0.003 0.0002"/></body></body>'
+    '<body name="crank"><joint name="drive" axis="0 1 0" damping="0.05" armature="0.01"/>'
+    '<inertial pos="0.02 0 0" mass="0.15" diaginertia="1e-4 1e-4 1e-4"/>'
+    '<body name="rod" pos="0.05 0 0"><joint name="pin" axis="0 1 0"/>'
+    '<inertial pos="0 0 -0.125" mass="0.1" diaginertia="5e-4 5e-4 1e-5"/></body></body></body></worldbody>'
+    '<equality><connect body1="rod" body2="shank" anchor="0 0 -0.25"/></equality>'
+    '<actuator><motor name="h" joint="hip" ctrlrange="-20 20"/><motor name="d" joint="drive" ctrlrange="-20 20"/>'
+    '<motor name="r" joint="rail" ctrlrange="-100 100"/></actuator></mujoco>'
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("text", "goals"),
+    [(GRIPPER, {"left": 0.5}), (LEG, {"hip": 0.4, "drive": -0.3, "rail": 0.05})],
+    ids=["gripper", "leg"],
+)
+def test_robots_with_loops_are_planned_by_default(tmp_path, text, goals):
+    """A gripper whose servo pulls a tendon of two fingers, and a leg whose knee a rod moves."""
+    (tmp_path / "robot.xml").write_text(text)
+    done = plan(tmp_path / "robot.xml", goals=goals, out=tmp_path / "out")
+    assert done.success, done
+    q = dict(zip(done.model.position_names, done.solution.xs[-1], strict=False))
+    assert all(abs(q[f"{name}_{'x' if name == 'rail' else 'q'}"] - value) < 1e-5 for name, value in goals.items())
+    assert max(gap(done.model, x[: done.model.nq])[0] for x in done.solution.xs) < 1e-3
+
+
+def test_a_servo_of_a_tendon_drives_the_joint_that_the_others_follow(tmp_path):
+    """ctrl of 255 is 0.8 rad; in MuJoCo the same command moves both fingers there."""
+    mujoco = pytest.importorskip("mujoco")
+    (tmp_path / "robot.xml").write_text(GRIPPER)
+    model = load(tmp_path / "robot.xml", time_step=0.002, mimic="reduce")
+    terms = model.contract.inputs[0]
+    assert (terms.name, terms.unit, terms.lower) == ("fingers", "rad", 0.0)
+    assert terms.upper == pytest.approx(255 * 0.3137255 / 100)
+    other = mujoco.MjModel.from_xml_path(str(tmp_path / "robot.xml"))
+    data, x = mujoco.MjData(other), model.default_state
+    data.ctrl = 0.5 * 100 / 0.3137255
+    for _ in range(1000):
+        mujoco.mj_step(other, data)
+        x = dd.step(model, x, [0.5])
+    left = model.position_names.index("left_q")
+    assert x[left] == pytest.approx(0.5, abs=5e-3)  # but for the springs
+    assert x[left] == pytest.approx(float(data.joint("left").qpos[0]), abs=5e-3)
+    assert x[left] == pytest.approx(float(data.joint("right").qpos[0]), abs=5e-3)
+
+
+@each_row(
+    "coefficients, coupled",
+    [((0.5, 0.5), True), ((0.5, -0.5), True), ((1.0, 1.0), False)],
+)
+def test_a_tendon_of_joints_that_do_not_follow_is_left_out(tmp_path, coefficients, coupled):
+    """Also one whose length does not change with them."""
+    first, second = coefficients
+    text = GRIPPER.replace('joint="right" coef="0.5"', f'joint="right" coef="{first}"')
+    text = text.replace('joint="left" coef="0.5"', f'joint="left" coef="{second}"')
+    (tmp_path / "robot.xml").write_text(text if coupled else text.replace('<joint joint1="right" joint2="left"/>', ""))
+    model = load(tmp_path / "robot.xml")
+    assert model.nu == (1 if coupled and first + second else 0)
+    assert ("1 actuators left out" in str(model.notes)) == (model.nu == 0)
