@@ -50,7 +50,7 @@ def as_mujoco_means(xml: XmlText, path: Path, notes: list[str]) -> XmlText:
     if not xml.root.get("model"):
         xml.set(xml.root, "model", path.stem)
         notes.append(f"The model has no name in the file: it is called {path.stem}.")
-    notes += [*_frames_to_bodies(xml), *_poses_of_several_joints(xml)]
+    notes += [*_without_mass(xml), *_frames_to_bodies(xml), *_poses_of_several_joints(xml)]
     if joined := _tendons_of_one_joint(xml):
         notes, xml = notes + joined, xml.read_again()
     notes += [*_motors_and_servos(xml), *_velocity_servos(xml)]
@@ -82,6 +82,19 @@ def _frames_to_bodies(xml: XmlText) -> list[str]:
     for frame in frames:
         xml.rename(frame, "body")
     return notes
+
+
+def _without_mass(xml: XmlText) -> list[str]:
+    """Let bodies whose <inertial> has a mass of 0, which Drake refuses, have shapes without mass instead."""
+    massless = list[str]()
+    for body in (b for world in xml.root.findall("worldbody") for b in world.iter("body")):
+        inertial = body.find("inertial")
+        if inertial is not None and _numbers(inertial.get("mass")) == [0.0]:
+            xml.remove(inertial)
+            for geom in body.findall("geom"):
+                xml.set(geom, "mass", "0")
+            massless.append(body.get("name", "?"))
+    return [f"Bodies without mass, as their <inertial> says: {', '.join(massless)}."] if massless else []
 
 
 def _poses_of_several_joints(xml: XmlText) -> list[str]:
@@ -576,9 +589,10 @@ class Mjcf:
                 yield Mimic(instance, *names, terms[1], a.start + terms[0] - terms[1] * b.start, in_drake=False)
 
     def mesh_and_density(self, geom: Element) -> tuple[str, float]:
-        """The name of the mesh that gives a geom its mass, "" where a number does, and its density [kg/m^3]."""
+        """The name of the mesh that gives a geom its inertia, and its density [kg/m^3]; 0 where its mass is given."""
         says = self.attributes(geom)
-        return "" if "mass" in says else says.get("mesh", ""), _first(says.get("density", "1000"), 1000.0)
+        given = _numbers(says.get("mass", ""))
+        return "" if given == [0.0] else says.get("mesh", ""), 0.0 if given else _first(says.get("density", "1000"))
 
     def masks(self, geom: Element) -> tuple[int, int]:
         """Its contype and conaffinity."""

@@ -432,9 +432,11 @@ class _Reading:
             self.notes += correct(self.parser.plant(), instance, mjcf)
             outdated = [OF_RANGES] + [OF_A_SPRING] * (not mjcf.has_other_springs)
             plant = self.parser.plant()
-            if mjcf.weightless and plant.num_model_instances() == 3:  # those of the world, of Drake, and this one
+            is_off = "gravity" in mjcf.disabled
+            if (mjcf.weightless or is_off) and plant.num_model_instances() == 3:  # the world's, Drake's, and this one
                 plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, 0.0])
-                self.notes.append("No gravity, as gravcomp compensates that of every body.")
+                why = "the file disables it" if is_off else "gravcomp compensates that of every body"
+                self.notes.append(f"No gravity, as {why}.")
                 outdated.append(OF_GRAVITY)
             self.notes[:] = [note for note in self.notes if not any(meant.search(note) for meant in outdated)]
 

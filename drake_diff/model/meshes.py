@@ -81,7 +81,7 @@ class FileMeshes:
             f"{len(self.missing)} meshes skipped, no file found: {_listed(self.missing)}. Links without a shape "
             "are drawn as a skeleton; packages={name: folder} says where a package is.": self.missing,
             f"{len(self.unusable)} meshes skipped, they cannot be used: {_listed(self.unusable)}.": self.unusable,
-            f"{len(self.hollow)} masses by the exact volume of a mesh, where MuJoCo's default rule gives another: "
+            f"{len(self.hollow)} inertias by the exact volume of a mesh, where MuJoCo's default rule has another: "
             f'{_listed(self.hollow)}. inertia="exact" of the mesh, or an <inertial>, is the same in both.': self.hollow,
         }
         return [sentence for sentence, names in sentences.items() if names]
@@ -134,7 +134,7 @@ def _convert_assets(meshes: FileMeshes, xml: XmlText, path: Path) -> None:
 
 
 def _look_for_hollows(meshes: FileMeshes, xml: XmlText, path: Path) -> None:
-    """Note each geom whose mass by MuJoCo's default rule for meshes is not that by the exact volume, with both."""
+    """Note each geom whose volume by MuJoCo's default rule for meshes is not the exact one, with both."""
     mjcf = Mjcf(xml)
     files = {mesh.get("name") or Path(mesh.get("file")).stem: mesh for mesh in assets_of(xml)}
     for body in (body for section in xml.root.findall("worldbody") for body in section.iter("body")):
@@ -143,9 +143,12 @@ def _look_for_hollows(meshes: FileMeshes, xml: XmlText, path: Path) -> None:
             mesh = files.get(name)
             if mesh is None or mjcf.attributes(mesh).get("inertia", "legacy") != "legacy":
                 continue
-            exact, legacy = (density * volume for volume in _volumes_of(xml, mesh, path))
+            exact, legacy = _volumes_of(xml, mesh, path)
             if abs(legacy - exact) > SAME_MASS * legacy:
-                meshes.hollow.append(f"{body.get('name', '?')} ({exact:.4g} kg, MuJoCo {legacy:.4g})")
+                both = f"{density * exact:.4g} kg, MuJoCo {density * legacy:.4g}"
+                if not density:
+                    both = f"mass as given, {exact:.4g} m^3, MuJoCo {legacy:.4g}"
+                meshes.hollow.append(f"{body.get('name', '?')} ({both})")
 
 
 def _volumes_of(xml: XmlText, mesh: Element, path: Path) -> tuple[float, float]:

@@ -1,12 +1,13 @@
 """Files of a grammar of MJCF, stepped in MuJoCo and here: accelerations must agree, or a finding must name why not.
 
-    python tests/benchmarks/same_step.py [--count 1000] [--seed 0]
+    python tests/benchmarks/same_step.py [--count 1000] [--seed 0] [--files robot.xml ...]
 
 Each file is a tree of hinges and slides with random attributes, default classes, compiler options, actuators of every
 kind and couplings. At random states, under random controls within their ranges, MuJoCo's `qacc` without constraints is
 compared with M^-1 (B efforts - rest) of Drake's plant. A difference above 1e-9 of the largest acceleration is reported
 if a note of the model, but for those of BENIGN, or a warning of its audit says what is not as in the file.
-Prints how many files agree, differ with a finding and differ without one, and the findings of files that agree.
+Prints how many files agree, differ with a finding and differ without one, and the findings of files that agree. With
+`--files` it is robots of others instead; a file is named where its joints cannot be matched.
 """
 
 import argparse
@@ -18,9 +19,11 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import drake_diff as dd
 from drake_diff.exceptions import ModelError
+from drake_diff.model.plant import actuators, joints
 
 AGREE = 1e-9  # of the largest acceleration: chains of a few bodies in double precision
 STATES = 4
@@ -30,6 +33,9 @@ BENIGN = re.compile(
     r"|has no name|Default classes|became forces on bodies|became bodies|tag 'site'|springs? added|Springs"
     r"|Masses are those|Armature of joints|No gravity, as|<velocity> servos|actuators? added|springs of joints"
     r"|several joints|collision shapes taken away|attribute 'actuatorfrcrange'"
+    r"|tag '(light|visual|sensor|statistic|keyframe|custom|size|contact|texture|material|camera)'|camera element"
+    r"|texture|[Tt]orsional|attribute '(user|rgba|group|condim|margin|solref|solimp|solreflimit|solimplimit)'"
+    r"|loops are closed|Actuators of tendons|collision mesh|condim|Bodies without mass"
 )
 OF_THE_FILE = ("left_out", "ignored", "switched_off", "invented_inertia")  # findings of `audit`
 
@@ -132,6 +138,69 @@ def text_of(random):
     )
 
 
+def matched(model, theirs):
+    """Each joint of ours that moves, where its coordinates begin in MuJoCo's, and where its velocities do."""
+    sides = []
+    for joint in (j for j in joints(model.plant) if j.num_velocities()):
+        free = joint.num_positions() == 7
+        name = joint.child_body().name() if free else joint.name()
+        kind = mujoco.mjtObj.mjOBJ_BODY if free else mujoco.mjtObj.mjOBJ_JOINT
+        i = mujoco.mj_name2id(theirs, kind, name)
+        if i < 0 or not (free or joint.num_positions() == 1):
+            raise UnmatchedError(f"{joint.type_name()} joint {name}")
+        i = theirs.body_jntadr[i] if free else i
+        sides.append((joint, theirs.jnt_qposadr[i], theirs.jnt_dofadr[i]))
+    if sum(joint.num_velocities() for joint, _, _ in sides) != theirs.nv:
+        raise UnmatchedError(f"{theirs.nv} velocities in MuJoCo, {model.nv} here")
+    return sides
+
+
+def numbers_of_inputs(model, theirs):
+    """Which of MuJoCo's actuators each input is: that of its name, or of its joint where it has none."""
+    numbers, motors = [], actuators(model.plant)
+    for k, name in enumerate(model.input_names):
+        i = mujoco.mj_name2id(theirs, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
+        if i < 0 and model.inputs.actuator[k] >= 0:
+            joint = motors[model.inputs.actuator[k]].joint().name()
+            joint = mujoco.mj_name2id(theirs, mujoco.mjtObj.mjOBJ_JOINT, joint)
+            is_joint = theirs.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+            i = next(iter(np.flatnonzero(is_joint & (theirs.actuator_trnid[:, 0] == joint))), -1)
+        if i < 0:
+            raise UnmatchedError(f"input {name}")
+        numbers.append(i)
+    return numbers
+
+
+class UnmatchedError(Exception):
+    """A joint of one has none in the other that it is."""
+
+
+def put(data, model, sides, x):
+    """The state x (nx,) of ours in MuJoCo's: a free body's place before its turn, its rates of turning in its axes."""
+    q, v = x[: model.nq], x[model.nq :]
+    for joint, i, k in sides:
+        p, w = joint.position_start(), joint.velocity_start()
+        if joint.num_positions() == 7:
+            turn = Rotation.from_quat(np.roll(q[p : p + 4], -1))
+            data.qpos[i : i + 7] = np.concatenate([q[p + 4 : p + 7], q[p : p + 4]])
+            data.qvel[k : k + 6] = np.concatenate([v[w + 3 : w + 6], turn.inv().apply(v[w : w + 3])])
+        else:
+            data.qpos[i], data.qvel[k] = q[p], v[w]
+
+
+def accelerations(data, model, sides):
+    """MuJoCo's (nv,) in our order, those of a free body in the world's axes."""
+    found = np.zeros(model.nv)
+    for joint, i, k in sides:
+        w = joint.velocity_start()
+        if joint.num_positions() == 7:
+            turn = Rotation.from_quat(np.roll(data.qpos[i + 3 : i + 7], -1))
+            found[w : w + 6] = np.concatenate([turn.apply(data.qacc[k + 3 : k + 6]), data.qacc[k : k + 3]])
+        else:
+            found[w] = data.qacc[k]
+    return found
+
+
 def gap(path, theirs, random):
     """The largest difference of accelerations, relative to the largest, and what the model says of the file."""
     with warnings.catch_warnings():
@@ -140,20 +209,20 @@ def gap(path, theirs, random):
         told = [f"{f.code}: {f.message}" for f in dd.audit(model) if f.code in OF_THE_FILE]
         findings = [words for words in told if not BENIGN.search(words)]
     theirs.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    data, number = mujoco.MjData(theirs), {}
-    for i in range(theirs.nu):
-        number[mujoco.mj_id2name(theirs, mujoco.mjtObj.mjOBJ_ACTUATOR, i)] = i
-    worst = 0.0
+    data, number = mujoco.MjData(theirs), numbers_of_inputs(model, theirs)
+    worst, sides = 0.0, matched(model, theirs)
     for _ in range(STATES):
         x = random.uniform(-1, 1, model.nx)
+        for joint, _, _ in sides:
+            if joint.num_positions() == 7:
+                x[joint.position_start() :][:4] /= np.linalg.norm(x[joint.position_start() :][:4])
         limited = theirs.actuator_ctrllimited.astype(bool)
         low, high = np.where(limited[:, None], theirs.actuator_ctrlrange, [-1.0, 1.0]).T
-        control = random.uniform(low, high)
-        data.qpos, data.qvel, data.ctrl = x[: model.nq], x[model.nq :], control
+        data.ctrl = control = random.uniform(low, high)
+        put(data, model, sides, x)
         mujoco.mj_forward(theirs, data)
         u = np.zeros(model.nu)
-        for k, name in enumerate(model.input_names):
-            i = number[name]
+        for k, i in enumerate(number):
             gear = theirs.actuator_gear[i]
             if model.inputs.commanded[k]:
                 gain, (bias, kp) = theirs.actuator_gainprm[i, 0], theirs.actuator_biasprm[i, :2]
@@ -169,7 +238,8 @@ def gap(path, theirs, random):
         efforts = np.clip(model.efforts(x, u), -limits, limits)
         needed = model.actuation @ efforts - twin.inverse_dynamics(np.zeros(model.nv))
         ours = np.linalg.solve(twin.mass_matrix(), needed)
-        worst = max(worst, float(np.max(np.abs(ours - data.qacc)) / max(1.0, np.max(np.abs(data.qacc)))))
+        wanted = accelerations(data, model, sides)
+        worst = max(worst, float(np.max(np.abs(ours - wanted)) / max(1.0, np.max(np.abs(wanted)))))
     notes = [note for note in model.notes if not BENIGN.search(note)]
     return worst, [*notes, *findings]
 
@@ -179,12 +249,16 @@ def main():
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--show", type=int, default=5)
+    parser.add_argument("--files", nargs="*", type=Path, default=[])
     asked = parser.parse_args()
     counts, told, silent = Counter(), Counter(), []
     with tempfile.TemporaryDirectory() as folder:
-        for i in range(asked.count):
+        for i, given in enumerate(asked.files or range(asked.count)):
             random, path = np.random.default_rng([asked.seed, i]), Path(folder) / "m.xml"
-            path.write_text(text_of(random))
+            if asked.files:
+                path = given
+            else:
+                path.write_text(text_of(random))
             try:
                 theirs = mujoco.MjModel.from_xml_path(str(path))
             except ValueError:
@@ -192,16 +266,23 @@ def main():
                 continue
             try:
                 worst, findings = gap(path, theirs, random)
+            except UnmatchedError as error:
+                counts["with joints that are not matched"] += 1
+                told[f"not matched: {error}" if asked.files else "not matched"] += 1
+                continue
             except ModelError as error:
                 counts["refused here alone, by name"] += 1
                 told[re.sub(r"\d\S*", "#", str(error).split(": ", 1)[1])[:90]] += 1
                 continue
             kind = "agree" if worst <= AGREE else "differ, with a finding" if findings else "differ, without a finding"
             counts[kind] += 1
-            told.update(re.sub(r"[\w/.]*\d\S*", "#", f)[:90] for f in findings)
+            told.update({re.sub(r"[\w/.]*\d\S*", "#", f)[:90] for f in findings})
             if kind == "differ, without a finding":
-                silent.append((i, worst))
-    print(f"{asked.count} files of seed {asked.seed}: " + ", ".join(f"{n} {kind}" for kind, n in counts.most_common()))
+                silent.append((str(given), worst))
+            elif asked.files and worst > AGREE:
+                print(f"{given}: differs by {worst:.2g}: {'; '.join(findings)[:400]}")
+    total = len(asked.files) or asked.count
+    print(f"{total} files, seed {asked.seed}: " + ", ".join(f"{n} {kind}" for kind, n in counts.most_common()))
     for words, n in told.most_common(20):
         print(f"  {n:5} {words}")
     print("without a finding:", silent[: asked.show])

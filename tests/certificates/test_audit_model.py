@@ -144,7 +144,6 @@ FILES = {
     "left_out": MJCF.format("", "", '<actuator><damper name="servo" joint="j" kv="5"/></actuator>'),
     "left_out 2": MJCF.format("", "", '<actuator><motor name="pull" tendon="t"/></actuator>'),
     "switched_off": MJCF.format('<option><flag contact="disable"/></option>', "", ""),
-    "switched_off 2": MJCF.format('<option><flag gravity="disable"/></option>', "", ""),
     "never_apart": sdf(""),
 }
 # The code, the severity, the file and options in which it is found, words of it, and what mends it.
@@ -250,14 +249,6 @@ TRAPS = [
     ),
     ("left_out", "warning", "left_out 2", {}, r"pull \(motor of no joint, line 1\)", None),
     ("switched_off", "warning", "switched_off", {}, r"contact\): the file switches it off", {"contact": False}),
-    (
-        "switched_off",
-        "warning",
-        "switched_off 2",
-        {},
-        r"gravity\): the file switches it off",
-        {"gravity": [0.0, 0.0, 0.0]},
-    ),
     ("never_apart", "warning", "never_apart", {}, r"a - b\): they overlap", {"contact": "separable"}),
 ]
 

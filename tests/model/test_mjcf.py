@@ -197,6 +197,15 @@ def test_the_compiler_s_masses_are_mujoco_s(tmp_path, compiler, masses):
     assert gap_to_mujoco(path.read_text(), model, np.random.default_rng(0)) < AGREE
 
 
+def test_a_body_may_have_no_mass(tmp_path):
+    """Drake refuses an <inertial> of mass 0, as an end effector's frame has."""
+    body = HINGE.format("", '<body name="b" pos="0 0 1"><inertial pos="0 0 0" mass="0" diaginertia="0 0 0"/>{}</body>')
+    path = write(tmp_path, body.format('<geom size="0.2"/>'))
+    model = load(path)
+    assert [b.default_mass() for b in bodies(model.plant)] == [1.0, 0.0]
+    assert gap_to_mujoco(path.read_text(), model, np.random.default_rng(0)) < AGREE
+
+
 def test_bounds_of_masses_are_told_where_shapes_are_in_frames(tmp_path):
     body = HINGE.format("", '<frame pos="0 0 1"><geom size="0.1" mass="0.1"/></frame>')
     model = load(write(tmp_path, body, defaults='<compiler boundmass="0.5"/>'))
@@ -213,6 +222,19 @@ def test_gravity_that_is_compensated_on_every_body_is_none(tmp_path, each, gravi
     model = load(write(tmp_path, body))
     assert np.linalg.norm(model.contract.gravity) == gravity
     assert ("gravcomp' found in a 'body' tag is currently unsupported" in str(model.notes)) == (gravity > 0)
+
+
+def test_gravity_that_the_file_disables_is_none_but_beside_other_robots(tmp_path):
+    """Which have theirs: `audit` says so."""
+    off = '<option><flag gravity="disable"/></option>'
+    path = write(tmp_path, HINGE.format("", ""), defaults=off)
+    assert load(path).contract.gravity == (0.0, 0.0, 0.0)
+    both = "".join(f"- add_model: {{name: r{i}, file: file://{path}}}\n" for i in range(2))
+    (tmp_path / "two.dmd.yaml").write_text(f"directives:\n{both}")
+    model = load(tmp_path / "two.dmd.yaml")
+    assert model.contract.gravity == (0.0, 0.0, -9.81)
+    (finding,) = [finding for finding in dd.audit(model) if finding.code == "switched_off"]
+    assert finding.arguments == {"gravity": [0.0, 0.0, 0.0]}
 
 
 def test_a_velocity_servo_is_a_motor_with_damping(tmp_path):
@@ -312,6 +334,8 @@ def test_the_mass_of_a_mesh_that_is_not_convex_is_told_with_mujoco_s(tmp_path, e
         assert len(notes) == rows
         assert abs(theirs / ours - 1) > 0.1 if rows else theirs == pytest.approx(ours, rel=1e-6)
         assert not rows or f"a ({ours:.4g} kg, MuJoCo {theirs:.4g})" in notes[0]
+        given = load(write(tmp_path, body.replace("density", "mass"), more=asset.format(attribute)))
+        assert ("a (mass as given" in str(given.notes)) == bool(rows)  # whose inertia is another
 
 
 def random_tree(random):
