@@ -7,22 +7,27 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_diff._base.arrays import Array, finite_array
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.model.loops import relative_motion
+from drake_diff.model.loops import APART, relative_motion
 from drake_diff.model.model import Model
+from drake_diff.model.plant import joints
 from drake_diff.model.step import set_state
+from drake_diff.model.tangent import tangent_space
 
-OPEN = 1e-2  # of the same: from there a step moves the loop by what no plan means
 CLOSED = 1e-9  # of the distance of points from their bodies' origins
+OPEN = 1e-2  # of that distance: a step from there pulls the loop shut with a jerk
 MOST = 50  # steps of Newton's method; from what can be assembled it takes below ten
 LONGEST = 0.5  # [rad or m] of a step: farther ones miss the posture nearby
 
 
 def gap(model: Model, q: ArrayLike) -> tuple[float, float]:
-    """[m] how far the points of a pair are apart in posture q (nq,) at most, and from their bodies' origins."""
+    """[m] how far the points of a pair are apart in posture q (nq,) at most, and a length to compare that with.
+
+    The length is the largest distance of a point from the origin of its body, or that of points of one loop.
+    """
     held = model.file_facts.held_points
     set_state(model.double, np.concatenate([finite_array("q", q, (model.nq,)), np.zeros(model.nv)]))
     _, apart = relative_motion(model.plant, model.double.context, held)
-    size = max((float(np.linalg.norm(point)) for pair in held for point in pair.points), default=0.0)
+    size = max([APART, *(float(np.linalg.norm(point)) for pair in held for point in pair.points)])
     return max((float(np.linalg.norm(difference)) for difference in apart), default=0.0), size
 
 
@@ -43,7 +48,7 @@ def assembled(model: Model, x: ArrayLike, *, keep: Collection[str] = ()) -> Arra
         keep: The names of positions, as in `Model.state_names`, that stay as they are: those of motors, as a rule.
 
     Returns:
-        (nx,) by Newton's method with the least change of velocities for each step.
+        (nx,) by Newton's method; each step is the least change of positions, of bases that float only where it must be.
 
     Raises:
         UnknownNameError: One of `keep` is no position.
@@ -68,19 +73,39 @@ def assembled(model: Model, x: ArrayLike, *, keep: Collection[str] = ()) -> Arra
 
 def closed(model: Model, q: Array, fixed: NDArray[np.bool_]) -> Array | None:
     """The posture near q (nq,) in which loops are closed; what is `fixed` (nq,) stays. None where none was found."""
-    held, plant, context = model.file_facts.held_points, model.plant, model.double.context
-    q, free = np.array(q), np.ones(model.nv, dtype=bool)
-    free[np.flatnonzero(fixed) - (model.nq - model.nv)] = False  # joints come behind the quaternion of what floats
-    for _ in range(MOST if held else 0):
+    if not model.file_facts.held_points:
+        return q
+    places, rates = single_coordinates(model)
+    single = np.zeros(model.nv, dtype=bool)
+    single[rates] = True
+    free = np.ones(model.nv, dtype=bool)
+    free[rates[fixed[places]]] = False
+    without_bases = _closed(model, q, free & single)
+    return _closed(model, q, free) if without_bases is None else without_bases
+
+
+def _closed(model: Model, q: Array, free: NDArray[np.bool_]) -> Array | None:
+    """By velocities that are `free` (nv,)."""
+    for _ in range(MOST):
         apart, size = gap(model, q)
         if apart <= CLOSED * size:
             return q
-        jacobian, difference = relative_motion(plant, context, held)
-        rows = jacobian.reshape(-1, jacobian.shape[-1])
+        rows, difference = relative_motion(model.plant, model.double.context, model.file_facts.held_points)
+        rows = rows.reshape(-1, rows.shape[-1])
         if model.coupling is not None:
             rows = rows @ model.coupling.spread
         change = np.zeros(model.nv)
         change[free] = -np.linalg.lstsq(rows[:, free], difference.ravel(), rcond=None)[0]
         change /= max(1.0, float(np.abs(change).max()) / LONGEST)
         q = q + np.asarray(model.double.rates(change))
-    return None if held else q
+        for start in tangent_space(model).quaternions:
+            q[start : start + 4] /= np.linalg.norm(q[start : start + 4])
+    return None
+
+
+def single_coordinates(model: Model) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Where the positions and velocities of joints with one of each are in q and in v."""
+    places = [model.places(joint) for joint in joints(model.plant)]
+    pairs = [(q[0], v[0]) for q, v in places if len(q) == len(v) == 1]
+    in_q, in_v = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
+    return in_q, in_v

@@ -31,9 +31,9 @@ ACTUATORS = ("general", *KINDS, "velocity", "intvelocity", "damper", "cylinder",
 SHARED = ("gear", "ctrlrange", "ctrllimited", "forcerange", "forcelimited")  # by the defaults of all kinds of these
 SCALAR = ("hinge", "slide")  # the types of joints with one coordinate
 POSES = ("pos", "quat", "axisangle", "euler", "xyaxes", "zaxis")
-FLAGS = ("contact", "constraint", "gravity")  # what <option><flag> may disable and Drake has all the same
+FLAGS = ("contact", "constraint", "gravity", "equality")  # what <option><flag> may disable
 OF_MASSES = ("boundmass", "boundinertia", "settotalmass")  # attributes of the compiler
-PLACE = "_place"  # the end of the names of bodies that are added around those with several joints
+PLACE = "_before_its_joints"  # the end of the names of bodies that are added around those with several joints
 MOST_INCLUDES = 100
 UNSEEN = 2**30  # a mask that no other meets: Drake makes no collision shape of a geom whose masks are both 0
 
@@ -52,7 +52,8 @@ def as_mujoco_means(xml: XmlText, path: Path, notes: list[str]) -> XmlText:
         notes.append(f"The model has no name in the file: it is called {path.stem}.")
     notes += [*_without_mass(xml), *_frames_to_bodies(xml), *_poses_of_several_joints(xml)]
     if joined := _tendons_of_one_joint(xml):
-        notes, xml = notes + joined, xml.read_again()
+        notes += joined
+        xml = xml.read_again()
     notes += [*_motors_and_servos(xml), *_velocity_servos(xml)]
     mjcf = Mjcf(xml)
     notes += _unread(mjcf, path)
@@ -87,14 +88,23 @@ def _frames_to_bodies(xml: XmlText) -> list[str]:
 def _without_mass(xml: XmlText) -> list[str]:
     """Let bodies whose <inertial> has a mass of 0, which Drake refuses, have shapes without mass instead."""
     massless = list[str]()
+    if Mjcf(xml).compiler("inertiafromgeom", "auto") == "true":
+        return []  # the shapes say it
     for body in (b for world in xml.root.findall("worldbody") for b in world.iter("body")):
         inertial = body.find("inertial")
         if inertial is not None and _numbers(inertial.get("mass")) == [0.0]:
             xml.remove(inertial)
-            for geom in body.findall("geom"):
+            for geom in _geoms_of(body):
                 xml.set(geom, "mass", "0")
             massless.append(body.get("name", "?"))
     return [f"Bodies without mass, as their <inertial> says: {', '.join(massless)}."] if massless else []
+
+
+def _geoms_of(body: Element) -> Iterator[Element]:
+    """Those of a body, also in its frames."""
+    yield from body.findall("geom")
+    for frame in body.findall("frame"):
+        yield from _geoms_of(frame)
 
 
 def _poses_of_several_joints(xml: XmlText) -> list[str]:
@@ -150,7 +160,8 @@ def _velocity_servos(xml: XmlText) -> list[str]:
     for actuator in (e for section in xml.root.findall("actuator") for e in section.findall("velocity")):
         says = mjcf.attributes(actuator)
         joint = elements.get(says.get("joint", ""))
-        if joint is None or "forcerange" in says or mjcf.joints[says["joint"]].sides:
+        driven = [mjcf.attributes(e).get("joint") for section in xml.root.findall("actuator") for e in section.children]
+        if joint is None or "forcerange" in says or mjcf.joints[says["joint"]].sides or driven.count(says["joint"]) > 1:
             continue
         gear, kv = _first(says.get("gear", "1"), 1.0), _first(says.get("kv", "1"), 1.0)
         for name, value in ({name: says[name] for name in SHARED if name in says} | {"gear": repr(gear * kv)}).items():
@@ -166,7 +177,7 @@ def _velocity_servos(xml: XmlText) -> list[str]:
 def _motors_and_servos(xml: XmlText) -> list[str]:
     """Write <general> actuators of joints, which Drake does not read, as the motors and servos that they are.
 
-    With gain g and bias (b, -k, -d) one is a servo of kp k and kv d, or of the damping ratio -d where that is below 0.
+    With gain g and bias (b, -k, -d) one is a servo of kp k and kv d, or where g is k of the damping ratio -d below 0.
     Its commanded position is (g ctrl + b) / k.
     """
     mjcf, written = Mjcf(xml), list[str]()
@@ -181,7 +192,7 @@ def _motors_and_servos(xml: XmlText) -> list[str]:
         if not any(bias):
             force = " ".join(f"{end / gain!r}" for end in _numbers(says.get("forcerange", "")))
             kind, more = "motor", {"gear": repr(gear * gain)} | ({"forcerange": force} if force else {})
-        elif bias[1] < 0:
+        elif bias[1] < 0 and (bias[2] <= 0 or gain == -bias[1]):
             kind, more = "position", {"kp": repr(-bias[1]), "kv" if bias[2] <= 0 else "dampratio": repr(abs(bias[2]))}
             if (gain, 0.0) != (-bias[1], bias[0]) and (ends := _numbers(says.get("ctrlrange", ""))):
                 more["ctrlrange"] = " ".join(repr((gain * end + bias[0]) / -bias[1]) for end in ends)
@@ -193,7 +204,8 @@ def _motors_and_servos(xml: XmlText) -> list[str]:
             xml.drop(element, name)
         xml.rename(element, kind)
         written.append(f"{says.get('name', '?')} ({kind})")
-    return [f"<general> actuators read as what they are: {', '.join(written)}."] if written else []
+    what = "<general> actuators read as what they are, a servo's input as (gain ctrl + bias) / (kp gear)"
+    return [f"{what}: {', '.join(written)}."] if written else []
 
 
 def _unread(mjcf: "Mjcf", path: Path) -> Iterator[str]:
@@ -334,10 +346,10 @@ class TouchFilter:
 class FileFacts:
     """What the files say, joints and links by the names of their model instance and their own.
 
-    `followers` are the joints that mimic another one. `disabled` is what MJCF switches off and Drake has all the same:
-    contact, constraint, gravity. `left_out` are the joints of actuators of MJCF that Drake does not read, `touching` is
-    what MJCF lets touch, by model instance. `thrusters` are the fields of a BodyForce for each motor of a site. `loops`
-    are what is held together, `held_points` by what the plant holds it.
+    `followers` are the joints that mimic another one. `disabled` is what MJCF switches off: contact and constraint,
+    which Drake has all the same, and gravity and equality. `left_out` are the joints of actuators of MJCF that Drake
+    does not read, `touching` is what MJCF lets touch, by model instance. `thrusters` are the fields of a BodyForce for
+    each motor of a site. `loops` are what is held together, `held_points` are the constraints of the plant that do so.
     """
 
     joints: dict[Key, JointSays] = field(default_factory=dict)
@@ -538,10 +550,11 @@ class Mjcf:
     def loops(self, instance: str) -> Iterator[tuple[Element, HeldBodies | None]]:
         """Each <connect> and <weld>, and what it holds together; None of one that is not active."""
         for element in (e for section in self.root.findall("equality") for e in section.children):
-            says = self.defaults[MAIN].get("equality", {}) | element.attributes
+            of_class = self.defaults.get(element.get("class") or MAIN, self.defaults[MAIN])
+            says = of_class.get("equality", {}) | element.attributes
             if element.tag not in ("connect", "weld"):
                 continue
-            if says.get("active", "true") == "false":
+            if says.get("active", "true") == "false" or {"equality", "constraint"} & set(self.disabled):
                 yield element, None
             elif "site1" in says:
                 yield element, self._loop_of_sites(instance, element, says)
@@ -556,9 +569,10 @@ class Mjcf:
         if element.tag == "weld" or not (first and first.parent and second and second.parent):
             raise ModelError(f"line {element.line}: expected a <connect> of two sites, or bodies")
         points, others = ((tuple(_numbers(self.attributes(s).get("pos", "0 0 0"))),) for s in (first, second))
-        return HeldBodies(
-            instance, first.parent.get("name") or WORLD, second.parent.get("name") or WORLD, points, others
-        )
+        body, other = (WORLD if b.tag == "worldbody" else b.get("name") for b in (first.parent, second.parent))
+        if not (body and other):
+            raise ModelError(f"line {element.line}: expected sites of bodies or frames with a name")
+        return HeldBodies(instance, body, other, points, others)
 
     def _turn(self, says: Attributes) -> np.ndarray:
         """(3, 3) the orientation that the attributes of an element give."""
@@ -674,19 +688,24 @@ def compiler_changes_masses(xml: XmlText) -> bool:
     return any(_first(compiler.get(name)) > 0 for compiler in xml.root.findall("compiler") for name in OF_MASSES)
 
 
-def write_masses(xml: XmlText, read: Callable[[], dict[str, Any]]) -> str:
+def write_masses(xml: XmlText, read: Callable[[XmlText], dict[str, Any]]) -> str:
     """Write out the masses and inertias that the compiler of MJCF makes: lower bounds of each, and the sum of masses.
 
-    `read` gives the bodies of the file as Drake reads it, by name. Inertias are bounded along the principal axes.
+    `read` gives the bodies of a file as Drake reads it, by name. Inertias are bounded along the principal axes. What
+    Drake does not read, as in <replicate>, has no part in the sum.
     """
     compiler = Mjcf(xml).compiler
     least, least_inertia, total = (_first(compiler(name, "0")) for name in OF_MASSES)
     from_shapes = compiler("inertiafromgeom", "auto") == "true"
-    bodies = [body for world in xml.root.findall("worldbody") for body in world.iter("body")]
-    for i, body in enumerate(bodies):
-        xml.set(body, "name", body.get("name") or f"nameless_{i}")
-    read_bodies = read()
-    inertias = [read_bodies[body.get("name")].default_spatial_inertia() for body in bodies]
+    named = xml.read_again()
+    for i, body in enumerate(named.root.iter("body")):
+        named.set(body, "name", body.get("name") or f"nameless_{i}")
+    by_name = read(named)
+    pairs = zip(xml.root.iter("body"), named.root.iter("body"), strict=True)
+    bodies, read_bodies = zip(
+        *[(body, by_name[n]) for body, other in pairs if (n := other.get("name")) in by_name], strict=True
+    )
+    inertias = [body.default_spatial_inertia() for body in read_bodies]
     bounds = [0.0 if body.get("name").endswith(PLACE) else least for body in bodies]
     masses = [max(inertia.get_mass(), bound) for inertia, bound in zip(inertias, bounds, strict=True)]
     scale = total / sum(masses) if total > 0 and sum(masses) > 0 else 1.0

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import cache
 from importlib.metadata import PackageNotFoundError, requires, version
 from os.path import isfile
 from pathlib import Path
@@ -412,7 +412,7 @@ class _Reading:
             make_absolute(xml, path)
         if masses:
             xml = xml.read_again()  # with the bodies that were added
-            self.notes.append(write_masses(xml, partial(self._read_alone, xml)))
+            self.notes.append(write_masses(xml, self._read_alone))
         return xml
 
     def _read_alone(self, xml: XmlText) -> dict[str, Any]:

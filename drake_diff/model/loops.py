@@ -18,7 +18,7 @@ from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ModelError
 from drake_diff.model.xml_text import Element, XmlText
 
-APART = 0.1  # [m] between points of one loop: of the size of links, and nearly rigid whatever it is
+APART = 0.1  # [m] between the points of one loop: the constraints are nearly rigid at any distance
 POINTS = {"ball": 1, "revolute": 2, "continuous": 2, "fixed": 3}  # of a joint of SDF
 WORLD = "world"
 
@@ -82,12 +82,18 @@ def loops_of_sdf(xml: XmlText, model: Element, instance: str) -> Iterator[HeldBo
         yield HeldBodies(instance, child, parent, points_along(axis, POINTS[kind]), frame=name)
 
 
-def close_loops(plant: MultibodyPlant, loops: list[HeldBodies]) -> tuple[list[HeldPoints], tuple[str, ...]]:
-    """Hold the points of loops together, before the plant is finalized; what holds them, and a sentence."""
-    held = []
+def close_loops(plant: MultibodyPlant, loops: list[HeldBodies], held: list[HeldPoints]) -> tuple[str, ...]:
+    """Hold the points of loops together, before the plant is finalized, and add to `held` how; a sentence.
+
+    Raises ModelError where a body is none of the plant's.
+    """
     for loop in loops:
         instance = plant.GetModelInstanceByName(loop.instance)
+        for name in (n for n in (loop.body, loop.other) if n != WORLD and not plant.HasBodyNamed(n, instance)):
+            raise ModelError(f"expected bodies of {loop.instance} that are held together, got {name}, which is none")
         body, other = (_body(plant, name, instance) for name in (loop.body, loop.other))
+        if {body.index(), other.index()} <= {fixed.index() for fixed in plant.GetBodiesWeldedTo(plant.world_body())}:
+            continue  # neither moves, and a step would fail
         pose = RigidTransform()
         if loop.frame:
             pose = plant.GetFrameByName(loop.frame, instance).GetFixedPoseInBodyFrame()
@@ -96,9 +102,9 @@ def close_loops(plant: MultibodyPlant, loops: list[HeldBodies]) -> tuple[list[He
             points += [] if loop.other_points is None else [np.array(loop.other_points[i])]
             constraint = plant.AddBallConstraint(body, points[0], other, *points[1:])
             held.append(HeldPoints(constraint, (body.index(), other.index()), points))
-    how = [f" (joint {loop.frame}, without its limits and damping)" if loop.frame else "" for loop in loops]
+    how = [f" (joint {loop.frame}, without its limits, damping and motor)" if loop.frame else "" for loop in loops]
     names = ", ".join(f"{loop.body} and {loop.other}{words}" for loop, words in zip(loops, how, strict=True))
-    return held, (f"{len(loops)} loops are closed, nearly rigidly (softly in MuJoCo): {names}.",) if loops else ()
+    return (f"{len(loops)} loops are closed, nearly rigidly (softly in MuJoCo): {names}.",) if loops else ()
 
 
 def _body(plant: MultibodyPlant, name: str, instance: Any) -> Any:

@@ -623,9 +623,7 @@ def load_model(
         check_in_child_process(source, options)
     read = read_into(plant, source, options["packages"], meshes)
     repairs, mimics = _repaired(plant, scene_graph, source, read.facts, options)
-    held_points, closed = close_loops(plant, read.facts.loops)
-    read.facts.held_points.extend(held_points)
-    notes = read.notes + repairs + closed
+    notes = read.notes + repairs
     if notes:
         warnings.warn("\n  ".join([f"{source.name}:", *notes]), ModelWarning, stacklevel=2)
     notes += () if contact_geometry is None else replace_collision_geometry(plant, scene_graph, contact_geometry)
@@ -636,7 +634,7 @@ def load_model(
         plant.Finalize()
     except DRAKES_REFUSALS as error:
         raise ModelError(f"{source}: expected a model that Drake can finalize; Drake says: {error}") from error
-    find_points(plant, held_points)
+    find_points(plant, read.facts.held_points)
     notes += damp_servos(plant, read.facts)
     coupling = coupling_of(plant, mimics)
     body_forces = check_body_forces([*read.facts.thrusters, *body_forces])
@@ -830,6 +828,7 @@ def _repaired(
         notes += hold_base(plant, base)
         notes += add_armatures(plant, facts)
         notes += add_springs(plant, facts)
+        notes += close_loops(plant, facts.loops, facts.held_points)
         notes += () if options["contact"] else take_away_contact(plant, scene_graph)
         return notes + add_ground(plant, options["ground"]), mimics if choice == "reduce" else ()
     except ModelError as error:

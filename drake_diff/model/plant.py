@@ -13,7 +13,7 @@ from drake_diff.exceptions import ModelError, UnknownNameError
 
 _SCENE_GRAPHS = (SceneGraph_[float], SceneGraph_[AutoDiffXd])
 
-ARMATURE = "armature of "  # how the actuators of joints begin that nothing drives: Drake has rotors on actuators alone
+ARMATURE = "armature of "  # the prefix of actuators that only carry the armature of a joint, which nothing drives
 FLOATING = ("quaternion_floating", "rpy_floating")  # the types of joints that hold nothing
 DiagramPath = tuple[int, ...]  # the position among the subsystems, level by level
 

@@ -19,6 +19,7 @@ from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, ModelWarning, WriteError
 from drake_diff.legs.feet import Legs
 from drake_diff.legs.standing import Rest, random_shift, shift_to
+from drake_diff.model.assembly import single_coordinates
 from drake_diff.model.model import Model
 from drake_diff.optimize.options import Options
 from drake_diff.optimize.problem.constraint import Bounds
@@ -481,7 +482,8 @@ def _of_passive(robot: Robot, task: Goals) -> Iterator[_Attempt]:
     goal, budget = x0.copy(), BUDGET
     if model.file_facts.held_points:  # all else is where the loops have it
         goal[:], budget = np.nan, LONG_BUDGET
-        goal[[model.nq + i - (model.nq - model.nv) for i in task.joints]] = 0.0
+        places, rates = single_coordinates(model)
+        goal[model.nq + rates[np.isin(places, list(task.joints))]] = 0.0
     goal[list(task.joints)] = list(task.joints.values())
     for steps in (100, 150):
         problem = Problem(

@@ -277,10 +277,12 @@ def _placed(draft: _Draft, random: np.random.Generator) -> Robot:
     shapes, holds = model if touches else None, apart if driven else None
     if flies and shapes is not None:
         first = lifted(shapes, first)
-    if model.file_facts.held_points:
-        first = assembled(model, np.concatenate([first, np.zeros(model.nv)]))[: model.nq]
     try:
-        posture = start(shapes, holds, first, lower, upper, random)
+        if model.file_facts.held_points:  # others would open the loops
+            first = assembled(model, np.concatenate([first, np.zeros(model.nv)]))[: model.nq]
+            posture = StartPosture(first, 0.0, 0.0, pairs_always([first], shapes))
+        else:
+            posture = start(shapes, holds, first, lower, upper, random)
     except SimulationError as error:
         repairs.append(f"its overlap is not looked for: {error}")
         shapes, posture = None, start(None, holds, first, lower, upper, random)

@@ -219,6 +219,73 @@ def test_loops_are_closed_from_a_posture_nearby(tmp_path):
         dd.Problem(model, x0={"a_q": 0.5}, x_goal={"a_q": 0.6}, num_steps=10)
 
 
+def test_what_floats_beside_a_loop_is_left_alone(tmp_path):
+    """Joints keep their limits and places in q, whose quaternion stands behind them here."""
+    box = '<body name="box" pos="0 0 3"><freejoint/><geom size="0.1" mass="1"/></body>'
+    path = parallelogram(tmp_path, more=box)
+    path.write_text(path.read_text().replace('name="a"', 'name="a" range="-60 60"'))
+    model = load(path)
+    x = np.array(model.default_state)
+    a, b = (model.position_names.index(name) for name in ("a_q", "b_q"))
+    x[a] = 0.2
+    near = dd.model.assembled(model, x, keep=["a_q"])
+    assert (near[a], near[b]) == (0.2, pytest.approx(-0.2, abs=1e-7))
+    box_entries = [i for i, name in enumerate(model.position_names) if name.startswith("box")]
+    np.testing.assert_array_equal(near[box_entries], x[box_entries])
+    bounds = dd.Problem(model, x0=model.default_state, num_steps=5, x_goal={"a_q": 0.3}).bounds
+    assert bounds.x_upper[a] == pytest.approx(np.pi / 3)
+    assert bounds.x_upper[b] == np.inf
+
+
+def test_points_at_the_origins_of_their_bodies_can_be_held(tmp_path):
+    """Whose distance from there is no length to compare a gap with."""
+    sites = '<body name="end" pos="{} 0 {}"><site name="{}"/></body>'
+    path = parallelogram(tmp_path, '<connect site1="p" site2="s"/>')
+    text = path.read_text().replace(f'<site name="end" pos="{WIDTH} 0 0"/>', sites.format(WIDTH, 0, "p"))
+    path.write_text(text.replace(f'<site name="tip" pos="0 0 {-L}"/>', sites.format(0, -L, "s").replace("end", "tip")))
+    model = load(path)
+    x = dd.model.assembled(model, [0.5, 0.0, 0.0, 0, 0, 0], keep=["a_q"])
+    np.testing.assert_allclose(x[:3], [0.5, -0.5, 0.5], atol=1e-7)
+
+
+@each_row(
+    "equality, words",
+    [
+        ('<connect body1="bar" body2="nobody" anchor="0 0 0"/>', "expected bodies of loop that are held .* got nobody"),
+        ('<weld site1="end" site2="tip"/>', "line 1: expected a <connect> of two sites"),
+        ('<connect site1="inner" site2="tip"/>', "line 1: expected sites of bodies or frames with a name"),
+    ],
+)
+def test_what_cannot_be_held_is_refused_by_name(tmp_path, equality, words):
+    more = '<body name="more"><joint name="d"/><geom size="0.1"/><frame pos="1 0 0"><site name="inner"/></frame></body>'
+    with pytest.raises(ModelError, match=words):
+        load(parallelogram(tmp_path, equality, more))
+
+
+@each_row(
+    "head, attributes",
+    [
+        ('<option><flag equality="disable"/></option>', ""),
+        ('<option><flag constraint="disable"/></option>', ""),
+        ('<default><default class="off"><equality active="false"/></default></default>', 'class="off"'),
+    ],
+)
+def test_a_loop_that_mujoco_does_not_close_is_open(tmp_path, head, attributes):
+    path = parallelogram(tmp_path, f'<connect body1="bar" body2="second" anchor="{WIDTH} 0 0" {attributes}/>')
+    path.write_text(path.read_text().replace("<worldbody>", f"{head}<worldbody>"))
+    assert load(path).num_constraints == 0
+
+
+def test_bodies_that_joints_fix_are_held_by_nothing(tmp_path):
+    """Drake's step fails with a constraint between two bodies that cannot move."""
+    model = load(parallelogram(tmp_path), fix_joints=["a", "b", "c"][1:])
+    assert model.num_constraints == 1
+    more = '<body name="more"><joint name="d"/><geom size="0.1"/></body>'
+    model = load(parallelogram(tmp_path, more=more), fix_joints=["a", "b", "c"])
+    assert model.num_constraints == 0
+    dd.step(model, [0.1, 0.2], [])
+
+
 @each_row("method", ["ilqr", "shooting"])
 def test_a_crank_is_moved_by_a_verified_plan(tmp_path, method):
     model = load(parallelogram(tmp_path), time_step=0.01)
@@ -294,6 +361,8 @@ def test_a_servo_of_a_tendon_drives_the_joint_that_the_others_follow(tmp_path):
     mujoco = pytest.importorskip("mujoco")
     (tmp_path / "robot.xml").write_text(GRIPPER)
     model = load(tmp_path / "robot.xml", time_step=0.002, mimic="reduce")
+    assert "Actuators of tendons drive" in str(model.notes)
+    assert "<general> actuators read as" in str(model.notes)
     terms = model.contract.inputs[0]
     assert (terms.name, terms.unit, terms.lower) == ("fingers", "rad", 0.0)
     assert terms.upper == pytest.approx(255 * 0.3137255 / 100)

@@ -249,8 +249,20 @@ def test_a_velocity_servo_is_a_motor_with_damping(tmp_path):
     (damping,) = model.double.damping()
     assert model.contract.inputs[0].upper == 30.0
     assert -3 * 5 * 1.2 + 0.4 * 0.7 - damping * 0.7 == pytest.approx(data.qfrc_actuator[0], abs=1e-12)
-    path = write(tmp_path, HINGE.format("", ""), more=more.replace("/></act", ' forcerange="-1 1"/></act'))
-    assert "1 actuators left out" in str(load(path).notes)
+    others = (
+        more.replace("/></act", ' forcerange="-1 1"/></act'),
+        more.replace("<vel", '<position joint="j" kp="9"/><vel'),
+    )
+    for other in others:
+        assert "1 actuators left out" in str(load(write(tmp_path, HINGE.format("", ""), more=other)).notes)
+
+
+@each_row("bias, left_out", [("0 -10 2", True), ("0 -10 -2", False), ("1 -10 -2", False), ("1 0 -2", True)])
+def test_a_general_actuator_that_is_no_servo_is_left_out(tmp_path, bias, left_out):
+    """A third term above 0 is a damping ratio only where the gain is the stiffness."""
+    servo = f'<actuator><general joint="j" gainprm="5" biastype="affine" biasprm="{bias}"/></actuator>'
+    model = load(write(tmp_path, HINGE.format("", ""), more=servo))
+    assert (model.nu == 0) == left_out
 
 
 def effort_range(path):

@@ -12,6 +12,7 @@ from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
 from drake_diff._base.arrays import Array, array_with_gaps, frozen
 from drake_diff._base.autodiff import called, carrying, chain_rows, gradient_rows, named
 from drake_diff.exceptions import GradientError, InputError, ShapeError
+from drake_diff.model.assembly import single_coordinates
 from drake_diff.model.model import Model
 
 LOOKED_AT = 5  # states at which the slopes of a constraint are taken
@@ -309,8 +310,9 @@ def plant_limits(model: Model) -> dict[str, Array]:
     """
     (q_lower, q_upper), (v_lower, v_upper) = model.position_limits, model.velocity_limits
     if model.file_facts.held_points:
+        places, rates = single_coordinates(model)
         follows = np.ones(model.nq, dtype=bool)
-        follows[np.flatnonzero(np.any(model.actuation != 0, axis=1)) + model.nq - model.nv] = False
+        follows[places[np.any(model.actuation != 0, axis=1)[rates]]] = False
         q_lower, q_upper = np.where(follows, -np.inf, q_lower), np.where(follows, np.inf, q_upper)
     return {
         "x_lower": np.concatenate([q_lower, v_lower]),
