@@ -83,9 +83,9 @@ class Model(ShowsItsRepr):
     """A finalized discrete plant, ready to be stepped and differentiated.
 
     Make one with `load_model` or `model_from_diagram`. The state is Drake's, `x = [q; v]`, and the input `u` the
-    plant's actuation, forces on bodies and what a diagram exports, all in SI units. A Model keeps its contexts between
-    calls and sets all of x, u and the parameters on each call, so results do not depend on the order of calls. Each
-    thread that uses a Model has contexts of its own.
+    efforts or commands of its motors, forces on bodies and what a diagram exports, all in SI units. A Model keeps its
+    contexts between calls and sets all of x, u and the parameters on each call, so results do not depend on the order
+    of calls. Each thread that uses a Model has contexts of its own.
 
     Attributes:
         nq, nv, nx, nu: Numbers of positions, velocities, states (nq + nv) and inputs.

@@ -75,7 +75,7 @@ class ParametricPolicy:
 class PD:
     """The policy u_i = kp_i (q_ref - q) + kd_i (v_ref - v) at the joint of actuator i. Angles are not wrapped.
 
-    u is the effort at the joint [N or N m], as plant.MakeActuationMatrix() applies it, without gear ratio; Drake
+    u is the effort at the joint [N or N m], as `Model.actuation` applies it, without gear ratio; Drake
     actuates joints of one degree of freedom only. `parameters` is [kp; kd] (2 nu,).
 
     Args:
