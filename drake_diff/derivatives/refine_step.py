@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.multibody.tree import JacobianWrtVariable
+from scipy.sparse.csgraph import connected_components
 
 from drake_diff._base.arrays import Array, Indices, cross
 from drake_diff._base.values import Refusal
@@ -443,15 +444,16 @@ def _same_tree(model: Model) -> NDArray[np.bool_]:
     """(nv, nv) whether two degrees of freedom belong to one tree: Drake solves for all of a tree, or none."""
 
     def read() -> NDArray[np.bool_]:
-        world, inboard = model.plant.world_body().index(), {j.child_body().index(): j for j in joints(model.plant)}
-        root = np.empty(model.nv, dtype=np.intp)
-        for joint in joints(model.plant):
-            below = joint
-            while below.parent_body().index() != world:
-                below = inboard[below.parent_body().index()]
+        count, tree = model.plant.num_bodies(), np.empty(model.nv, dtype=np.intp)
+        world, linked = int(model.plant.world_body().index()), np.zeros((count, count), dtype=bool)
+        ends = [(int(j.parent_body().index()), int(j.child_body().index())) for j in joints(model.plant)]
+        for parent, child in ends:
+            linked[parent, child] = world not in (parent, child)
+        _, of_body = connected_components(linked, directed=False)
+        for joint, (parent, child) in zip(joints(model.plant), ends, strict=True):
             start = joint.velocity_start()
-            root[start : start + joint.num_velocities()] = int(below.index())
-        return np.asarray(root[:, None] == root)
+            tree[start : start + joint.num_velocities()] = of_body[parent if child == world else child]
+        return np.asarray(tree[:, None] == tree)
 
     return model.cache("same tree", read, of_structure=True)
 

@@ -32,8 +32,10 @@ SHARED = ("gear", "ctrlrange", "ctrllimited", "forcerange", "forcelimited")  # b
 SCALAR = ("hinge", "slide")  # the types of joints with one coordinate
 POSES = ("pos", "quat", "axisangle", "euler", "xyaxes", "zaxis")
 FLAGS = ("contact", "constraint", "gravity", "equality")  # what <option><flag> may disable
+GAINS = {"general": ("gainprm", "biasprm"), "position": ("kp", "kv"), "velocity": ("kv",)}
 OF_MASSES = ("boundmass", "boundinertia", "settotalmass")  # attributes of the compiler
 PLACE = "_before_its_joints"  # the end of the names of bodies that are added around those with several joints
+FRAME = "_frame"  # the end of the names of those that <frame>s become
 MOST_INCLUDES = 100
 UNSEEN = 2**30  # a mask that no other meets: Drake makes no collision shape of a geom whose masks are both 0
 
@@ -51,10 +53,11 @@ def as_mujoco_means(xml: XmlText, path: Path, notes: list[str]) -> XmlText:
         xml.set(xml.root, "model", path.stem)
         notes.append(f"The model has no name in the file: it is called {path.stem}.")
     notes += [*_without_mass(xml), *_frames_to_bodies(xml), *_poses_of_several_joints(xml)]
+    notes += _name_joints_with_armature(xml)
     if joined := _tendons_of_one_joint(xml):
         notes += joined
         xml = xml.read_again()
-    notes += [*_motors_and_servos(xml), *_velocity_servos(xml)]
+    notes += [*_gains_of_other_kinds(Mjcf(xml), path), *_motors_and_servos(xml), *_velocity_servos(xml)]
     mjcf = Mjcf(xml)
     notes += _unread(mjcf, path)
     paired = {name for pair in mjcf.touching.pairs for name in pair}
@@ -80,23 +83,40 @@ def _frames_to_bodies(xml: XmlText) -> list[str]:
         for name in (name for name in OF_MASSES[:2] if compiler.get(name)):
             xml.drop(compiler, name)
             notes.append(f"Line {compiler.line}: {name} is ignored, as the file has shapes in <frame>s.")
+    by_shapes = Mjcf(xml).compiler("inertiafromgeom", "auto") == "true"
+    for i, frame in enumerate(frames):
+        body = frame
+        while body.parent is not None and body in frames:
+            body = body.parent
+        inertial = None if by_shapes else body.find("inertial")
+        if inertial is not None and _numbers(inertial.get("mass")) != [0.0]:  # which has the inertia of all shapes
+            for geom in frame.findall("geom"):
+                xml.set(geom, "mass", "0")
+        xml.set(frame, "name", f"{frame.get('name', 'frame')}_{i}{FRAME}")
     for frame in frames:
         xml.rename(frame, "body")
     return notes
 
 
 def _without_mass(xml: XmlText) -> list[str]:
-    """Let bodies whose <inertial> has a mass of 0, which Drake refuses, have shapes without mass instead."""
+    """Let bodies whose <inertial> has a mass of 0, which Drake refuses, have shapes without mass instead.
+
+    With inertiafromgeom="true" an <inertial> counts in bodies without shapes alone, where Drake has no mass.
+    """
     massless = list[str]()
-    if Mjcf(xml).compiler("inertiafromgeom", "auto") == "true":
-        return []  # the shapes say it
+    by_shapes = Mjcf(xml).compiler("inertiafromgeom", "auto") == "true"
     for body in (b for world in xml.root.findall("worldbody") for b in world.iter("body")):
         inertial = body.find("inertial")
-        if inertial is not None and _numbers(inertial.get("mass")) == [0.0]:
+        if inertial is not None and by_shapes and any(_geoms_of(body)):
+            xml.remove(inertial)
+        elif inertial is not None and _numbers(inertial.get("mass")) == [0.0]:
+            turns = any(_numbers(inertial.get("diaginertia") or inertial.get("fullinertia")))
             xml.remove(inertial)
             for geom in _geoms_of(body):
                 xml.set(geom, "mass", "0")
-            massless.append(body.get("name", "?"))
+            massless.append(body.get("name", "?") + " (its inertia without mass is ignored)" * turns)
+    for compiler in xml.root.findall("compiler") if by_shapes else ():
+        xml.drop(compiler, "inertiafromgeom")
     return [f"Bodies without mass, as their <inertial> says: {', '.join(massless)}."] if massless else []
 
 
@@ -122,6 +142,17 @@ def _poses_of_several_joints(xml: XmlText) -> list[str]:
     return [f"Poses of bodies with several joints became bodies around them: {', '.join(placed)}."] if placed else []
 
 
+def _name_joints_with_armature(xml: XmlText) -> list[str]:
+    """Name the joints that have an armature and no name, by which they get it."""
+    mjcf, names = Mjcf(xml), list[str]()
+    joints = [joint for world in xml.root.findall("worldbody") for joint in world.iter("joint")]
+    for i, joint in enumerate(joints):
+        if not joint.get("name") and _first(mjcf.attributes(joint).get("armature", "0")):
+            names.append(f"joint_{i}_of_line_{joint.line}")
+            xml.set(joint, "name", names[-1])
+    return [f"Joints without a name are called {', '.join(names)}."] if names else []
+
+
 def _tendons_of_one_joint(xml: XmlText) -> list[str]:
     """Let an actuator of a <fixed> tendon drive a joint, where the others of the tendon follow that in proportion."""
     mjcf, written = Mjcf(xml), list[str]()
@@ -130,7 +161,7 @@ def _tendons_of_one_joint(xml: XmlText) -> list[str]:
     for actuator in (e for section in xml.root.findall("actuator") for e in section.children):
         says = mjcf.attributes(actuator)
         tendon = tendons.get(says.get("tendon", ""))
-        if tendon is None:
+        if tendon is None or "dampratio" in says:
             continue
         leaders, total = set[str](), 0.0
         for part in tendon.findall("joint"):
@@ -147,7 +178,8 @@ def _tendons_of_one_joint(xml: XmlText) -> list[str]:
             xml.set(actuator, "gear", repr(_first(says.get("gear", "1"), 1.0) * total))
             xml.drop(actuator, "tendon")
             written.append(f"{says.get('name', '?')} ({leader})")
-    return [f"Actuators of tendons drive the joint that the others follow: {', '.join(written)}."] if written else []
+    what = 'Actuators of tendons drive the joint that the others follow with mimic="reduce"'
+    return [f"{what}: {', '.join(written)}."] if written else []
 
 
 def _velocity_servos(xml: XmlText) -> list[str]:
@@ -161,7 +193,14 @@ def _velocity_servos(xml: XmlText) -> list[str]:
         says = mjcf.attributes(actuator)
         joint = elements.get(says.get("joint", ""))
         driven = [mjcf.attributes(e).get("joint") for section in xml.root.findall("actuator") for e in section.children]
-        if joint is None or "forcerange" in says or mjcf.joints[says["joint"]].sides or driven.count(says["joint"]) > 1:
+        of_joint = mjcf.joints.get(says.get("joint", ""))
+        if (
+            joint is None
+            or of_joint is None
+            or of_joint.sides
+            or "forcerange" in says
+            or driven.count(says["joint"]) > 1
+        ):
             continue
         gear, kv = _first(says.get("gear", "1"), 1.0), _first(says.get("kv", "1"), 1.0)
         for name, value in ({name: says[name] for name in SHARED if name in says} | {"gear": repr(gear * kv)}).items():
@@ -471,7 +510,9 @@ class Mjcf:
     def weightless(self) -> bool:
         """Whether the file compensates the gravity of each of its bodies."""
         bodies = [body for world in self.root.findall("worldbody") for body in world.iter("body")]
-        return all(_first(body.get("gravcomp")) == 1 for body in bodies if not body.get("name").endswith(PLACE))
+        return all(
+            _first(body.get("gravcomp")) == 1 for body in bodies if not body.get("name").endswith((PLACE, FRAME))
+        )
 
     def _range(self, says: Attributes, name: str) -> Range | None:
         """A range that holds; None where none does."""
@@ -550,11 +591,10 @@ class Mjcf:
     def loops(self, instance: str) -> Iterator[tuple[Element, HeldBodies | None]]:
         """Each <connect> and <weld>, and what it holds together; None of one that is not active."""
         for element in (e for section in self.root.findall("equality") for e in section.children):
-            of_class = self.defaults.get(element.get("class") or MAIN, self.defaults[MAIN])
-            says = of_class.get("equality", {}) | element.attributes
+            says = self._equality(element)
             if element.tag not in ("connect", "weld"):
                 continue
-            if says.get("active", "true") == "false" or {"equality", "constraint"} & set(self.disabled):
+            if says["active"] == "false":
                 yield element, None
             elif "site1" in says:
                 yield element, self._loop_of_sites(instance, element, says)
@@ -563,6 +603,12 @@ class Mjcf:
                 yield element, HeldBodies(instance, says.get("body1", WORLD), says.get("body2", WORLD), (anchor,))
             else:
                 yield element, _loop_of_weld(instance, says)
+
+    def _equality(self, element: Element) -> Attributes:
+        """The attributes of an equality, `active` with what the file disables."""
+        of_class = self.defaults.get(element.get("class") or MAIN, self.defaults[MAIN])
+        says = {"active": "true"} | of_class.get("equality", {}) | element.attributes
+        return says | ({"active": "false"} if {"equality", "constraint"} & set(self.disabled) else {})
 
     def _loop_of_sites(self, instance: str, element: Element, says: Attributes) -> HeldBodies:
         first, second = (self.sites.get(says.get(name, "")) for name in ("site1", "site2"))
@@ -595,11 +641,11 @@ class Mjcf:
     def mimics(self, instance: str) -> Iterator[Mimic]:
         """Joints that follow another one linearly, of the robot that is called `instance`."""
         for element in (e for section in self.root.findall("equality") for e in section.findall("joint")):
-            says = self.attributes(element)
+            says = self._equality(element)
             names = says.get("joint1", ""), says.get("joint2", "")
             a, b = (self.joints.get(name) for name in names)
             terms = [*_numbers(says.get("polycoef", "0 1 0 0 0")), 0.0, 0.0]
-            if a and b and says.get("active", "true") == "true" and not any(terms[2:]):
+            if a and b and says["active"] == "true" and not any(terms[2:]):
                 yield Mimic(instance, *names, terms[1], a.start + terms[0] - terms[1] * b.start, in_drake=False)
 
     def mesh_and_density(self, geom: Element) -> tuple[str, float]:
@@ -706,7 +752,7 @@ def write_masses(xml: XmlText, read: Callable[[XmlText], dict[str, Any]]) -> str
         *[(body, by_name[n]) for body, other in pairs if (n := other.get("name")) in by_name], strict=True
     )
     inertias = [body.default_spatial_inertia() for body in read_bodies]
-    bounds = [0.0 if body.get("name").endswith(PLACE) else least for body in bodies]
+    bounds = [0.0 if body.get("name").endswith((PLACE, FRAME)) else least for body in bodies]
     masses = [max(inertia.get_mass(), bound) for inertia, bound in zip(inertias, bounds, strict=True)]
     scale = total / sum(masses) if total > 0 and sum(masses) > 0 else 1.0
     for body, inertia, mass in zip(bodies, inertias, masses, strict=True):
@@ -729,14 +775,26 @@ def write_masses(xml: XmlText, read: Callable[[XmlText], dict[str, Any]]) -> str
 def _loop_of_weld(instance: str, says: Attributes) -> HeldBodies:
     """The anchor in the second body and two points beside it, where relpose puts them, else where they are."""
     anchor = np.array([*_numbers(says.get("anchor", "")), 0.0, 0.0, 0.0][:3])
-    points = tuple(tuple((anchor + step).tolist()) for step in (np.zeros(3), *(APART * np.eye(3)[:2])))
+    steps = (np.zeros(3), *(APART * np.eye(3)[:2]))[: 3 if _first(says.get("torquescale", "1"), 1.0) else 1]
+    points = tuple(tuple((anchor + step).tolist()) for step in steps)
     first, second, pose = says.get("body1", WORLD), says.get("body2", WORLD), _numbers(says.get("relpose", ""))
     if len(pose) != 7 or not any(pose[3:]):
         return HeldBodies(instance, second, first, points)
     turn = Rotation.from_quat([*pose[4:], pose[3]])
     return HeldBodies(
-        instance, first, second, tuple(tuple(point) for point in (turn.apply(points) + pose[:3]).tolist()), points
+        instance, first, second, tuple(tuple(point) for point in (turn.apply(steps) + pose[:3]).tolist()), points
     )
+
+
+def _gains_of_other_kinds(mjcf: Mjcf, path: Path) -> Iterator[str]:
+    """MuJoCo has one default for all kinds of actuators: gains of one kind are those of another, which is not read."""
+    for element in (e for section in mjcf.root.findall("actuator") for e in section.children):
+        tags = mjcf.defaults.get(element.get("class") or MAIN, mjcf.defaults[MAIN])
+        others = [tag for tag in GAINS if tag != element.tag and any(name in tags.get(tag, {}) for name in GAINS[tag])]
+        own = element.tag in GAINS and all(name not in mjcf.attributes(element) for name in GAINS[element.tag][:1])
+        if own and others:
+            name, kinds = element.get("name", element.tag), ", ".join(others)
+            yield f"{path}:{element.line}: {name} has the gains of the default of {kinds} in MuJoCo, which are ignored."
 
 
 def _read_class(section: Element, name: str, parent: str, defaults: Defaults) -> None:

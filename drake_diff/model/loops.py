@@ -76,6 +76,8 @@ def loops_of_sdf(xml: XmlText, model: Element, instance: str) -> Iterator[HeldBo
         if effort is not None and float(effort.text) > 0:
             raise ModelError(f"{where}, and has a motor: drive another joint of the loop, or let its effort be 0")
         axis = np.array([float(word) for word in xyz.text.split()] if xyz is not None else [0.0, 0.0, 1.0])
+        if not axis.any():
+            raise ModelError(f"{where}: expected an axis, got 0 0 0")
         pose = joint.find("pose")
         text = "" if pose is None else xml.data[pose.start : pose.end].decode()
         xml.replace(joint, f"<frame name={quoteattr(name)} attached_to={quoteattr(child)}>{text}</frame>")
@@ -102,7 +104,9 @@ def close_loops(plant: MultibodyPlant, loops: list[HeldBodies], held: list[HeldP
             points += [] if loop.other_points is None else [np.array(loop.other_points[i])]
             constraint = plant.AddBallConstraint(body, points[0], other, *points[1:])
             held.append(HeldPoints(constraint, (body.index(), other.index()), points))
-    how = [f" (joint {loop.frame}, without its limits, damping and motor)" if loop.frame else "" for loop in loops]
+    how = [
+        f" (joint {loop.frame}, without its limits, damping, spring and motor)" if loop.frame else "" for loop in loops
+    ]
     names = ", ".join(f"{loop.body} and {loop.other}{words}" for loop, words in zip(loops, how, strict=True))
     return (f"{len(loops)} loops are closed, nearly rigidly (softly in MuJoCo): {names}.",) if loops else ()
 

@@ -35,7 +35,8 @@ BENIGN = re.compile(
     r"|several joints|collision shapes taken away|attribute 'actuatorfrcrange'"
     r"|tag '(light|visual|sensor|statistic|keyframe|custom|size|contact|texture|material|camera)'|camera element"
     r"|texture|[Tt]orsional|attribute '(user|rgba|group|condim|margin|solref|solimp|solreflimit|solimplimit)'"
-    r"|loops are closed|Actuators of tendons|collision mesh|condim|Bodies without mass"
+    r"|loops are closed|Actuators of tendons|collision mesh|condim|Joints without a name"
+    r"|Bodies without mass(?!.*is ignored)"
 )
 OF_THE_FILE = ("left_out", "ignored", "switched_off", "invented_inertia")  # findings of `audit`
 

@@ -15,6 +15,7 @@ from drake_diff.exceptions import InputError, ModelError
 from drake_diff.model.named_files import named_files
 from drake_diff.model.plant import actuators, bodies, joints
 
+INERTIAL = '<inertial pos="0 0 0.2" mass="2" diaginertia="0.1 0.1 0.1"/>'
 GEOM = '<geom size="0.1" mass="1"/>'
 AGREE = 1e-9  # relative: both sum up a chain of a few bodies in double precision
 
@@ -204,6 +205,38 @@ def test_a_body_may_have_no_mass(tmp_path):
     model = load(path)
     assert [b.default_mass() for b in bodies(model.plant)] == [1.0, 0.0]
     assert gap_to_mujoco(path.read_text(), model, np.random.default_rng(0)) < AGREE
+
+
+@each_row(
+    "inside, compiler",
+    [
+        # Where a body has an <inertial>, its shapes have none, in frames too.
+        (f'{INERTIAL}<frame pos="0.3 0 0"><geom size="0.1"/></frame>', ""),
+        (f'{INERTIAL}<geom size="0.1"/>', 'inertiafromgeom="true"'),
+        (INERTIAL, 'inertiafromgeom="true"'),
+        ('<frame pos="0.3 0 0"><body name="c"><geom size="0.1"/></body></frame><geom size="0.1"/>', 'boundmass="0.5"'),
+        ('<joint axis="0 1 0" armature="3"/><geom size="0.1" pos="1 0 0"/>', ""),
+    ],
+)
+def test_what_moves_is_mujoco_s(tmp_path, inside, compiler):
+    """M^-1 of all is; the joint of the last body has no name."""
+    mujoco = pytest.importorskip("mujoco")
+    body = f'<body name="b" pos="1 0 0">{inside}</body></body>'
+    body = f'<body name="a"><joint name="j" axis="0 1 0" pos="0.1 0 0.3"/>{GEOM}{body}'
+    path = write(tmp_path, body, defaults=f"<compiler {compiler}/>")
+    model, other = load(path), mujoco.MjModel.from_xml_path(str(path))
+    data, mass = mujoco.MjData(other), np.zeros((model.nv, model.nv))
+    mujoco.mj_forward(other, data)
+    mujoco.mj_solveM(other, data, mass, np.eye(model.nv))
+    ours = model.plant.CalcMassMatrix(model.plant.CreateDefaultContext())
+    np.testing.assert_allclose(np.linalg.inv(mass), ours, rtol=AGREE)
+
+
+def test_gains_of_the_default_of_another_kind_are_told(tmp_path):
+    """MuJoCo has one default of all actuators."""
+    servo = '<actuator><general joint="j"/></actuator>'
+    model = load(write(tmp_path, HINGE.format("", ""), defaults='<default><position kp="50"/></default>', more=servo))
+    assert "has the gains of the default of position in MuJoCo" in str(model.notes)
 
 
 def test_bounds_of_masses_are_told_where_shapes_are_in_frames(tmp_path):
