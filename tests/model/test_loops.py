@@ -341,8 +341,10 @@ LEG = (
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "goals"),
-    [(GRIPPER, {"left": 0.5}), (LEG, {"hip": 0.4, "drive": -0.3, "rail": 0.05})],
-    ids=["gripper", "leg"],
+    [
+        pytest.param(GRIPPER, {"left": 0.5}, id="gripper", marks=pytest.mark.long),
+        pytest.param(LEG, {"hip": 0.4, "drive": -0.3, "rail": 0.05}, id="leg"),
+    ],
 )
 def test_robots_with_loops_are_planned_by_default(tmp_path, text, goals):
     """A gripper whose servo pulls a tendon of two fingers, and a leg whose knee a rod moves."""
@@ -351,7 +353,8 @@ def test_robots_with_loops_are_planned_by_default(tmp_path, text, goals):
     assert done.success, done
     q = dict(zip(done.model.position_names, done.solution.xs[-1], strict=False))
     assert all(abs(q[f"{name}_{'x' if name == 'rail' else 'q'}"] - value) < 1e-5 for name, value in goals.items())
-    assert max(gap(done.model, x[: done.model.nq])[0] for x in done.solution.xs) < 1e-3
+    # The constraint gives way by 2 h^2 (0.1 / 2 pi)^2 F / m: of 5 N m at 0.03 m of a link of 0.03 kg by 1.1 mm.
+    assert max(gap(done.model, x[: done.model.nq])[0] for x in done.solution.xs) < 1.2e-3
 
 
 def test_a_servo_of_a_tendon_drives_the_joint_that_the_others_follow(tmp_path):
