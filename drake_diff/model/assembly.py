@@ -4,6 +4,7 @@ from collections.abc import Collection
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydrake.multibody.tree import BodyIndex
 
 from drake_diff._base.arrays import Array, finite_array
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
@@ -22,21 +23,27 @@ LONGEST = 0.5  # [rad or m] of a step: farther ones miss the posture nearby
 def gap(model: Model, q: ArrayLike) -> tuple[float, float]:
     """[m] how far the points of a pair are apart in posture q (nq,) at most, and a length to compare that with.
 
-    The length is the largest distance of a point from the origin of its body, or that of points of one loop.
+    The length is the largest distance of a point from the origin of its body, or the extent of the origins of the
+    bodies that are held and of those that carry them, whatever unit the robot is modelled in.
     """
     held = model.file_facts.held_points
     set_state(model.double, np.concatenate([finite_array("q", q, (model.nq,)), np.zeros(model.nv)]))
-    _, apart = relative_motion(model.plant, model.double.context, held)
-    size = max([APART, *(float(np.linalg.norm(point)) for pair in held for point in pair.points)])
-    return max((float(np.linalg.norm(difference)) for difference in apart), default=0.0), size
+    _, differences = relative_motion(model.plant, model.double.context, held)
+    bodies = {int(index) for pair in held for index in pair.bodies}
+    carried = [j for j in joints(model.plant) if int(j.child_body().index()) in bodies]
+    bodies |= {int(j.parent_body().index()) for j in carried} - {int(model.plant.world_body().index())}
+    poses = [model.plant.EvalBodyPoseInWorld(model.double.context, model.plant.get_body(BodyIndex(i))) for i in bodies]
+    extent = float(np.linalg.norm(np.ptp([pose.translation() for pose in poses], axis=0))) if poses else 0.0
+    size = max([extent, *(float(np.linalg.norm(point)) for pair in held for point in pair.points)]) or APART
+    return max((float(np.linalg.norm(difference)) for difference in differences), default=0.0), size
 
 
 def check_closed(model: Model, subject: str, x: Array) -> None:
     """InputError where x (nx,) leaves a loop of the model open."""
-    apart, size = gap(model, x[: model.nq]) if model.file_facts.held_points else (0.0, 0.0)
-    if apart > OPEN * size:
+    distance, size = gap(model, x[: model.nq]) if model.file_facts.held_points else (0.0, 0.0)
+    if distance > OPEN * size:
         expected = f"a closed loop, as dd.model.assembled(model, {subject}) makes it"
-        raise InputError(subject, got=f"points {apart:.3g} m apart that the file holds together", expected=expected)
+        raise InputError(subject, got=f"points {distance:.3g} m apart that the file holds together", expected=expected)
 
 
 def assembled(model: Model, x: ArrayLike, *, keep: Collection[str] = ()) -> Array:
@@ -66,8 +73,8 @@ def assembled(model: Model, x: ArrayLike, *, keep: Collection[str] = ()) -> Arra
     fixed = np.isin(model.position_names, list(keep))
     q = closed(model, state[: model.nq], fixed)
     if q is None:
-        apart, _ = gap(model, state[: model.nq])
-        raise ModelError(f"the loops cannot be closed from there, where points are {apart:.3g} m apart; keep less")
+        distance, _ = gap(model, state[: model.nq])
+        raise ModelError(f"the loops cannot be closed from there, where points are {distance:.3g} m apart; keep less")
     return np.concatenate([q, state[model.nq :]])
 
 
@@ -87,8 +94,8 @@ def closed(model: Model, q: Array, fixed: NDArray[np.bool_]) -> Array | None:
 def _closed(model: Model, q: Array, free: NDArray[np.bool_]) -> Array | None:
     """By velocities that are `free` (nv,)."""
     for _ in range(MOST):
-        apart, size = gap(model, q)
-        if apart <= CLOSED * size:
+        distance, size = gap(model, q)
+        if distance <= CLOSED * size:
             return q
         rows, difference = relative_motion(model.plant, model.double.context, model.file_facts.held_points)
         rows = rows.reshape(-1, rows.shape[-1])

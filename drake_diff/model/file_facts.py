@@ -791,8 +791,7 @@ def _gains_of_other_kinds(mjcf: Mjcf, path: Path) -> Iterator[str]:
     for element in (e for section in mjcf.root.findall("actuator") for e in section.children):
         tags = mjcf.defaults.get(element.get("class") or MAIN, mjcf.defaults[MAIN])
         others = [tag for tag in GAINS if tag != element.tag and any(name in tags.get(tag, {}) for name in GAINS[tag])]
-        own = element.tag in GAINS and all(name not in mjcf.attributes(element) for name in GAINS[element.tag][:1])
-        if own and others:
+        if others and element.tag in GAINS and GAINS[element.tag][0] not in mjcf.attributes(element):
             name, kinds = element.get("name", element.tag), ", ".join(others)
             yield f"{path}:{element.line}: {name} has the gains of the default of {kinds} in MuJoCo, which are ignored."
 

@@ -89,6 +89,7 @@ def close_loops(plant: MultibodyPlant, loops: list[HeldBodies], held: list[HeldP
 
     Raises ModelError where a body is none of the plant's.
     """
+    names: list[str] = []
     for loop in loops:
         instance = plant.GetModelInstanceByName(loop.instance)
         for name in (n for n in (loop.body, loop.other) if n != WORLD and not plant.HasBodyNamed(n, instance)):
@@ -104,15 +105,15 @@ def close_loops(plant: MultibodyPlant, loops: list[HeldBodies], held: list[HeldP
             points += [] if loop.other_points is None else [np.array(loop.other_points[i])]
             constraint = plant.AddBallConstraint(body, points[0], other, *points[1:])
             held.append(HeldPoints(constraint, (body.index(), other.index()), points))
-    how = [
-        f" (joint {loop.frame}, without its limits, damping, spring and motor)" if loop.frame else "" for loop in loops
-    ]
-    names = ", ".join(f"{loop.body} and {loop.other}{words}" for loop, words in zip(loops, how, strict=True))
-    return (f"{len(loops)} loops are closed, nearly rigidly (softly in MuJoCo): {names}.",) if loops else ()
+        lost = f" (joint {loop.frame}, without its limits, damping, spring and motor)" if loop.frame else ""
+        names.append(f"{loop.body} and {loop.other}{lost}")
+    if not names:
+        return ()
+    return (f"{len(names)} loops are closed, nearly rigidly (softly in MuJoCo): {', '.join(names)}.",)
 
 
 def _body(plant: MultibodyPlant, name: str, instance: Any) -> Any:
-    """The body of that name; of the world one that is welded to it: on the world a ball constraint ends the process."""
+    """The body of that name. For the world it is one that is welded to it, as Drake crashes on the world itself."""
     if name != WORLD:
         return plant.GetBodyByName(name, instance)
     if not plant.HasBodyNamed(f"{WORLD}_of_loops", instance):
@@ -131,9 +132,9 @@ def find_points(plant: MultibodyPlant, held: list[HeldPoints]) -> None:
 
 
 def relative_motion(plant: MultibodyPlant, context: Any, held: list[HeldPoints]) -> tuple[Array, Array]:
-    """Of L pairs in the state of `context`: the difference of their points (L, 3), and how v moves it (L, 3, nv).
+    """The Jacobians (L, 3, nv) of the differences of L pairs of points by v, and the differences (L, 3) [m].
 
-    In the world's axes; the motion comes first.
+    They are those in the state of `context`, in the world's axes.
     """
     jacobians, differences = np.zeros((len(held), 3, plant.num_velocities())), np.zeros((len(held), 3))
     world = plant.world_frame()

@@ -281,7 +281,24 @@ def test_bodies_that_joints_fix_are_held_by_nothing(tmp_path):
     more = '<body name="more"><joint name="d"/><geom size="0.1"/></body>'
     model = load(parallelogram(tmp_path, more=more), fix_joints=["a", "b", "c"])
     assert model.num_constraints == 0
+    assert "loops are closed" not in str(model.notes)
     dd.step(model, [0.1, 0.2], [])
+
+
+def test_an_open_loop_of_a_millimetre_is_refused(tmp_path):
+    """A four-bar with links of 0.3 and 0.4 mm, whose second crank is 0.5 rad off."""
+    path = parallelogram(tmp_path)
+    text = path.read_text()
+    for length in (f"{-L}", f"{-L / 2}", f"{WIDTH}", f"{WIDTH / 2}"):
+        text = text.replace(f' {length}"', f' {float(length) / 1000}"').replace(
+            f'"{length} ', f'"{float(length) / 1000} '
+        )
+    path.write_text(text)
+    model = load(path)
+    with pytest.raises(InputError, match=r"x0: expected a closed loop"):
+        dd.Problem(model, x0={"c_q": 0.5}, x_goal={"a_q": 0.6}, num_steps=10)
+    x = dd.model.assembled(model, [0.5, 0.0, 0.0, 0, 0, 0], keep=["a_q"])
+    np.testing.assert_allclose(x[:3], [0.5, -0.5, 0.5], atol=1e-7)
 
 
 @each_row("method", ["ilqr", "shooting"])
