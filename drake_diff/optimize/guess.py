@@ -13,10 +13,12 @@ from pydrake.trajectories import Trajectory
 from drake_diff._base.arrays import Array, finite_array, positive_float
 from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import DrakeDiffError, InputError, ShapeError
+from drake_diff.mechanics.clearance import OfShapes
 from drake_diff.model.assembly import closed
 from drake_diff.model.model import Model
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.problem.cost import TimedCost
+from drake_diff.optimize.problem.obstacles import clearances
 from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Multipliers
@@ -170,6 +172,8 @@ def _line(problem: Problem, method: str, seed: int) -> Guess:
     """A straight line to the goal, or the reference, with the problem's inputs, or inputs near zero."""
     xs, followed = _way(problem)
     us = np.array(problem.us)
+    if method == "collocation" and followed is None and not us.any() and _keeps_shapes_clear(problem):
+        xs, us = _from_rest_to_rest(problem)
     if problem.optimizes_controls and not us.any() and followed is not None:
         us = (followed[:-1] + followed[1:]) / 2
     if problem.optimizes_controls and not us.any():
@@ -196,6 +200,36 @@ def _way(problem: Problem) -> tuple[Array, Array | None]:
     xs, us = reference
     bent = xs + (1 - s) * (problem.x0 - xs[0]) + s * (np.where(np.isnan(goal), xs[-1], goal) - xs[-1])
     return np.where(np.isnan(bent), line, bent), us
+
+
+def _keeps_shapes_clear(problem: Problem) -> bool:
+    """Whether shapes keep clear of each other in a motion of driven hinges and slides from rest to rest."""
+    of_shapes = any(isinstance(c.clearance, OfShapes) for c in clearances(problem.kept))
+    if not (of_shapes and problem.has_model and problem.optimizes_controls):
+        return False
+    model = problem.model
+    is_plain = model.nq == model.nv and not model.inputs.commanded.any() and not model.file_facts.held_points
+    at_rest = not np.any(problem.x0[model.nq :]) and not np.any(np.nan_to_num(problem.goal[model.nq :]))
+    return is_plain and at_rest and bool(np.linalg.matrix_rank(model.actuation) == model.nv)
+
+
+def _from_rest_to_rest(problem: Problem) -> tuple[Array, Array]:
+    """The straight line passed along the polynomial of degree 5 that begins and ends at rest, with the efforts for it.
+
+    A search that begins far from a motion goes through shapes before it comes to one.
+    """
+    model, duration = problem.model, problem.start_horizon
+    s, goal = np.linspace(0, 1, problem.num_steps + 1)[:, None], np.array(problem.goal)
+    way = np.where(np.isnan(goal), problem.x0, goal)[: model.nq] - problem.x0[: model.nq]
+    q = problem.x0[: model.nq] + s**3 * (10 - 15 * s + 6 * s**2) * way
+    v = 30 * (s - s**2) ** 2 * way / duration
+    a = 60 * s * (1 - s) * (1 - 2 * s) * way / duration**2
+    twin, efforts = model.double, []
+    for x, acceleration in zip(np.hstack([q, v]), a, strict=True):
+        twin.set_state(x)
+        needed = twin.inverse_dynamics(acceleration) + twin.damping() * x[model.nq :]
+        efforts.append(np.linalg.lstsq(model.actuation, needed, rcond=None)[0])
+    return np.hstack([q, v]), (np.array(efforts[:-1]) + efforts[1:]) / 2
 
 
 def _with_closed_loops(problem: Problem, xs: Array) -> Array:

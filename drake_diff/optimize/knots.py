@@ -18,6 +18,7 @@ from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.values import Refusal
 from drake_diff.exceptions import GradientError
 from drake_diff.mechanics.casadi_tree import agrees
+from drake_diff.mechanics.clearance import OfShapes
 from drake_diff.mechanics.symbol import Symbol, symbols
 from drake_diff.optimize.problem.constraint import Constraint, short
 from drake_diff.optimize.problem.cost import (
@@ -94,12 +95,14 @@ class Mapped:
 class PointFunction:
     """m numbers of a point of `width` entries; `why_not` says why it has no exact second derivative, "" if it has.
 
+    One that has none may be `linear` to a search: its second derivatives are taken for 0.
     `jacobian_at` and `hessian_at`, of the upper triangle, are where the nonzeros of one point are.
     """
 
     rows: int
     width: int
     why_not: str = ""
+    linear: bool = False
     jacobian_at: Pattern
     hessian_at: Pattern
 
@@ -174,13 +177,21 @@ class Traced(PointFunction):
 class Called(PointFunction):
     """A function that is called, and depends on the entries `depends` of a point, on all where None.
 
-    Its second derivatives are differences of its Jacobians.
+    Its second derivatives are differences of its Jacobians, but of one that is `linear`.
     """
 
     def __init__(
-        self, why_not: str, values: Values, linearize: Linearize, rows: int, width: int, depends: Indices | None = None
+        self,
+        why_not: str,
+        values: Values,
+        linearize: Linearize,
+        rows: int,
+        width: int,
+        depends: Indices | None = None,
+        *,
+        linear: bool = False,
     ):
-        self.why_not, self.rows, self.width = why_not, rows, width
+        self.why_not, self.rows, self.width, self.linear = why_not, rows, width, linear
         self._evaluate, self._linearize = values, linearize
         self._depends = np.arange(width) if depends is None else depends
         self.jacobian_at = np.repeat(np.arange(rows), len(self._depends)), np.tile(self._depends, rows)
@@ -195,6 +206,8 @@ class Called(PointFunction):
 
     def hessian(self, points: Array, weights: Array, jacobian: Array) -> Array:
         size = len(self._depends)
+        if self.linear:
+            return np.zeros((len(points), len(self.hessian_at[0])))
         full, pushed = np.zeros((len(points), size, size)), np.flatnonzero(np.any(weights, axis=1))
         points, weights = points[pushed], weights[pushed]
         for j, column in enumerate(self._depends if len(pushed) else ()):
@@ -212,6 +225,9 @@ def _places(sparsity: Any) -> Pattern:
 
 def constraint_function(c: Constraint, nx: int, probe: Array) -> PointFunction:
     """What a constraint limits; `probe` (P, nx + nu) are points [x, u] at which its expression is compared with it."""
+    if isinstance(c, ClearanceConstraint) and isinstance(c.clearance, OfShapes):  # Drake's own have no expression
+        depends, why_not = np.arange(c.clearance.model.nq), "distances between shapes are taken as linear"
+        return _called(c, why_not, nx, probe[:0], depends, linear=True)
     values = c.along(probe[:, :nx], probe[:, nx:])
     with np.errstate(all="ignore"):
         function = trace(c.function if c.takes_input else lambda x, u: c.function(x), nx, probe, values)
@@ -227,14 +243,14 @@ def knot_function(c: Constraint, nx: int, nu: int, probe: Array) -> PointFunctio
     return constraint_function(c, nx, probe)
 
 
-def _called(c: Constraint, why_not: str, nx: int, probe: Array, depends: Indices) -> Called:
+def _called(c: Constraint, why_not: str, nx: int, probe: Array, depends: Indices, *, linear: bool = False) -> Called:
     def values(knots: Array) -> Array:
         return c.along(knots[:, :nx], knots[:, nx:])
 
     def linearize(knots: Array) -> tuple[Array, Array]:
         return values(knots), c.slopes(knots[:, :nx], knots[:, nx:])
 
-    return Called(why_not, values, linearize, len(c.lower), probe.shape[1], depends)
+    return Called(why_not, values, linearize, len(c.lower), probe.shape[1], depends, linear=linear)
 
 
 class Selected(PointFunction):

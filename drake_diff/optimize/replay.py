@@ -609,7 +609,7 @@ def clearance_checks(plan: ReplayPlan, motion: MeasuredMotion) -> Iterator[Check
         yield c.nearest(*along_steps(motion.times, motion.xs), c.tolerance)
     for goal in plan.problem.goals:
         if isinstance(goal, SelfCollision):
-            for pair in goal.left_out(plan.problem.model):
+            for pair in goal.left_out(plan.problem.model, plan.problem.x0):
                 yield check("left-out pair", pair, np.nan, goal.margin, "m", "undecided")
 
 

@@ -186,8 +186,8 @@ def _plan(solution: Solution) -> _Plan:
             return TranscribedProgram([Phase(task, mesh, knot_functions(task))])
 
         program = collocated(problem)
-        if program.why_not:
-            raise ModelError(f"{problem.name}: no second derivatives: {program.why_not}")
+        if why := program.why_not or program.linearized:
+            raise ModelError(f"{problem.name}: no second derivatives: {why}")
         z = program.phases[0].pack(np.asarray(motion.nodes), motion.horizon, motion.task.parameters)
         return _Plan(problem, collocated, z, False)
     if problem.trajectory_cost is not None:

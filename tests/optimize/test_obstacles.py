@@ -16,6 +16,7 @@ import drake_diff as dd
 import drake_diff.optimize.transcription.collocation as collocation_module
 from drake_diff.exceptions import InputError, ModelWarning, UnknownNameError
 from drake_diff.optimize import Options
+from drake_diff.optimize.guess import first_guess
 from drake_diff.optimize.problem.obstacles import along_steps
 from drake_diff.optimize.program import NlpResult, Outcome
 from drake_diff.optimize.verification import judged
@@ -221,11 +222,11 @@ def test_neighbours_and_what_always_overlaps_are_left_out_of_self_collision():
 BAR, TOP = "<box><size>0.04 0.04 0.26</size></box>", "<box><size>1 1 0.05</size></box>"
 
 
-def reach(folder, at, *, margin=0.01, ignore=(), to=(0.3, 0.5)):
+def reach(folder, at, *, margin=0.01, ignore=(), start=(0.0, 0.0), to=(0.3, 0.5)):
     """From a table at the height of its start, or beyond it."""
     model = arm_beside_table(folder, BAR, TOP, at=at, actuators="all", gravity=[0, 0, 0])
     goal, cost = dd.SelfCollision(margin=margin, ignore=ignore), dd.QuadraticCost(R=np.eye(2))
-    return dd.Problem(model, x0=np.zeros(4), x_goal=[*to, 0, 0], num_steps=20, running_cost=cost, goals=[goal])
+    return dd.Problem(model, x0=[*start, 0, 0], x_goal=[*to, 0, 0], num_steps=20, running_cost=cost, goals=[goal])
 
 
 def overlaps(model, xs):
@@ -247,6 +248,27 @@ def test_a_pair_that_overlaps_at_the_start_leaves_a_plan_undecided(tmp_path):
     assert not solution.success
     assert "lower and top overlap where the file has them" in solution.message
     assert dd.solve(reach(tmp_path, at, ignore=[("lower", "top")])).success
+
+
+@pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
+def test_a_pair_that_overlaps_in_the_file_is_kept_clear_from_a_start_that_is(tmp_path):
+    problem = reach(tmp_path, (0.9, 0, 0.0), start=(1.5, 0.5), to=(1.2, 0.8))
+    assert "lower and top" in problem.kept_goals[0].clearance.labels
+    goal = dd.SelfCollision()
+    assert goal.left_out(problem.model, problem.x0) == ()
+    assert goal.left_out(problem.model) == goal.left_out(problem.model, np.zeros(4)) == ("lower and top",)
+
+
+@pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
+def test_a_search_begins_with_a_motion_from_rest_to_rest_where_shapes_keep_clear(tmp_path):
+    """Of x(s) = 10 s^3 - 15 s^4 + 6 s^5 the largest rate is 15/8; without gravity its efforts do no work in all."""
+    problem = reach(tmp_path, (0.3, 0, -0.1), start=(0.0, 0.2), to=(0.05, 1.0))
+    guess, way, h = first_guess(problem, "collocation", None, 0), np.array([0.05, 0.8]), problem.time_step
+    assert guess.xs[10] == pytest.approx([0.025, 0.6, *(15 / 8 * way / problem.start_horizon)])
+    assert guess.xs[[0, -1], 2:] == pytest.approx(np.zeros((2, 2)))
+    power = np.sum(guess.us * (guess.xs[1:, 2:] + guess.xs[:-1, 2:]) / 2, axis=1)
+    assert np.abs(power.sum() * h) < 0.02 * np.abs(power).sum() * h  # as 20 intervals integrate it
+    assert np.abs(power).max() > 0
 
 
 @pytest.mark.slow

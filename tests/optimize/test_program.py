@@ -170,3 +170,26 @@ def test_derivatives_of_a_program_of_steps_are_differences(changes):
     )
     program = StepProgram(problem)
     check(program, tolerance=1e-5)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e6])
+def test_a_row_that_changes_by_rounding_alone_is_as_large_as_its_values(unit):
+    """As the distance of a shape from the axis that it turns about, whose slope is 1e-17."""
+
+    def rows(x):
+        return np.array([0.5 * unit + 1e-17 * unit * x[0], 2e-5 * unit * x[1]])
+
+    problem = dd.Problem(
+        dd.Dynamics(pendulum, 2, 1),
+        x0=[0, 0],
+        num_steps=3,
+        horizon=1.0,
+        running_cost=EFFORT,
+        constraints=[dd.Constraint(rows, lower=[0.1 * unit, 0.0])],
+    )
+    transcription = Transcription(problem, "hermite_simpson")
+    program = transcription.program([np.linspace(0, 1, 4)])
+    constant = program.sides[0] == 0.1 * unit
+    scales = program.scales_at(np.full(program.size, 0.2)).rows
+    assert scales[constant] == pytest.approx(np.full(np.sum(constant), 0.5 * unit))
+    assert np.min(scales) == pytest.approx(min(0.2, 2e-5 * unit * 0.2))

@@ -265,7 +265,8 @@ class SelfCollision(Obstacle):
     Links are their collision shapes, of meshes the convex hulls, at Drake's signed distance, whatever `contact` the
     model has; those without are capsules as for a `SphereObstacle`. Left out are links that a joint ties to each other
     and what is welded together. Pairs that overlap in the posture that the file gives, or in every one of 1,000 random
-    states, cannot be kept apart: a plan is then undecided, unless they are in `ignore`.
+    states, and are nearer than the margin at `x0` too, cannot be kept apart: a plan is then undecided, unless they are
+    in `ignore`.
 
     Args:
         margin, weight: As those of a `SphereObstacle`.
@@ -289,10 +290,13 @@ class SelfCollision(Obstacle):
     def _check(self) -> None:
         self._set(ignore=tuple(_pair("SelfCollision.ignore", pair) for pair in self.ignore))
 
-    def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
-        overlapping = set(self.left_out(model))
+    def bind(self, model: Model, x0: Array | None = None) -> tuple[ClearanceConstraint, ...]:
+        overlapping = set(self.left_out(model, x0))
         pairs = [pair for pair in self._pairs(model) if _bodies(*pair) not in overlapping]
         return self.kept_clear(self._distances(model, pairs), "clear of itself") if pairs else ()
+
+    def bind_to(self, problem: Any) -> tuple[GoalConstraint, ...]:
+        return self.bind(problem.model, problem.x0)
 
     def rows_away_from(self, model: Model, xs: Array) -> tuple[ClearanceConstraint, ...]:
         """What keeps the capsules of all pairs of `model` apart but those nearer than the margin at one of xs (K, nx).
@@ -306,11 +310,21 @@ class SelfCollision(Obstacle):
         pairs = [pair for pair in pairs if _bodies(*pair) not in touching]
         return self.kept_clear(OfPairs(model, kinematics, pairs), "clear of itself")
 
-    def left_out(self, model: Model) -> tuple[str, ...]:
-        """The pairs of bodies of `model` that overlap by their shapes and are not kept apart: "a and b"."""
+    def left_out(self, model: Model, x0: Array | None = None) -> tuple[str, ...]:
+        """The pairs of bodies of `model` that overlap by their shapes and are not kept apart: "a and b".
+
+        With a first state `x0` (nx,) only those that are nearer than the margin there.
+        """
         pairs = self._pairs(model)
         key = ("overlapping", tuple(_bodies(*pair) for pair in pairs))
-        return model.cache(key, lambda: _overlapping(model, lambda some: self._distances(model, some), pairs))
+        left: tuple[str, ...] = model.cache(
+            key, lambda: _overlapping(model, lambda some: self._distances(model, some), pairs)
+        )
+        overlapping = [pair for pair in pairs if _bodies(*pair) in left]
+        if x0 is None or not overlapping:
+            return left
+        near = self._distances(model, overlapping).values(x0[None])[0] < self.margin
+        return tuple(sorted({_bodies(*pair) for pair, close in zip(overlapping, near, strict=True) if close}))
 
     def _distances(self, model: Model, pairs: Sequence[tuple[Solid, Solid]]) -> OfShapes:
         near = self.margin + EXACT
@@ -447,12 +461,12 @@ def swept(constraints: Sequence[Constraint], time_step: float, parts: int) -> tu
     return tuple(swept_constraints)
 
 
-def doubts_of(goals: Sequence[Goal], model: Model) -> Iterator[str]:
-    """What a model may not keep clear, where one of `goals` asks for it."""
+def doubts_of(goals: Sequence[Goal], model: Model, x0: Array | None = None) -> Iterator[str]:
+    """What a model may not keep clear from x0 (nx,) on, where one of `goals` asks for it."""
     if any(isinstance(goal, Obstacle) for goal in goals):
         yield from cover_of(model, _kinematics(model)).doubts
     for goal in goals:
-        if isinstance(goal, SelfCollision) and (left := goal.left_out(model)):
+        if isinstance(goal, SelfCollision) and (left := goal.left_out(model, x0)):
             yield (
                 f"SelfCollision does not keep {len(left)} pairs of links apart, as their shapes overlap in the posture "
                 f"of the file or in every one: {', '.join(left)}"

@@ -741,7 +741,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         given = several("goals", self.goals, Goal, "a goal such as FrameGoal, or several")
         if given and not self.has_model:
             raise InputError("goals", got="given", expected="none for plain dynamics: a goal is a model's")
-        for doubt in doubts_of(given, self.model) if given else ():
+        for doubt in doubts_of(given, self.model, self.x0) if given else ():
             warnings.warn(doubt, ModelWarning, stacklevel=4)
         return given
 

@@ -635,6 +635,8 @@ def solve_program(
 
     why, start = program.why_not, now()
     derivatives = f"first derivatives, limited-memory Hessian: {why}" if why else "symbolic, exact Hessian"
+    if program.linearized and not why:
+        derivatives = f"symbolic, Hessian without some curvature: {program.linearized}"
     usable = multipliers if multipliers and multipliers.sizes == (program.size, len(program.sides[0])) else None
     options: dict[str, Any] = {"more": more, "motions": program.iterates}
     result = solve_ipopt(program, guess, limits, report, exact=not why, multipliers=usable, **options)

@@ -1,7 +1,6 @@
 """The functions that a collocation program is made of: dynamics, costs, constraints and couplings of its nodes."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -64,6 +63,8 @@ class Stepwise(PointFunction):
 class Timed:
     """A running cost that changes in time: a function of knots once their times are known, see `at`."""
 
+    linear = False
+
     def __init__(self, rate: TimedRate, nx: int):
         self.rate, self.width = rate, rate.width
         with np.errstate(all="ignore"):
@@ -100,14 +101,14 @@ class KnotFunctions:
     joined: tuple[PointFunction, ...] = ()
     parameters: PointFunction | None = None  # the cost of the parameters, of their coordinates
 
-    @cached_property
-    def why_not(self) -> str:
-        """Which of them has no second derivative and why, "" where all have."""
+    def why_not(self, *, linear: bool) -> str:
+        """Which of them has no second derivative and why, "" where all have; of those that are `linear`, or others."""
         named = [("dynamics", self.dynamics), ("running_cost", self.rate), ("final_cost", self.final)]
         named += [("parameter_cost", self.parameters)]
         named += [(f"constraint {i}", path) for i, path in enumerate(self.paths)]
         named += [(f"coupling {i}", coupling) for i, coupling in enumerate(self.joined)]
-        return next((f"{name}: {f.why_not}" for name, f in named if f is not None and f.why_not), "")
+        lacking = [(name, f.why_not) for name, f in named if f is not None and f.why_not and f.linear == linear]
+        return next((f"{name}: {why}" for name, why in lacking), "")
 
 
 def knot_functions(task: OptimalControl) -> KnotFunctions:

@@ -122,7 +122,8 @@ class TranscribedProgram(BlockProgram):
             phase.first, first = first, first + phase.size
         for phase in phases:
             self._add_phase(phase)
-        reasons = [phase.functions.why_not for phase in phases]
+        reasons = [phase.functions.why_not(linear=False) for phase in phases]
+        self.linearized = next(filter(None, (phase.functions.why_not(linear=True) for phase in phases)), "")
         if problem is not None:
             reasons = [f"{name}, {why}" if why else "" for name, why in zip(problem.names, reasons, strict=True)]
             reasons += [f"a reset: {f.why_not}" if f.why_not else "" for f in links]

@@ -71,6 +71,7 @@ WARM_START = {
 }
 RELAXED = 1e-6  # of the smallest bound: what a plan may be beyond it
 FLAT = 1e-8  # of the largest slope of a row: a row that has another one than at the guess
+ROUNDING = 1e-13  # of the size of a row: a change that is rounding
 TRIED = 0.1  # of the spans: how far from the guess the cost is looked at
 PRECISE = 0.1  # of the tolerance: a motion may stay well within the spans of its first guess
 NOT_FINITE = "IPOPT: Invalid Number Detected"
@@ -107,11 +108,12 @@ class BlockProgram:
     """A program that grows by `add`, `add_rows` and `add_linear` until it is first evaluated; see the module.
 
     An error of the kinds `backs_off` makes an evaluation NaN, from which a search backs off: `refusals` counts them and
-    `refusal` is the last. The first other one is `error`, which ends the search. `why_not` says why there is no exact
-    Hessian.
+    `refusal` is the last. The first other one is `error`, which ends the search. `why_not` says why there is no
+    Hessian, and `linearized` what that leaves out.
     """
 
     why_not = ""
+    linearized = ""
     backs_off: tuple[type[Exception], ...] = ()
 
     def __init__(self, lower: Array, upper: Array):
@@ -281,6 +283,8 @@ class BlockProgram:
                     continue
             rows = np.maximum(rows, np.where(flat, np.nan_to_num(moved, posinf=0.0), 0.0) / TRIED)
         largest = max((change for change in changes if np.isfinite(change)), default=0.0)
+        sizes = np.max(np.abs(np.nan_to_num([values, *self.sides], posinf=0.0, neginf=0.0)), axis=0)
+        rows = np.where(rows > ROUNDING * sizes, rows, sizes)  # a row that changes by rounding alone is a constant
         rows, largest = np.where(rows > 1e-150, rows, 1.0), largest or 1.0  # whose products do not overflow
         every = np.concatenate([spans, rows, [largest]])
         return Scales(spans, rows, largest) if are_far_from_one(every) else UNSCALED
