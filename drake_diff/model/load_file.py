@@ -291,6 +291,7 @@ FORMATS = (".urdf", ".sdf", ".xml", ".mjcf", ".dmd.yaml")
 DRAKES_REFUSALS = (RuntimeError, ValueError, IndexError, OverflowError, SystemExit)  # the last is a failed condition
 OF_RANGES = re.compile(r"Asymmetrical effort limits are not supported|collision filter groups are not yet implemented")
 OF_GRAVITY = re.compile(r"attribute 'gravcomp' found in a 'body' tag .* ignored")
+NO_GRAVITY = "No gravity, as"  # begins a note
 OF_A_SPRING = re.compile(r"attribute '(?:stiffness|springref)' found in a 'joint' tag .* ignored")
 
 # Drake says of every half space that deformable bodies will not touch it, which no model here has.
@@ -436,7 +437,7 @@ class _Reading:
             if (mjcf.weightless or is_off) and plant.num_model_instances() == 3:  # the world's, Drake's, and this one
                 plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, 0.0])
                 why = "the file disables it" if is_off else "gravcomp compensates that of every body"
-                self.notes.append(f"No gravity, as {why}.")
+                self.notes.append(f"{NO_GRAVITY} {why}.")
                 outdated.append(OF_GRAVITY)
             self.notes[:] = [note for note in self.notes if not any(meant.search(note) for meant in outdated)]
 

@@ -4,10 +4,10 @@ A joint of SDF whose child has a joint already closes a loop. Drake has no such 
 joint's axis are held at those of the parent. Each pair of points is one of Drake's ball constraints, nearly rigid.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
-from xml.sax.saxutils import quoteattr
+from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -16,6 +16,7 @@ from pydrake.multibody.tree import JacobianWrtVariable, SpatialInertia, UnitIner
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ModelError
+from drake_diff.model.plant import joint_pose, joints
 from drake_diff.model.xml_text import Element, XmlText
 
 APART = 0.1  # [m] between the points of one loop: the constraints are nearly rigid at any distance
@@ -58,13 +59,16 @@ def points_along(axis: Array, count: int) -> tuple[tuple[float, ...], ...]:
 def loops_of_sdf(xml: XmlText, model: Element, instance: str) -> Iterator[HeldBodies]:
     """The joints of an SDF model that close loops; they become frames of their children.
 
+    Those of nested models come first: a joint to a link that has one there closes a loop.
+
     Raises ModelError, with its line, where one is of a kind that points cannot hold, or drives.
     """
-    has_joint: set[str] = set()
+    has_joint = set(_driven_links(model))
     for joint in model.findall("joint"):
-        parent, child = (element.text.strip() if (element := joint.find(tag)) else "" for tag in ("parent", "child"))
-        if child not in has_joint:
-            has_joint.add(child)
+        parent, child = _ends(joint)
+        link = _link(model, child)
+        if link not in has_joint:
+            has_joint.add(link)
             continue
         kind, name = joint.get("type"), joint.get("name")
         where = f"line {joint.line}: the joint {name} closes a loop"
@@ -79,31 +83,91 @@ def loops_of_sdf(xml: XmlText, model: Element, instance: str) -> Iterator[HeldBo
         if not axis.any():
             raise ModelError(f"{where}: expected an axis, got 0 0 0")
         pose = joint.find("pose")
-        text = "" if pose is None else xml.data[pose.start : pose.end].decode()
-        xml.replace(joint, f"<frame name={quoteattr(name)} attached_to={quoteattr(child)}>{text}</frame>")
-        yield HeldBodies(instance, child, parent, points_along(axis, POINTS[kind]), frame=name)
+        says = {"relative_to": child} | ({} if pose is None else pose.attributes)
+        given = " ".join(f"{key}={quoteattr(value)}" for key, value in says.items())
+        placed = f"<pose {given}>{'' if pose is None else escape(pose.text)}</pose>"
+        # To the link itself: Drake loses the pose of a frame on a frame of a nested model.
+        xml.replace(joint, f"<frame name={quoteattr(name)} attached_to={quoteattr(link)}>{placed}</frame>")
+        yield HeldBodies(instance, link, _link(model, parent), points_along(axis, POINTS[kind]), frame=name)
 
 
-def close_loops(plant: MultibodyPlant, loops: list[HeldBodies], held: list[HeldPoints]) -> tuple[str, ...]:
-    """Hold the points of loops together, before the plant is finalized, and add to `held` how; a sentence.
+def _ends(joint: Element) -> tuple[str, str]:
+    """The parent and the child that a joint of SDF names."""
+    parent, child = (element.text.strip() if (element := joint.find(tag)) else "" for tag in ("parent", "child"))
+    return parent, child
+
+
+def _link(model: Element, name: str) -> str:
+    """The link that a name in an SDF model means: "inner::link" of a nested one, and of a frame what it is fixed to."""
+    seen: set[str] = set()
+    while name not in seen:  # frames that are fixed to each other are refused by Drake
+        seen.add(name)
+        scope, _, rest = name.partition("::")
+        inner = next((m for m in model.findall("model") if m.get("name") == scope), None)
+        if rest and inner is not None:
+            return f"{scope}::{_link(inner, rest)}"
+        frame = next((f for f in model.findall("frame") if f.get("name") == name), None)
+        name = name if frame is None else frame.get("attached_to") or name
+    return name
+
+
+def _driven_links(model: Element) -> Iterator[str]:
+    """The links of nested models that are the child of a joint there, as `model` names them."""
+    for inner in model.findall("model"):
+        links = {_link(inner, _ends(joint)[1]) for joint in inner.findall("joint")}
+        for link in (*links, *_driven_links(inner)):
+            yield f"{inner.get('name')}::{link}"
+
+
+def in_pose_of_files(
+    plant: MultibodyPlant, loops: Sequence[HeldBodies], position: Callable[[Any], float]
+) -> list[HeldBodies]:
+    """`loops` with the points of both bodies, which coincide in the files' pose where a file gives those of one alone.
+
+    The plant is not finalized and its joints are those of the files; `position` is that of a hinge or slide [rad or m]
+    in the files' pose. A .dmd.yaml may let the robot start elsewhere, and a weld in place of a joint be elsewhere.
 
     Raises ModelError where a body is none of the plant's.
     """
+    inboard = {joint.child_body().index(): joint for joint in joints(plant)}
+
+    def pose(body: Any) -> RigidTransform:
+        if body.index() == plant.world_body().index():
+            return RigidTransform()
+        joint = inboard.get(body.index())
+        if joint is None:
+            return plant.GetDefaultFloatingBaseBodyPose(body)
+        moved = joint_pose(joint, position(joint))
+        on_parent, on_child = (f.GetFixedPoseInBodyFrame() for f in (joint.frame_on_parent(), joint.frame_on_child()))
+        return pose(joint.parent_body()) @ on_parent @ moved @ on_child.inverse()
+
+    located = []
+    for loop in loops:
+        first, second = (_body(plant, loop.instance, name) for name in (loop.body, loop.other))
+        points, others = loop.points, loop.other_points
+        if loop.frame:
+            of_frame = plant.GetFrameByName(loop.frame, first.model_instance()).GetFixedPoseInBodyFrame()
+            points = tuple(tuple(of_frame @ np.array(point)) for point in points)
+        if others is None:
+            between = pose(second).inverse() @ pose(first)
+            others = tuple(tuple(between @ np.array(point)) for point in points)
+        located.append(replace(loop, points=points, other_points=others))
+    return located
+
+
+def close_loops(plant: MultibodyPlant, loops: Sequence[HeldBodies], held: list[HeldPoints]) -> tuple[str, ...]:
+    """Hold the points of both bodies of loops together, before the plant is finalized; adds to `held`; a sentence."""
     names: list[str] = []
     for loop in loops:
-        instance = plant.GetModelInstanceByName(loop.instance)
-        for name in (n for n in (loop.body, loop.other) if n != WORLD and not plant.HasBodyNamed(n, instance)):
-            raise ModelError(f"expected bodies of {loop.instance} that are held together, got {name}, which is none")
-        body, other = (_body(plant, name, instance) for name in (loop.body, loop.other))
-        if {body.index(), other.index()} <= {fixed.index() for fixed in plant.GetBodiesWeldedTo(plant.world_body())}:
-            continue  # neither moves, and a step would fail
-        pose = RigidTransform()
-        if loop.frame:
-            pose = plant.GetFrameByName(loop.frame, instance).GetFixedPoseInBodyFrame()
-        for i, point in enumerate(loop.points):
-            points = [pose @ np.array(point)]
-            points += [] if loop.other_points is None else [np.array(loop.other_points[i])]
-            constraint = plant.AddBallConstraint(body, points[0], other, *points[1:])
+        body, other = (
+            _stand_in_for_the_world(plant, loop.instance) if name == WORLD else _body(plant, loop.instance, name)
+            for name in (loop.body, loop.other)
+        )
+        if other.index() in {welded.index() for welded in plant.GetBodiesWeldedTo(body)}:
+            continue  # they move together, and a step would fail
+        for point, other_point in zip(loop.points, loop.other_points or (), strict=True):
+            points = [np.array(point), np.array(other_point)]
+            constraint = plant.AddBallConstraint(body, points[0], other, points[1])
             held.append(HeldPoints(constraint, (body.index(), other.index()), points))
         lost = f" (joint {loop.frame}, without its limits, damping, spring and motor)" if loop.frame else ""
         names.append(f"{loop.body} and {loop.other}{lost}")
@@ -112,23 +176,27 @@ def close_loops(plant: MultibodyPlant, loops: list[HeldBodies], held: list[HeldP
     return (f"{len(names)} loops are closed, nearly rigidly (softly in MuJoCo): {', '.join(names)}.",)
 
 
-def _body(plant: MultibodyPlant, name: str, instance: Any) -> Any:
-    """The body of that name. For the world it is one that is welded to it, as Drake crashes on the world itself."""
-    if name != WORLD:
-        return plant.GetBodyByName(name, instance)
-    if not plant.HasBodyNamed(f"{WORLD}_of_loops", instance):
+def _body(plant: MultibodyPlant, instance: str, name: str) -> Any:
+    """That of a model instance, or of one within it, "inner::link"; ModelError where there is none."""
+    if name == WORLD:
+        return plant.world_body()
+    *scopes, last = name.split("::")
+    full = "::".join([instance, *scopes])
+    if plant.HasModelInstanceNamed(full):
+        index = plant.GetModelInstanceByName(full)
+        if plant.HasBodyNamed(last, index):
+            return plant.GetBodyByName(last, index)
+    raise ModelError(f"expected bodies of {instance} that are held together, got {name}, which is none")
+
+
+def _stand_in_for_the_world(plant: MultibodyPlant, instance: str) -> Any:
+    """A body without mass that is welded to the world, as Drake crashes on constraints of the world itself."""
+    name, index = f"{WORLD}_of_loops", plant.GetModelInstanceByName(instance)
+    if not plant.HasBodyNamed(name, index):
         nothing = SpatialInertia(0.0, np.zeros(3), UnitInertia(0.0, 0.0, 0.0))
-        body = plant.AddRigidBody(f"{WORLD}_of_loops", instance, nothing)
+        body = plant.AddRigidBody(name, index, nothing)
         plant.WeldFrames(plant.world_frame(), body.body_frame())
-    return plant.GetBodyByName(f"{WORLD}_of_loops", instance)
-
-
-def find_points(plant: MultibodyPlant, held: list[HeldPoints]) -> None:
-    """Complete, in the default pose of a finalized plant, the points that the file leaves open."""
-    context = plant.CreateDefaultContext()
-    for pair in (pair for pair in held if len(pair.points) == 1):
-        first, second = (plant.EvalBodyPoseInWorld(context, plant.get_body(index)) for index in pair.bodies)
-        pair.points.append(second.inverse() @ (first @ pair.points[0]))
+    return plant.GetBodyByName(name, index)
 
 
 def relative_motion(plant: MultibodyPlant, context: Any, held: list[HeldPoints]) -> tuple[Array, Array]:

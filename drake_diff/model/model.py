@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar
@@ -32,8 +32,8 @@ from drake_diff.model.contact_geometry import (
 from drake_diff.model.contract import Contract, read_contract
 from drake_diff.model.file_facts import FileFacts, Mimic
 from drake_diff.model.inputs import TIMES, BodyForce, add_body_forces, check_body_forces, read_inputs
-from drake_diff.model.load_file import DRAKES_REFUSALS, as_packages, read_into, warn_of_newer_versions
-from drake_diff.model.loops import close_loops, find_points
+from drake_diff.model.load_file import DRAKES_REFUSALS, NO_GRAVITY, as_packages, read_into, warn_of_newer_versions
+from drake_diff.model.loops import close_loops, in_pose_of_files
 from drake_diff.model.meshes import TREATMENTS
 from drake_diff.model.plant import (
     actuators,
@@ -64,6 +64,7 @@ from drake_diff.model.repairs import (
     fix,
     fix_mimics,
     hold_base,
+    position_in_file,
     still_moving,
     take_away_contact,
     touch_the_world_alone,
@@ -623,7 +624,7 @@ def load_model(
         check_in_child_process(source, options)
     read = read_into(plant, source, options["packages"], meshes)
     repairs, mimics = _repaired(plant, scene_graph, source, read.facts, options)
-    notes = read.notes + repairs
+    notes = tuple(n for n in read.notes if gravity is None or not n.startswith(NO_GRAVITY)) + repairs
     if notes:
         warnings.warn("\n  ".join([f"{source.name}:", *notes]), ModelWarning, stacklevel=2)
     notes += () if contact_geometry is None else replace_collision_geometry(plant, scene_graph, contact_geometry)
@@ -634,7 +635,6 @@ def load_model(
         plant.Finalize()
     except DRAKES_REFUSALS as error:
         raise ModelError(f"{source}: expected a model that Drake can finalize; Drake says: {error}") from error
-    find_points(plant, read.facts.held_points)
     notes += damp_servos(plant, read.facts)
     coupling = coupling_of(plant, mimics)
     body_forces = check_body_forces([*read.facts.thrusters, *body_forces])
@@ -811,6 +811,7 @@ def _repaired(
         raise InputError("ground", got="contact=False too", expected="contact, without which nothing stands on it")
     mimics: tuple[Mimic, ...] = ()
     try:
+        loops = in_pose_of_files(plant, facts.loops, partial(position_in_file, plant, facts))
         if choice is not None or options["fix_joints"]:  # Drake takes no joint out of a model with constraints
             followers = [m for m in facts.followers.values() if choice is not None or m.in_drake]
             mimics = uncoupled(plant, still_moving(plant, followers))
@@ -828,7 +829,7 @@ def _repaired(
         notes += hold_base(plant, base)
         notes += add_armatures(plant, facts)
         notes += add_springs(plant, facts)
-        notes += close_loops(plant, facts.loops, facts.held_points)
+        notes += close_loops(plant, loops, facts.held_points)
         notes += () if options["contact"] else take_away_contact(plant, scene_graph)
         return notes + add_ground(plant, options["ground"]), mimics if choice == "reduce" else ()
     except ModelError as error:

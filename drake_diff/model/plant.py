@@ -4,9 +4,18 @@ from typing import Any
 
 import numpy as np
 from pydrake.autodiffutils import AutoDiffXd
+from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.geometry import SceneGraph_
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import JointActuatorIndex, JointIndex, ModelInstanceIndex
+from pydrake.multibody.tree import (
+    JointActuatorIndex,
+    JointIndex,
+    ModelInstanceIndex,
+    PrismaticJoint,
+    RevoluteJoint,
+    WeldJoint,
+)
 from pydrake.systems.framework import Diagram
 
 from drake_diff.exceptions import ModelError, UnknownNameError
@@ -47,6 +56,20 @@ def actuators(plant: Any) -> list[Any]:
 def rotors(plant: Any) -> list[Any]:
     """Every actuator of Drake's, also those that nothing drives and that give their joints an armature."""
     return [plant.get_joint_actuator(JointActuatorIndex(int(i))) for i in plant.GetJointActuatorIndices()]
+
+
+def joint_pose(joint: Any, q: float = 0.0) -> RigidTransform:
+    """The pose of a joint's child frame in its parent frame, a hinge or slide being at the position q [rad or m].
+
+    Free bodies are in their default pose and others at zero.
+    """
+    if isinstance(joint, RevoluteJoint):
+        return RigidTransform(RotationMatrix(AngleAxis(q, joint.revolute_axis())), np.zeros(3))
+    if isinstance(joint, PrismaticJoint):
+        return RigidTransform(q * np.asarray(joint.translation_axis()))
+    if isinstance(joint, WeldJoint):
+        return joint.X_FM()
+    return joint.GetDefaultPose() if joint.type_name().endswith("_floating") else RigidTransform()
 
 
 def labelled(elements: list[Any]) -> dict[str, Any]:

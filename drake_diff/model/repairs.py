@@ -28,8 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake import geometry as pg
 from pydrake.autodiffutils import ExtractValue
-from pydrake.common.eigen_geometry import AngleAxis
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import (
     FrameIndex,
@@ -47,7 +46,7 @@ from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.model.contact_geometry import collision_geometries
 from drake_diff.model.file_facts import FileFacts, Mimic
 from drake_diff.model.load_file import DRAKES_REFUSALS
-from drake_diff.model.plant import ARMATURE, actuators, bodies, joints, labelled, named
+from drake_diff.model.plant import ARMATURE, actuators, bodies, joint_pose, joints, labelled, named
 
 GROUND_FRICTION = 0.5  # of ground=True: what Drake's SceneGraph gives to geometry without a friction of its own
 Actuated = str | tuple[str, ...] | dict[str, float | None] | None
@@ -236,6 +235,14 @@ def _key(plant: MultibodyPlant, joint: Any) -> tuple[str, str]:
     return str(plant.GetModelInstanceName(joint.model_instance())), str(joint.name())
 
 
+def position_in_file(plant: MultibodyPlant, facts: FileFacts, joint: Any) -> float:
+    """That of a hinge or slide [rad or m] in the pose of its file, wherever a .dmd.yaml lets it start."""
+    says = facts.joints.get(_key(plant, joint))
+    if says is not None or joint.num_velocities() != 1:
+        return 0.0 if says is None else says.start
+    return float(joint.default_positions()[0])
+
+
 def _limit_again(actuator: Any, limit: float) -> list[str]:
     was = float(actuator.effort_limit())
     if was == limit:
@@ -355,9 +362,7 @@ def weld(plant: MultibodyPlant, joint: Any, q: float) -> None:
     for actuator in [a for a in actuators(plant) if a.joint().index() == joint.index()]:
         plant.RemoveJointActuator(actuator)
     name, parent, child = joint.name(), joint.frame_on_parent(), joint.frame_on_child()
-    axis = np.asarray(joint.revolute_axis() if isinstance(joint, RevoluteJoint) else joint.translation_axis())
-    turned = RotationMatrix(AngleAxis(q, axis)) if isinstance(joint, RevoluteJoint) else None
-    moved = RigidTransform(turned, np.zeros(3)) if turned is not None else RigidTransform(q * axis)
+    moved = joint_pose(joint, q)
     plant.RemoveJoint(joint)
     plant.AddJoint(WeldJoint(name, parent, child, moved))
 

@@ -143,6 +143,32 @@ def test_a_joint_of_sdf_that_closes_a_loop_holds(tmp_path, kind):
     dd.certify(model, x, [1.0]).require()
 
 
+def test_ends_of_a_joint_of_sdf_are_frames_or_links_of_a_nested_model(tmp_path):
+    """The same four-bar, whose rocker is in a nested model and whose closing joint names frames: one motion."""
+    plain = sdf(tmp_path)
+    text = plain.read_text()
+    rocker = SDF_LINK.format("rocker", "0.5 0 1")
+    tip = '<frame name="tip" attached_to="arm"><pose>0 0 0.3 0 0 0</pose></frame><frame name="arm" attached_to="side"/>'
+    text = text.replace(rocker, f'<model name="inner">{rocker}</model><frame name="side" attached_to="inner::rocker"/>')
+    text = text.replace("<child>rocker</child>", "<child>inner::rocker</child>", 1)
+    text = text.replace('<pose relative_to="rocker">0 0 0.3 0 0 0</pose>', "")
+    text = text.replace("<child>rocker</child>", "<child>tip</child>").replace("</model></sdf>", f"{tip}</model></sdf>")
+    nested = tmp_path / "nested.sdf"
+    nested.write_text(text)
+    ends = []
+    for path in (plain, nested):
+        model, x = load(path, time_step=0.005), np.zeros(6)
+        for _ in range(20):
+            x = dd.step(model, x, [0.2])
+        ends.append(x)
+    assert ends[0] == pytest.approx(ends[1], abs=1e-9)  # rounding: one mechanism
+    assert abs(ends[0][0]) > 0.005
+    lost = tmp_path / "lost.sdf"
+    lost.write_text(text.replace("<parent>bar</parent>", "<parent>inner::bar</parent>"))
+    with pytest.raises(ModelError, match="inner::bar"):
+        load(lost)
+
+
 @each_row(
     "options, words",
     [
@@ -154,6 +180,21 @@ def test_a_joint_of_sdf_that_closes_a_loop_holds(tmp_path, kind):
 def test_a_loop_that_points_cannot_hold_is_refused(tmp_path, options, words):
     with pytest.raises(ModelError, match=words):
         load(sdf(tmp_path, **options))
+
+
+@pytest.mark.parametrize("fixed", [(), ("c",)])
+def test_points_coincide_in_the_pose_of_the_file_wherever_the_robot_starts(tmp_path, fixed):
+    """A .dmd.yaml lets it start 0.4 rad away, or a joint be fixed there: the loop is that of the file all the same."""
+    moved = tmp_path / "moved.dmd.yaml"
+    moved.write_text(
+        "directives:\n- add_model:\n    name: loop\n    file: file://"
+        f"{parallelogram(tmp_path)}\n    default_joint_positions: {{a: [0.4], b: [-0.4], c: [0.4]}}\n"
+    )
+    model, plain = load(moved, fix_joints=fixed), load(parallelogram(tmp_path))
+    ends = [model.file_facts.held_points[0].points, plain.file_facts.held_points[0].points]
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-12)
+    np.testing.assert_allclose(ends[1], [[WIDTH, 0, 0], [0, 0, -L]], atol=1e-12)
+    assert max(gaps(model, model.default_state)) < 1e-12
 
 
 @each_row("relpose", ["", 'relpose="0.3 0 0.1 0.8 0 0.6 0"', 'relpose="0.356 0 -0.092 0.8 0 0.6 0" anchor="0.2 0 0"'])
@@ -409,3 +450,13 @@ def test_a_tendon_of_joints_that_do_not_follow_is_left_out(tmp_path, coefficient
     model = load(tmp_path / "robot.xml")
     assert model.nu == (1 if coupled and first + second else 0)
     assert ("1 actuators left out" in str(model.notes)) == (model.nu == 0)
+
+
+def test_bodies_that_move_together_need_no_constraint(tmp_path):
+    """A weld of a body to what is rigid with it already: Drake's step would fail."""
+    rim = '<body name="rim"><geom size="0.2"/></body>'
+    more = f'<body name="plate" pos="0 1 1"><joint name="p"/><geom size="0.1"/>{rim}</body>'
+    equality = f'<connect body1="bar" body2="second" anchor="{WIDTH} 0 0"/><weld body1="plate" body2="rim"/>'
+    model = load(parallelogram(tmp_path, equality, more))
+    assert len(model.file_facts.held_points) == 1
+    assert np.all(np.isfinite(dd.step(model, model.default_state, [0.1])))

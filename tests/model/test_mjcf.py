@@ -255,6 +255,8 @@ def test_gravity_that_is_compensated_on_every_body_is_none(tmp_path, each, gravi
     model = load(write(tmp_path, body))
     assert np.linalg.norm(model.contract.gravity) == gravity
     assert ("gravcomp' found in a 'body' tag is currently unsupported" in str(model.notes)) == (gravity > 0)
+    assert ("No gravity" in str(model.notes)) == (gravity == 0)
+    assert "No gravity" not in str(load(write(tmp_path, body), gravity=[0, 0, -1]).notes)
 
 
 def test_gravity_that_the_file_disables_is_none_but_beside_other_robots(tmp_path):
