@@ -25,6 +25,7 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import GradientError, InputError, ModelError, SimulationError
+from drake_diff.model.assembly import OPEN, gap
 from drake_diff.model.contact import deepest_overlap, thinnest_geometry
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
@@ -550,6 +551,8 @@ def motion_checks(
     yield from clearance_checks(plan, motion)
     if model.contract.contact.collision_pairs:
         yield penetration_check(model, motion)
+    if model.file_facts.held_points:
+        yield loop_check(model, motion)
 
 
 def comparison_checks(plan: ReplayPlan, motion: MeasuredMotion, parts: int, *, same: bool = False) -> Iterator[Check]:
@@ -627,6 +630,17 @@ def penetration_check(model: Model, motion: MeasuredMotion) -> Check:
     worst = int(np.argmax(motion.penetration))
     where = f"{name} at {motion.times[worst]:.3g} s"
     return check("penetration", where, motion.penetration[worst], PENETRATION_PART * least, "m")
+
+
+def loop_check(model: Model, motion: MeasuredMotion) -> Check:
+    """How far the points of a loop come apart for a hundredth of the mechanism: Drake's constraints give way to force.
+
+    They do so in proportion to the square of the time step.
+    """
+    gaps = [gap(model, x[: model.nq]) if np.all(np.isfinite(x)) else (np.inf, 1.0) for x in motion.xs]
+    k = int(np.argmax([distance / size for distance, size in gaps]))
+    distance, size = gaps[k]
+    return check("loop", f"at {motion.times[k]:.3g} s", distance, OPEN * size, "m")
 
 
 def energy_check(motion: Rollout) -> Check:

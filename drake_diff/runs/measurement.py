@@ -22,7 +22,7 @@ from drake_diff.model.step import set_state
 from drake_diff.motion.rollout import CONTINUOUS, STEPS, Rollout, drift, smooth_mean
 from drake_diff.optimize.measure import ASKED, INTEGRATION_TOLERANCE
 from drake_diff.optimize.problem.dynamics import units_of
-from drake_diff.optimize.replay import PENETRATION_PART, Replay, energy_tolerance
+from drake_diff.optimize.replay import PENETRATION_PART, Replay, energy_tolerance, loop_check
 from drake_diff.optimize.solution import Solution, Status
 from drake_diff.runs.fields import Event, Failure, Label, Metric, ReplayEvidence, evidence, finite
 
@@ -244,6 +244,9 @@ def _metrics_of_the_replay(
     rests_on_it = judged is None or judged.motion is None or judged.motion is motion
     if motion is not None and rests_on_it and np.all(np.isfinite(motion.constraint_violation)):  # which may take some
         bounds["energy drift"] = energy_tolerance(motion)
+    if motion is not None and solution.problem.has_model and solution.problem.model.file_facts.held_points:
+        loop = loop_check(solution.problem.model, motion)
+        yield measured("loop gap", f"largest distance of points that a loop holds together {here}", loop.value, "m")
     for (name, definition, unit), value in zip(measures, values, strict=True):
         if name == HALF_STEP and solution.problem.motion != STEPS:
             continue  # it has no steps
