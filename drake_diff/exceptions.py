@@ -24,8 +24,11 @@ Example:
 
 import pickle
 from collections.abc import Iterable
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
+
+LISTED = 12  # names of a list that a message writes out
 
 
 class DrakeDiffError(Exception):
@@ -75,11 +78,15 @@ class NonFiniteError(InputError):
 
 
 class UnknownNameError(InputError):
-    """A name that does not exist; the message lists those that do."""
+    """A name that does not exist; the message lists the most similar of those that do, and the best guess."""
 
     def __init__(self, subject: str, *, got: object, known: Iterable[str]):
-        names = ", ".join(sorted(known)) or "(none)"
-        super().__init__(subject, got=repr(got), expected=f"one of {names}")
+        names = sorted(map(str, known))
+        similar = get_close_matches(str(got), names, n=LISTED)
+        listed = names if len(names) <= LISTED else sorted({*similar, *names[: LISTED - len(similar)]})
+        more = f" and {len(names) - len(listed)} more" * (len(names) > len(listed))
+        guess = f"; did you mean {similar[0]!r}?" if similar else ""
+        super().__init__(subject, got=f"{got!r}{guess}", expected=f"one of {', '.join(listed) or '(none)'}{more}")
 
 
 class ModelError(DrakeDiffError):

@@ -1,7 +1,7 @@
 """Run a function in one child process with limits of time and memory: its crash or overrun is reported, not shared.
 
 The child is a fresh Python process; arguments and value travel as JSON. It has the rights of the user who started it:
-see docs/strangers.md for what that does not protect against.
+see docs/verification.md for what that does not protect against.
 """
 
 import faulthandler

@@ -3,12 +3,14 @@
 import importlib
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
 import drake_diff
+from drake_diff.exceptions import UnknownNameError
 
 pytestmark = pytest.mark.solve
 
@@ -121,6 +123,7 @@ def test_threads_that_race_for_names_all_get_them():
     code = """
 import threading
 import drake_diff
+from drake_diff.exceptions import UnknownNameError
 
 names = ["Model", "solve", "audit", "step", "verify", "robustness", "solve", "PD"] * 2
 gate, found = threading.Barrier(len(names)), []
@@ -140,7 +143,33 @@ print(len(found) == len(names) and all(value is getattr(drake_diff, name) for na
 
 
 def test_a_name_that_is_none_is_refused():
-    with pytest.raises(AttributeError, match=r"No drake_diff attribute stepp"):
+    with pytest.raises(AttributeError, match="no attribute stepp; did you mean drake_diff.step"):
         drake_diff.stepp  # noqa: B018
     with pytest.raises(ImportError, match="cannot import name 'stepp'"):
         exec("from drake_diff import stepp")
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "meant"),
+    [
+        (drake_diff, "MPC", "drake_diff.loop.MPC"),
+        (drake_diff, "Quadraticcost", "drake_diff.QuadraticCost"),
+        (drake_diff.optimize, "Periodc", "drake_diff.optimize.Periodic"),
+    ],
+)
+def test_a_wrong_attribute_names_the_one_that_is_meant(module, name, meant):
+    with pytest.raises(AttributeError, match=f"has no attribute {name}; did you mean {meant}?"):
+        getattr(module, name)
+    assert getattr(module, "zzzz", None) is None
+
+
+def test_the_version_is_that_of_the_installed_package():
+    assert drake_diff.__version__ == version("drake_diff")
+    assert not hasattr(drake_diff.loop, "__version__")
+
+
+def test_a_wrong_name_among_many_is_answered_with_similar_ones():
+    error = UnknownNameError("joint", got="joint_17", known=[f"joint{i}" for i in range(100)])
+    assert str(error).count("joint") < 20
+    assert "and 88 more, got 'joint_17'; did you mean 'joint17'?" in str(error)
+    assert str(UnknownNameError("joint", got=3, known=[])) == "joint: expected one of (none), got 3"
