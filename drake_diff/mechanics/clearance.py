@@ -12,7 +12,7 @@ point and a segment that are apart, between parallel segments, and on the planes
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.autodiffutils import ExtractValue
@@ -254,14 +254,15 @@ class OfShapes(Clearance):
         return chain_rows(values[0], slopes[0], x)
 
     def values(self, xs: Array) -> Array:
-        return self._blended(xs, np.minimum.reduceat(self.capsules.values(xs), self.first, axis=1))[0]
+        return self._blended(xs, np.minimum.reduceat(self.capsules.values(xs), self.first, axis=1)).values
 
     def linearize(self, xs: Array) -> tuple[Array, Array]:
         of_capsules, slopes = self.capsules.linearize(xs)
         ends = [*self.first[1:], of_capsules.shape[1]]
         nearest = [a + np.argmin(of_capsules[:, a:b], axis=1) for a, b in zip(self.first, ends, strict=True)]
         rows = np.arange(len(xs))[:, None], np.column_stack(nearest)
-        values, by_capsules, by_shapes, points, way = self._blended(xs, of_capsules[rows])
+        points, way = np.zeros((2, *rows[1].shape, 3)), np.zeros((*rows[1].shape, 3))
+        values, by_capsules, by_shapes = self._blended(xs, of_capsules[rows], points, way)
         q, total = xs[:, : self.model.nq], slopes[rows] * by_capsules[..., None]
         frames = self.kinematics(q)
         for side, nearest_points, sign in zip(self.sides, points, (1.0, -1.0), strict=True):
@@ -279,29 +280,41 @@ class OfShapes(Clearance):
             )
         return far
 
-    def _blended(self, xs: Array, least: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """The rows (K, m), of capsules with the distances `least` (K, m), and what their slopes are made of.
+    def _blended(self, xs: Array, least: Array, points: Array | None = None, way: Array | None = None) -> "_Blended":
+        """The rows (K, m) at xs (K, nx), of capsules with the distances `least` (K, m), and what slopes are made of.
 
-        The derivatives (K, m) of a row by the distances of capsules and of shapes, the shapes' nearest points
-        (2, K, m, 3) in the world, and the way (K, m, 3) in which the distance grows as the first of them moves.
+        Fills, where they are given, the shapes' nearest `points` (2, K, m, 3) in the world, and the `way` (K, m, 3) in
+        which the distance grows as the first of them moves.
         """
         share = np.clip((self.far - least) / (self.far - self.near), 0.0, 1.0) * self.exact
         weight, slope = share**2 * (3 - 2 * share), -6 * share * (1 - share) / (self.far - self.near)
-        distances, points, way = least.copy(), np.zeros((2, *least.shape, 3)), np.zeros((*least.shape, 3))
-        twin = self.shapes.double
+        distances, twin = least.copy(), self.shapes.double
         for k in np.flatnonzero(np.any(weight > 0, axis=1) & np.all(np.isfinite(xs), axis=1)):
             twin.set_state(xs[k])
             query = twin.plant.get_geometry_query_input_port().Eval(twin.context)
             for i in np.flatnonzero(weight[k] > 0):
                 a, b = (solid.geometry for solid in self.pairs[i])
                 pair = query.ComputeSignedDistancePairClosestPoints(a, b)
-                points[:, k, i] = query.GetPoseInWorld(a) @ pair.p_ACa, query.GetPoseInWorld(b) @ pair.p_BCb
-                distances[k, i], way[k, i] = pair.distance, pair.nhat_BA_W
+                distances[k, i] = pair.distance
+                if points is None or way is None:
+                    continue
+                in_a, in_b = query.GetPoseInWorld(a), query.GetPoseInWorld(b)
+                points[:, k, i] = in_a.multiply(pair.p_ACa), in_b.multiply(pair.p_BCb)
+                way[k, i] = pair.nhat_BA_W
                 if not np.all(np.isfinite(way[k, i])):  # of shapes that just touch
-                    way[k, i] = query.GetPoseInWorld(a).translation() - query.GetPoseInWorld(b).translation()
+                    way[k, i] = in_a.translation() - in_b.translation()
                     way[k, i] /= length(way[k, i])
-        values = least + weight * (distances - least)
-        return values, 1 - weight + slope * (distances - least), weight, points, way
+        return _Blended(
+            least + weight * (distances - least), 1 - weight + slope * (distances - least), by_shapes=weight
+        )
+
+
+class _Blended(NamedTuple):
+    """Distances (K, m), and their derivatives by those of capsules and of shapes."""
+
+    values: Array
+    by_capsules: Array
+    by_shapes: Array
 
 
 def from_ball(
