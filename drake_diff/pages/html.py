@@ -263,9 +263,27 @@ def _environment() -> "Environment":
     )
     # tojson writes <, >, & and ' as \u003c and so on: no text can end the script element that it is in.
     environment.policies["json.dumps_kwargs"] = {"sort_keys": True, "allow_nan": False, "separators": (",", ":")}
+    environment.filters["worst_first"] = worst_first
     environment.filters.update(short=short_number, words=in_words, phrase=phrase, unit=unit_of, shell=shlex.join)
     environment.globals["asset"] = asset
     return environment
+
+
+def worst_first(measures: list[Any]) -> list[Any]:
+    """Measures of a record: failed, undecided and passed ones, each from the largest excess down, and then the rest."""
+
+    def used(measure: Any) -> float:
+        value, bound = measure["value"], measure["tolerance"]
+        if value is None:
+            return math.inf
+        used_up = bound - value if measure["direction"] == "at_least" else value - bound
+        return float(used_up / abs(bound)) if bound else float(used_up)
+
+    decided = [m for m in measures if m["verdict"] != "info"]
+    order = ("fail", "undecided", "pass")
+    return sorted(decided, key=lambda m: (order.index(m["verdict"]), -used(m))) + [
+        m for m in measures if m["verdict"] == "info"
+    ]
 
 
 def phrase(key: str) -> str:

@@ -12,7 +12,7 @@ from helpers.table import slow_after
 
 import drake_diff as dd
 from drake_diff.exceptions import ArtifactError, UnknownNameError
-from drake_diff.pages.html import page_data
+from drake_diff.pages.html import page_data, worst_first
 from drake_diff.pages.scene import ARROW_PART, scene_of
 from drake_diff.runs import measure
 from drake_diff.runs.page import plots_of
@@ -234,3 +234,20 @@ def test_the_live_view_is_at_loopback_only(runs):
     assert meshcat.web_url().startswith("http://127.0.0.1:")
     with urllib.request.urlopen(meshcat.web_url(), timeout=10) as page:
         assert b"meshcat" in page.read()
+
+
+def test_measures_are_listed_worst_first():
+    rows = [
+        {"name": name, "verdict": verdict, "value": value, "tolerance": bound, "direction": direction}
+        for name, verdict, value, bound, direction in (
+            ("cost", "info", 3.0, None, "info"),
+            ("near", "pass", 0.9, 1.0, "at_most"),
+            ("far", "pass", 0.1, 1.0, "at_most"),
+            ("clearance", "pass", 2.0, 1.0, "at_least"),
+            ("twice", "fail", 2.0, 1.0, "at_most"),
+            ("lost", "fail", None, 1.0, "at_most"),
+            ("unknown", "undecided", 0.5, 0.0, "at_most"),
+        )
+    ]
+    names = [row["name"] for row in worst_first(rows)]
+    assert names == ["lost", "twice", "unknown", "near", "far", "clearance", "cost"]
