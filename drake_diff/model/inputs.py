@@ -164,8 +164,8 @@ class Inputs:
 
     @property
     def one_sided(self) -> tuple[Array, Array]:
-        """Lower and upper limits (nu,) of motors whose sides differ, which steps do not keep; infinite of others."""
-        differ = (self.actuator >= 0) & (self.lower != -self.upper) & ~self.commanded
+        """Lower and upper limits (nu,) of efforts whose sides differ, which steps do not keep; infinite of others."""
+        differ = (self.lower != -self.upper) & ~self.commanded
         return np.where(differ, self.lower, -np.inf), np.where(differ, self.upper, np.inf)
 
     def of_actuators(self, rows: Any) -> Array:

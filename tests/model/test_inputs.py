@@ -112,6 +112,15 @@ def test_a_quadrotor_steps_and_moves_by_newton_and_euler(seed):
     assert dd.certify(model, x, u).verdict == "agree"
 
 
+def test_bounds_do_not_let_a_rotor_pull():
+    model = quadrotor()
+    tasks = {"x0": model.default_state, "num_steps": 3, "running_cost": dd.QuadraticCost(R=np.eye(4))}
+    within = dd.Problem(model, bounds=dd.Bounds(u_lower=[1] * 4, u_upper=[5] * 4), **tasks)
+    assert within.bounds.u_lower.tolist() == [1] * 4
+    with pytest.raises(InputError, match=r"bounds, rotor_0: expected within \[0, 6\], got -1"):
+        dd.Problem(model, bounds=dd.Bounds(u_lower=[-1] * 4), **tasks)
+
+
 def test_a_false_derivative_by_a_rotor_is_refuted():
     model, (x, u) = quadrotor(), random_point(0)
     d = dd.differentiate_step(model, x, u)
