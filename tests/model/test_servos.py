@@ -2,6 +2,7 @@
 
 import pickle
 import warnings
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -311,9 +312,22 @@ def hand():
 )
 def test_a_plan_for_servos_is_followed_in_mujoco(tmp_path, robot, monkeypatch):
     """Its inputs, held as MuJoCo's `ctrl` over each step, lead to within 0.03 rad of its states all along."""
-    monkeypatch.setattr("drake_diff.planning.planner.BUDGET", 600.0)  # [s] enough for a slow machine
     path = tmp_path / "robot.xml"
     path.write_text(robot())
+    check_followed(path, tmp_path, monkeypatch)
+
+
+@pytest.mark.long
+def test_a_plan_for_a_hand_of_mjx_is_followed_in_mujoco(tmp_path, monkeypatch):
+    """The Shadow Hand of MJX's own tests: 24 servos, with meshes."""
+    path = Path(mujoco.__file__).parent / "mjx/test_data/shadow_hand/right_hand.xml"
+    if not path.exists():
+        pytest.skip("mujoco-mjx is not installed")
+    check_followed(path, tmp_path, monkeypatch)
+
+
+def check_followed(path, tmp_path, monkeypatch):
+    monkeypatch.setattr("drake_diff.planning.planner.BUDGET", 600.0)  # [s] enough for a slow machine
     done = plan(path, out=tmp_path / "run", seed=1)
     assert done.success, repr(done)
     solution, model = done.solution, done.model
