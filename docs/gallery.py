@@ -147,8 +147,8 @@ def page() -> str:
 
 INTRO = """# Gallery
 
-Each picture is a moment of a run that its script made, and that `drake-diff verify` made again with the same numbers. A
-script is one short file. A picture opens the report, where this site was built with the runs.
+Each picture shows a run of a short script. `drake-diff verify` reproduced every run. If this site was built with the
+runs, a picture opens the report.
 
 ```sh
 drake-diff run examples/cart_pole_swing_up.py

@@ -11,21 +11,6 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "drake_diff"
 NAME = re.compile(r"^from \.([\w.]+) import (\w+) as \w+$", re.MULTILINE)
 NOTEBOOKS, GALLERY = ROOT / "docs/notebooks", ROOT / "docs/gallery"
-NEXT = {  # of pages of figures, which a benchmark writes: what a reader does with them
-    "impacts.md": "Use this gradient where something hits something: [Choosing a gradient](gradients.md).",
-    "mpc_realtime.md": "Put your own model in the first block of [Model predictive control](mpc.md), and "
-    "print `mpc.latencies`.",
-    "speed.md": "Print `.method` of `dd.differentiate_step` on your own robot: "
-    "[Derivatives](derivatives.md) says which is fast. If a whole solve is slow, [this "
-    "page](questions/slow.md) finds out which part.",
-    "tasks_solved.md": "Find the task that is nearest to yours, and write it as in [Tasks](tasks.md). If it"
-    " is not solved, the message says why: [what each status asks "
-    "for](methods.md#what-the-answer-means).",
-    "trust.md": "Ask for the certificate of your own gradient: [Choosing a gradient](gradients.md). It says"
-    " how small an error it would have noticed on your robot, which no count of others can.",
-    "zoo.md": "Run `drake-diff plan ROBOT` on your own file. If there is no plan, its output says why. "
-    "[Your own robot](models.md) has the argument that mends it.",
-}
 TOP = {"changelog.md": "CHANGELOG.md", "contributing.md": "CONTRIBUTING.md"}
 
 
@@ -40,7 +25,7 @@ def names_of(package: str) -> dict[str, str]:
 def reference() -> dict[str, str]:
     """Each page of the reference with its text: one for the names of `dd`, one for each package that has names."""
     root = names_of("")
-    pages = {"reference/index.md": _page("drake_diff", "Everything that `import drake_diff as dd` has.", "dd", root)}
+    pages = {}
     for stub in sorted(PACKAGE.glob("*/__init__.pyi")):
         package = stub.parent.name
         names = {name: where for name, where in names_of(package).items() if root.get(name) != where}
@@ -48,7 +33,10 @@ def reference() -> dict[str, str]:
             first = (stub.parent / "__init__.py").read_text().split('"""')[1].split("\n")[0]
             pages[f"reference/{package}.md"] = _page(f"dd.{package}", first, f"dd.{package}", names)
     errors = "# dd.exceptions\n\n::: drake_diff.exceptions\n    options: {show_root_heading: false}\n"
-    return {**pages, "reference/exceptions.md": errors}
+    pages["reference/exceptions.md"] = errors
+    packages = ", ".join(f"[`dd.{Path(page).stem}`]({Path(page).name})" for page in pages)
+    intro = f"The names of `import drake_diff as dd`. Packages with further names: {packages}."
+    return {"reference/index.md": _page("drake_diff", intro, "dd", root), **pages}
 
 
 def _page(title: str, intro: str, prefix: str, names: dict[str, str]) -> str:
@@ -86,13 +74,12 @@ def _to_pages(text: str) -> str:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Link notebooks and reports to pages, and end a page of figures with what to do next."""
+    """Link notebooks to their pages, and pictures of the gallery to their reports."""
     if page.file.src_uri == "notebooks/index.md":
         return _to_pages(markdown)
     if page.file.src_uri == "gallery/index.md":
         return with_reports(markdown, GALLERY)
-    step = NEXT.get(page.file.src_uri)
-    return f"{markdown}\n\n## What would I do next?\n\n{step}\n" if step else markdown
+    return markdown
 
 
 def with_reports(text: str, gallery: Path) -> str:

@@ -26,6 +26,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 
 import numpy as np
 from helpers.models import MODELS, strike
+from pages import marked, write_section
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import Simulator
@@ -333,14 +334,11 @@ def measure(name, seed, count, clock, *, bare=False):
     return found, unsolved
 
 
-HEAD = """# MPC in real time, under blows
-
-Three tasks by `dd.loop.MPC` with default options: one step of sequential quadratic programming a tick. Written by
-`python tests/benchmarks/mpc_realtime.py --markdown docs/mpc_realtime.md`, seed {seed}, {count} runs each: problems
-drawn by seed, and three blows in each run. The plant is that of pydrake alone in steps of 1 ms, under the old input
-while the controller computes. Limits are judged at each of these steps by the referee's own formulas. They are
-those of the task; the problem plans with a part of them (sway and tilt 70 and 80 %, speeds 75 %, 2 cm beside the ball).
-Latencies are {clock} on the machine that wrote this page, with other work on it.
+HEAD = """Three tasks under three random blows in each run, controlled by `dd.loop.MPC` with default options. The plant
+is pydrake's in steps of 1 ms, with the old input while the controller computes; the referee judges the task's limits
+at each step. `python tests/benchmarks/mpc_realtime.py --markdown docs/measured.md`, seed {seed}, {count} runs each,
+at commit {commit}, {date}. The problem plans with a part of the limits (sway and tilt 70 and 80 %, speeds 75 %, 2 cm
+beside the ball). Latencies are {clock}, on a machine with other work.
 
 | Task | Ticks in time | Latency [ms]: median, 99 %, largest | Limits kept | Gates passed | Goal reached | "ok" |
 |---|---|---|---|---|---|---|
@@ -361,26 +359,28 @@ def row(name, runs, unsolved):
     )
 
 
+DETAILS = """| Task | Largest excess over a limit, or distance from a gate | Largest miss of the goal [m] | \
+Ticks with a violated limit, with the last plan continued | Wall clock [ms]: median, 99 %, largest; in time | \
+Without limits in the problem |
+|---|---|---|---|---|---|
+"""
+
+
 def details(name, runs, bare):
-    """What there is to say of a task beside its row."""
-    worst = {k: max(r.excess[k] for r in runs) for k in runs[0].excess}
+    """The task's row of the second table."""
     followed = sum("followed further" in s for r in runs for s in r.statuses)
     gives = sum("gives way" in s for r in runs for s in r.statuses)
     wall = np.concatenate([r.wall for r in runs])
-    excess = ", ".join(f"{k} {v:.3g}" for k, v in worst.items())
-    said = [
-        f"largest excess over a limit, or distance from a gate: {excess}; largest miss of the goal "
-        f"{max(r.ended for r in runs):.3g} m",
-        f"a limit of the problem gives way in {gives} ticks, in {followed} the last plan was followed further",
-        "by the wall's clock "
-        + ", ".join(f"{v:.1f}" for v in 1e3 * np.percentile(wall, [50, 99, 100]))
-        + f" ms, {int(np.sum(wall <= runs[0].period))} of {len(wall)} ticks in time",
-    ]
-    if bare:
-        excess = ", ".join(f"{k} {max(r.excess[k] for r in bare):.3g}" for k in bare[0].excess)
-        said.append(f"without these limits in the problem {sum(r.kept for r in bare)} of {len(bare)} runs keep them, "
-                    f"largest excess {excess}")  # fmt: skip
-    return f"- {name}: " + ";\n  ".join(said) + "."
+    times = ", ".join(f"{v:.1f}" for v in 1e3 * np.percentile(wall, [50, 99, 100]))
+    without = f"{sum(r.kept for r in bare)} of {len(bare)} runs keep them: {_excess(bare)}" if bare else "-"
+    return (
+        f"| {name} | {_excess(runs)} | {max(r.ended for r in runs):.3g} | {gives}, {followed} | "
+        f"{times}; {int(np.sum(wall <= runs[0].period))} of {len(wall)} | {without} |"
+    )
+
+
+def _excess(runs):
+    return ", ".join(f"{k} {max(r.excess[k] for r in runs):.3g}" for k in runs[0].excess)
 
 
 def main():
@@ -406,8 +406,8 @@ def main():
         held &= all(r.kept and r.passed and r.arrived and np.all(r.taken <= r.period) for r in runs)
     if options.markdown:
         clocks = {"cpu": "those of the controller's thread", "wall": "those of the wall's clock"}
-        head = HEAD.format(seed=options.seed, count=options.count, clock=clocks[options.clock])
-        options.markdown.write_text(head + "\n".join(rows) + "\n\n" + "\n".join(more) + "\n")
+        head = HEAD.format(seed=options.seed, count=options.count, clock=clocks[options.clock], **marked())
+        write_section(options.markdown, "mpc_realtime", head + "\n".join(rows) + "\n\n" + DETAILS + "\n".join(more))
     return 0 if held else 1
 
 

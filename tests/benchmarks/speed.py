@@ -1,10 +1,10 @@
-"""What derivatives cost beside Drake's own step of the same motion: the table of docs/speed.md.
+"""What derivatives cost beside Drake's own step of the same motion: the table of docs/measured.md.
 
-    python tests/benchmarks/speed.py [--quick] [--write docs/speed.md]
+    python tests/benchmarks/speed.py [--quick] [--write docs/measured.md]
 
 A Panda's seven joints that move freely, and a Go2 that stands on its feet at 5, 20 and 50 ms. Processor time of one
 thread; what is compared takes turns, round by round, and a figure is the median of the rounds' ratios. --write puts
-the table into a file, between <!-- speed --> and <!-- end of speed -->.
+the table into the section `speed` of the page.
 """
 
 import argparse
@@ -21,6 +21,7 @@ from pathlib import Path
 import _one_thread  # noqa: F401 (before NumPy)
 import mujoco
 import numpy as np
+from pages import write_section
 from panda_arm import panda_arm, state
 from pydrake.multibody.tree import BodyIndex
 
@@ -39,7 +40,6 @@ from drake_diff.optimize.ilqr.riccati import LinearQuadratic, solve_riccati
 KNOTS, ROUNDS, QUICK_ROUNDS = 50, 15, 5
 LEG = (0.0, 0.8, -1.6)  # [rad] hip, thigh and calf of the standing Go2
 GAINS = {0.005: (40.0, 1.0), 0.02: (40.0, 0.5), 0.05: (20.0, 0.2)}  # that hold it up
-BEGIN, END = "<!-- speed -->", "<!-- end of speed -->"
 Motion = tuple[dd.Model, np.ndarray, np.ndarray]
 Call = tuple[Callable[[], object], int]  # and how many steps it is of
 
@@ -176,25 +176,16 @@ def table(quick: bool) -> str:
     return "\n".join([*lines, "", f"Times Drake's own step of the same motion, or `rollout`; {machine}."])
 
 
-def write(path: Path, text: str) -> None:
-    """Put it between the two marks."""
-    before, _, rest = path.read_text().partition(BEGIN)
-    _, mark, after = rest.partition(END)
-    if not mark:
-        raise SystemExit(f"{path} has no {BEGIN} and {END}")
-    path.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="fewer rounds, no 10,000 steps")
-    parser.add_argument("--write", type=Path, help="the file that has the table")
+    parser.add_argument("--write", type=Path, help="the page that has the section")
     given = parser.parse_args()
     warnings.simplefilter("ignore", ModelWarning)
     text = table(given.quick)
     print(text)
     if given.write:
-        write(given.write, text)
+        write_section(given.write, "speed", text)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@
 The tasks are those of `task_cases.py`, each with --count random starts and constants by --seed, and 60 s of one core
 for a solve. One that says converged in that time is judged by `referee.py`, which has pydrake alone; a cost is compared
 with the closed form where there is one. What is in --out already is not run again, so that a run that was ended goes
-on; --markdown writes docs/tasks_solved.md from it, and from --peers. Seconds are of processor time.
+on; --markdown writes its section of docs/measured.md from it, and from --peers. Seconds are of processor time.
 
 --beside times the solves in turns with a peer's, see `task_peers.py`: CasADi by hand, Drake's DirectCollocation with
 IPOPT or SNOPT, Crocoddyl and acados, the last two by the --python of an environment that has them.
@@ -18,7 +18,6 @@ import fnmatch
 import json
 import logging
 import statistics
-import subprocess
 import sys
 import time
 import warnings
@@ -31,7 +30,7 @@ import _one_thread  # noqa: F401 (before NumPy)
 sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 
 import numpy as np
-from pages import write_page
+from pages import marked, write_section
 from rates import success_rate
 from referee import judge, judge_phases
 from task_cases import FAMILIES, NOT_EXPRESSED, Case
@@ -120,13 +119,13 @@ def told(rows: dict[str, Row], only: str) -> list[str]:
     whole = sum(sum(found) / len(found) for found in own.values()) / max(len(names) + len(left), 1)
     seconds = sorted(row["seconds"] for row in expressed.values()) or [0.0]
     return [
-        f"{len(names)} tasks that can be said, {len(expressed)} solves: {solved} solved, {100 * share:.1f} % "
-        f"({100 * rate.lower:.1f} to {100 * rate.upper:.1f} %), asked {100 * AIM:g} %"
+        f"{len(names)} tasks, {len(expressed)} solves: {solved} solved, {100 * share:.1f} % "
+        f"({100 * rate.lower:.1f} to {100 * rate.upper:.1f} %), target {100 * AIM:g} %"
         + ("" if share >= AIM else ": MISSED"),
-        f"false claims: {false} of {claims}, asked 0" + (": MISSED" if false else ""),
+        f"false claims: {false} of {claims}, target 0" + (": MISSED" if false else ""),
         f"tasks solved from every start: {every} of {len(names)}",
-        f"with {len(left)} tasks that cannot be said, which count as not solved: {100 * whole:.1f} % of "
-        f"{len(names) + len(left)}, each task counting alike",
+        f"with {len(left)} tasks that a Problem cannot state, counted as not solved: {100 * whole:.1f} % of "
+        f"{len(names) + len(left)}, with equal weight of each task",
         f"seconds of one core per solve: median {statistics.median(seconds):.2f}, "
         f"nine of ten within {seconds[int(0.9 * (len(seconds) - 1))]:.1f}, longest {seconds[-1]:.1f}",
     ]
@@ -149,7 +148,7 @@ def table(rows: dict[str, Row], only: str) -> list[str]:
         )
     for name, (family, why) in NOT_EXPRESSED.items():
         if chosen(name, only):
-            lines.append(f"| {name.replace('_', ' ')} | {family} | cannot be said | 0 | 0 | - | {why} |")
+            lines.append(f"| {name.replace('_', ' ')} | {family} | cannot be stated | 0 | 0 | - | {why} |")
     return lines
 
 
@@ -185,14 +184,11 @@ def ran(rows: list[Row]) -> str:
 
 
 def markdown(rows: dict[str, Row], peers: list[Row], seed: int, only: str) -> str:
-    """docs/tasks_solved.md."""
-    text = f"""# What `dd.solve(problem)` solves, defaults only
-
-Tasks as a practitioner asks them, with random starts and constants, no method and no option but a limit on time. A
-solve counts where it says converged within 60 s of one core and a referee that has pydrake alone agrees. Written by
-`python tests/benchmarks/tasks.py --markdown docs/tasks_solved.md`, seed {seed}, {ran(list(rows.values()))}. Times
-depend on the machine. Tasks with fewer starts are slower ones in a run that was ended. Attempts are the most first
-guesses and methods that a solve took.
+    """The section of docs/measured.md."""
+    text = f"""Tasks with random starts and constants, solved by `dd.solve(problem)` with a time limit as the only
+option. A solve counts if it converges within 60 s of one core and a referee of pydrake alone agrees.
+`python tests/benchmarks/tasks.py --markdown docs/measured.md`, seed {seed}, at {ran(list(rows.values()))}. Tasks with
+fewer starts belong to a run that was ended. Attempts are the most first guesses and methods that a solve took.
 
 """
     lines = [*(f"- {line}" for line in told(rows, only)), "", *families(rows), "", *table(rows, only), *optima(rows)]
@@ -201,26 +197,14 @@ guesses and methods that a solve took.
         import task_peers
 
         text += f"""
-## Beside other solvers
-
-The same tasks with the same constants, intervals and first guess, run in turns on one core, {ran(peers)}. Seconds are
-of processor time, and ratios below 1 are in our favour: the median, and the quartiles in brackets, where both say
-solved. Ours is all of `dd.solve`, with its certificates and the measures of its plan, or its search alone; a peer's is
-building the problem and solving it, or its solver alone. A peer's plan is judged by the same referee, which knows of no
-certificate: one that is false leaves limits by more than a thousandth of their range or misses the goal. Cheaper are
-plans of more than 1 % less cost, another optimum. How to run it, and what peers are told, is in
-[benchmarks](benchmarks.md).
+Beside other solvers: the same tasks, constants, intervals and first guess, in turns on one core, at {ran(peers)}.
+Ratios of processor time (median and quartiles, where both solve) below 1 favour `dd.solve`. Its time is the whole solve
+or its search; a peer's is building and solving, or its solver. A false plan leaves limits by more than a thousandth of
+their range or misses the goal. A cheaper plan costs at least 1 % less.
 
 """
         text += "\n".join(task_peers.told(peers)) + "\n"
     return text
-
-
-def marked() -> Row:
-    """What a row is marked with: the commit and the day."""
-    asked = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
-    found = subprocess.run(asked, capture_output=True, text=True, check=False)
-    return {"commit": found.stdout.strip() or "not known", "date": time.strftime("%Y-%m-%d", time.gmtime())}
 
 
 def compared(given: argparse.Namespace, names: list[str]) -> None:
@@ -249,7 +233,7 @@ def main() -> None:
     help_wall = f"[s] of a solve on the wall, more than {TIME_LIMIT:g} where the machine is busy with other work"
     parser.add_argument("--wall", type=float, default=TIME_LIMIT, help=help_wall)
     parser.add_argument("--out", type=Path, help="a JSON file; what is in it already is not run again")
-    parser.add_argument("--markdown", type=Path, help="write the table there")
+    parser.add_argument("--markdown", type=Path, help="write the section of that page")
     parser.add_argument("--beside", help="a peer of task_peers.PEERS to time the solves beside, instead")
     parser.add_argument("--python", default=sys.executable, help="of the peer's environment, with --beside")
     help_peers = "a JSON file of --beside, which adds to it; --markdown writes it into the page"
@@ -279,7 +263,7 @@ def main() -> None:
     print("\n".join([*told(shown, given.only), *optima(shown)]))
     if given.markdown:
         peers = json.loads(given.peers.read_text()) if given.peers else []
-        write_page(given.markdown, markdown(shown, peers, given.seed, given.only))
+        write_section(given.markdown, "tasks_solved", markdown(shown, peers, given.seed, given.only))
 
 
 if __name__ == "__main__":

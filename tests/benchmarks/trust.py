@@ -4,7 +4,7 @@
     python tests/benchmarks/trust.py [--only certificate,verify] [--seed 0] [--count N] [--out FILE.json]
 
 Each part plants errors, or builds fresh random cases, by seed, and counts what the toolkit says of them. --count is the
-number of cases of a part; without it each part takes as many as its figures in docs/trust.md.
+number of cases of a part; without it each part takes as many as its figures in docs/measured.md.
 """
 
 import argparse

@@ -8,7 +8,8 @@ The files: all URDFs of example-robot-data, the models that come with Drake, MuJ
 wheels (of dm_control its suite). Each runs in a process of its own with 60 s of one core (the verification included)
 and 8 GiB of memory. What counts is what Drake's own parser takes and can move, by Drake's word, not by ours, and what
 drake_diff reads where Drake does not. Single bodies without a joint (boxes, walls) count apart, drones do not. What is
-in --out already is not run again, so that a run that was ended goes on; --markdown writes docs/zoo.md from it.
+in --out already is not run again, so that a run that was ended goes on; --markdown writes its section
+of docs/measured.md from it.
 """
 
 import argparse
@@ -27,7 +28,7 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-from pages import write_page
+from pages import marked, write_section
 
 ROOT = Path(__file__).parents[2]
 CPU_LIMIT, MEMORY = 60, 8 * 2**30  # [s], [bytes]
@@ -166,11 +167,11 @@ def told(rows: dict[str, dict[str, object]]) -> list[str]:
     lines = [
         f"{len(rows)} files: {number['robot']} robots; {number['thing']} single bodies without a joint; "
         f"{number['still']} in which nothing can move; {number['refused']} that neither Drake nor drake_diff reads",
-        f"robots with a verified plan: {len(good)} of {len(taken)}, {100 * share:.1f} %, asked {100 * AIM:g} %"
+        f"robots with a verified plan: {len(good)} of {len(taken)}, {100 * share:.1f} %, target {100 * AIM:g} %"
         + ("" if share >= AIM else ": MISSED"),
-        f"of these plans {sum(bool(r['stands']) for r in good)} are of robots on their feet, "
-        f"{sum(bool(r['flies']) for r in good)} of ones that fly, {sum(bool(r['held']) for r in good)} of ones whose "
-        "floating base was fixed to the world",
+        f"of these robots {sum(bool(r['stands']) for r in good)} stand on their feet, "
+        f"{sum(bool(r['flies']) for r in good)} fly, and {sum(bool(r['held']) for r in good)} have a floating base "
+        "that was fixed to the world",
         f"single bodies with a verified plan: {sum(bool(r['verified']) for r in things)} of {len(things)}",
         f"above {CPU_LIMIT} s of one core: {sum('took more than' in str(r['why']) for r in rows.values())}; "
         f"tracebacks: {sum(bool(r['traceback']) for r in rows.values())}",
@@ -184,12 +185,14 @@ def told(rows: dict[str, dict[str, object]]) -> list[str]:
 
 
 def markdown(rows: dict[str, dict[str, object]], seed: int) -> str:
-    """docs/zoo.md."""
+    """The section of docs/measured.md."""
     begin = told(rows)
-    text = ["# The zoo: every robot file, first try", ""]
-    text += ["Each file with `drake-diff plan FILE`, default arguments, 60 s of one core, the verification included."]
-    text += ["Written by `python tests/benchmarks/zoo.py --markdown docs/zoo.md`,", f"seed {seed}, "]
-    text[-1] += f"{platform.python_implementation()} {platform.python_version()}. Times depend on the machine."
+    python = f"{platform.python_implementation()} {platform.python_version()}"
+    mark = "at commit {commit}, {date}".format(**marked())
+    text = [
+        "Every robot file of the sources below, planned with default arguments and 60 s of one core, with verification."
+    ]
+    text += [f"`python tests/benchmarks/zoo.py --markdown docs/measured.md`, seed {seed}, {python}, {mark}."]
     text += ["", *(f"- {line}" for line in begin), ""]
     text += ["| File | Verified | Base | CPU [s] | Repairs, or why not |", "|---|---|---|---|---|"]
     for name, row in rows.items():
@@ -207,7 +210,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--wheels", type=Path, help="a folder with wheels of dm_control and underactuated")
     parser.add_argument("--out", type=Path, help="a JSON file; what is in it already is not run again")
-    parser.add_argument("--markdown", type=Path, help="write the table there")
+    parser.add_argument("--markdown", type=Path, help="write the section of that page")
     given = parser.parse_args()
     rows: dict[str, dict[str, object]] = {}
     if given.out and given.out.is_file():
@@ -235,7 +238,7 @@ def main() -> None:
     shown = {name: row for name, row in rows.items() if fnmatch.fnmatch(name, given.only)}
     print("\n".join(told(shown)))
     if given.markdown:
-        write_page(given.markdown, markdown(shown, given.seed))
+        write_section(given.markdown, "zoo", markdown(shown, given.seed))
 
 
 if __name__ == "__main__":
