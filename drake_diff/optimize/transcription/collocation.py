@@ -561,9 +561,12 @@ class Transcription:
                 break
             if report is not None:
                 report.say(f"{reason} with {count} intervals: refined to {sum(len(mesh) - 1 for mesh in meshes)}")
-            # What goes through an obstacle is no place to go on from.
-            again = [b.on(m, t.scheme) for b, m, t in zip(starts, meshes, self.tasks, strict=True)] if entered else None
-            last, motion = motion, self._solve_on(again or _from(motion, meshes), _left(limits, start), report)
+            # What goes through an obstacle is no place to go on from, and what is near one may be none either.
+            first = [b.on(m, t.scheme) for b, m, t in zip(starts, meshes, self.tasks, strict=True)]
+            last, near_one = motion, any(np.any(short > 0) for short in lacking) and not entered
+            motion = self._solve_on(first if entered else _from(last, meshes), _left(limits, start), report)
+            if near_one and motion.result.outcome is Outcome.INFEASIBLE:
+                motion = self._solve_on(first, _left(limits, start), report)
             if motion.result.outcome not in FOUND and not entered:
                 motion = kept(last, motion)
                 break
@@ -592,7 +595,7 @@ class Transcription:
             return None
         if report is not None:
             counts = [sum(len(mesh) - 1 for mesh in grids) for grids in ([p.mesh for p in motion.phases], finer)]
-            report.say(f"what is found does not hold with {counts[0]} intervals: refined to {counts[1]}")
+            report.say(f"the motion does not pass its checks with {counts[0]} intervals: refined to {counts[1]}")
         return self._solve_on(_from(motion, finer), limits, report)
 
     def _solve_on(self, starts: Sequence[Initial], limits: Limits, report: Report | None) -> Transcribed:
@@ -680,7 +683,7 @@ def kept(last: Transcribed, failed: Transcribed) -> Transcribed:
     if failed.result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
         return replace(last, result=replace(failed.result, z=last.result.z))
     failure = f"on {failed.count} intervals no motion was found ({failed.result.message})"
-    note = f"{failure}: that on {last.count} is kept"
+    note = f"{failure}: the motion on {last.count} is kept"
     return replace(last, result=replace(last.result, note="; ".join(filter(None, (last.result.note, note)))))
 
 
