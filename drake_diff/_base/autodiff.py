@@ -211,7 +211,7 @@ class TracedArray(ArrayBox):  # type: ignore[misc]  # autograd has no types
         return self
 
     def _refuse(self, *_: Any) -> NoReturn:
-        raise UntraceableError("an assignment to what is differentiated")
+        raise UntraceableError("an assignment into a differentiated array")
 
     __setitem__ = __iadd__ = __isub__ = __imul__ = __itruediv__ = __ipow__ = __imatmul__ = _refuse
 
@@ -231,7 +231,7 @@ def traced_gradient(f: Callable[..., Any], arrays: Sequence[Array]) -> tuple[flo
         if isinstance(result, np.ndarray):  # of one traced number
             result = result.item()
         if not isinstance(result, TracedArray):
-            raise UntraceableError("the result does not depend on what is differentiated")
+            raise UntraceableError("the result does not depend on the differentiated arguments")
         return result
 
     value, gradients = value_and_grad(traced, argnum=tuple(range(len(arrays))))(*arrays)

@@ -64,7 +64,7 @@ def import_numba() -> Any:
             raise InputError(
                 NUMBA_SETTINGS,
                 got="a file in the working directory",
-                expected="none: it can make Numba run code of others; use NUMBA_ variables of the environment instead",
+                expected="no such file, as it can make Numba run foreign code; use NUMBA_ environment variables",
             )
         from numba.core import config
 

@@ -308,7 +308,7 @@ def json_of(data: bytes) -> Any:
             elif isinstance(value, list):
                 inner += value
             elif isinstance(value, str) and SURROGATE.search(value):
-                raise ValueError("a text in it is no Unicode: half of a surrogate pair")
+                raise ValueError("a text is not valid Unicode: it has half of a surrogate pair")
         if not inner:
             return document
         level = inner
@@ -322,7 +322,7 @@ def _refuse(constant: str) -> None:
 def _finite(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
-        raise ValueError(f"{text} is larger than any number of 64 bits")
+        raise ValueError(f"{text} is beyond the range of 64-bit numbers")
     return value
 
 
@@ -351,14 +351,14 @@ def arrays_of(path: Path, most: int = MOST_ARRAYS) -> dict[str, Array]:
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Array:
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # the others unpack without a limit
-        raise ValueError(f"{member.filename}: it is packed in a way that NumPy does not use")
+        raise ValueError(f"{member.filename}: its compression method is not one of NumPy's")
     with archive.open(member) as packed:
         data = packed.read(member.file_size + 1)  # read() alone would unpack what the index does not tell
     file = io.BytesIO(data)
     version = np.lib.format.read_magic(file)
     read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
     if read is None:
-        raise ValueError(f"{member.filename}: a header of version {version}")
+        raise ValueError(f"{member.filename}: expected a header of version 1.0 or 2.0, got {version}")
     shape, by_columns, dtype = read(file)
     if dtype != np.dtype("<f8"):
         raise ValueError(f"{member.filename}: expected numbers of 64 bits, got {dtype}")

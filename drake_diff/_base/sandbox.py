@@ -85,8 +85,8 @@ def _outcome(folder: Path, status: int, request: Mapping[str, Any]) -> CallOutco
     if status == 0 and answer.is_file():
         return CallOutcome(*json.loads(answer.read_bytes()))
     if -status in (signal.SIGALRM, signal.SIGKILL):
-        killed = "or the machine has no memory left" if -status == signal.SIGKILL else "the limit that was given"
-        return CallOutcome(error=f"it did not end within {request['seconds']:g} s, {killed}", is_limit=True)
+        killed = ", or the machine ran out of memory" if -status == signal.SIGKILL else ""
+        return CallOutcome(error=f"it exceeded its time limit of {request['seconds']:g} s{killed}", is_limit=True)
     if -status == signal.SIGXFSZ:
         return CallOutcome(error=f"its answer has more than {LARGEST_ANSWER} bytes")
     if status < 0:
@@ -108,7 +108,7 @@ def serve() -> None:
     try:
         answer = CallOutcome(function(**request["arguments"]))
     except MemoryError:
-        limit = f"it needs more than {request['memory'] / GIB:g} GiB, the limit that was given"
+        limit = f"it exceeded its memory limit of {request['memory'] / GIB:g} GiB"
         answer = CallOutcome(error=limit, is_limit=True)
     except (Exception, SystemExit) as error:
         answer = CallOutcome(error=f"{type(error).__name__}: {error}")

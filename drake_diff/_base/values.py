@@ -33,7 +33,7 @@ class PicklesItsFields:
         except Exception as error:  # whatever a user's object raises
             for name, value in values.items():
                 _check(f"{type(self).__name__}.{name}", value)
-            raise InputError(type(self).__name__, got=f"{error}", expected="what can be pickled") from error
+            raise InputError(type(self).__name__, got=f"{error}", expected="values that can be pickled") from error
         finally:
             INSIDE.reset(token)
 
@@ -51,7 +51,7 @@ def _check(name: str, value: Any) -> None:
     try:
         cloudpickle.dumps(value)
     except Exception as error:
-        raise InputError(name, got=f"{value!r:.80}: {error}", expected="what can be pickled") from error
+        raise InputError(name, got=f"{value!r:.80}: {error}", expected="a value that can be pickled") from error
 
 
 def plain_numbers(value: Any) -> Any:

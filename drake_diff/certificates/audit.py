@@ -95,13 +95,15 @@ def _pd_gains(point: Point) -> Found:
         names = [a.name() for a in actuators(plant) if a.model_instance() == instance and a.has_controller()]
         if not names:
             continue
-        target = "what your diagram feeds the desired state port"
+        target = "the signal that your diagram connects to the desired state port"
         if point.model.servos:
             target = "the commanded positions, which are inputs"
         elif not point.model.feeds(plant.get_desired_state_input_port(instance)):
             values = ", ".join(f"{value:g}" for value in point.model.pd_targets[instance])
             target = f"[q; v] fixed at ({values}), the default position at rest"
-        message = f"Drake's conversion to AutoDiffXd drops these PD gains; drake_diff puts them back; target: {target}"
+        message = (
+            f"Drake's conversion to AutoDiffXd drops these PD gains, and drake_diff restores them. Target: {target}"
+        )
         remedy = "set the joints' default positions to move the target, or put the PD law in a policy of the rollout"
         yield Finding("info", "pd_gains", ", ".join(names), message, remedy)
 
@@ -112,10 +114,10 @@ def _identity_frame(point: Point) -> Found:
     names = [name for name, frame in offsets if frame.GetFixedPoseInBodyFrame().IsExactlyIdentity()]
     if names:
         message = (
-            "the frame on the parent is exactly the identity, where Drake drops the derivative by the joint's offset; "
-            f"drake_diff keeps it by an offset of {IDENTITY_OFFSET:g} m"
+            "the joint's frame on its parent is exactly the identity, for which Drake drops the derivative by the "
+            f"joint's offset; drake_diff moves the frame by {IDENTITY_OFFSET:g} m to keep this derivative"
         )
-        remedy = "nothing to do with drake_diff; in your own AutoDiffXd code add that offset"
+        remedy = "no action is needed in drake_diff; add the same offset in your own AutoDiffXd code"
         yield Finding("info", "identity_frame", ", ".join(names), message, remedy)
 
 
@@ -123,7 +125,7 @@ def _joint_limit(point: Point) -> Found:
     names, limits = point.model.position_names, zip(*point.model.position_limits, strict=True)
     for name, q, (low, high) in zip(names, point.x[: point.model.nq], limits, strict=True):
         if q <= low + AT_LIMIT or q >= high - AT_LIMIT:
-            message = f"{q:.9g} is at or beyond its limits [{low:g}, {high:g}]: the derivative is that of one side"
+            message = f"{q:.9g} is at or beyond its limits [{low:g}, {high:g}], where the derivative is one-sided"
             remedy = "start inside the limits, or use `smooth_step`, which averages over both sides"
             yield Finding("warning", "joint_limit", name, message, remedy)
 
@@ -149,11 +151,11 @@ def _saturated_effort(point: Point) -> Found:
         limit = float(actuator.effort_limit())
         if abs(effort) >= limit:
             corner = abs(u) == limit and not actuator.has_controller()
-            slope = "that of the inside, and 0 outside" if corner else "exactly 0"
-            message = f"its effort is at the limit {limit:g} (u is {u:.6g}): there the derivative by u is {slope}"
+            slope = "one-sided: 0 beyond the limit" if corner else "exactly 0"
+            message = f"its effort is at the limit {limit:g} (u is {u:.6g}), where the derivative by u is {slope}"
             yield Finding("error", "saturated_effort", actuator.name(), message, remedy)
         elif abs(rest) > limit:
-            message = f"to hold x at rest takes {rest:.6g} (without contact), beyond the limit {limit:g}"
+            message = f"an effort of {rest:.6g} would hold x at rest (without contact), but the limit is {limit:g}"
             yield Finding("warning", "saturated_effort", actuator.name(), message, remedy)
 
 
@@ -163,7 +165,7 @@ def _zero_effort(point: Point) -> Found:
         joint = re.search(r'joint "([^"]+)" which has a zero effort limit', note)
         if joint and joint[1] not in driven:
             message = f"Drake leaves out actuators with an effort limit of 0, so there is no input: {note}"
-            remedy = "load_model(..., actuators=) drives the joint all the same, or give it an effort above 0"
+            remedy = "drive the joint with load_model(..., actuators=), or give it an effort limit above 0 in the file"
             yield Finding("error", "saturated_effort", joint[1], message, remedy, {"actuators": [joint[1]]})
 
 
@@ -171,17 +173,15 @@ def _jacobian(point: Point) -> Found:
     if point.step_error is not None:
         return
     if too_large := too_large_for_autodiff(point.model):
-        remedy = (
-            "load_model(..., fix_joints=) with what need not move, or accept `dd.differentiate_step` by differences"
-        )
-        yield Finding("warning", "too_large", "step", f"its Jacobian is not looked at: {too_large}", remedy)
+        remedy = "load_model(..., fix_joints=) for joints that need not move, or `dd.differentiate_step` by differences"
+        yield Finding("warning", "too_large", "step", f"the audit skips the Jacobian of the step: {too_large}", remedy)
         return
     result = point.by_autodiff
     if isinstance(result, ModelError):
-        remedy = "give that system a scalar conversion (TemplateSystem), take it out, or accept differences"
+        remedy = "give that system a scalar conversion (TemplateSystem), remove it, or use method finite_difference"
         yield Finding("error", "autodiff_refused", "diagram", str(result), remedy)
     elif isinstance(result, SimulationError) and not any(pair.refused for pair in point.pairs):
-        remedy = "leave out what it names, or accept differences (method finite_difference)"
+        remedy = "remove the element that the error names, or use method finite_difference"
         yield Finding("error", "autodiff_refused", "step", f"the AutoDiffXd step throws: {short(result)}", remedy)
     if isinstance(result, ModelError | SimulationError):
         result = point.differentiate("finite_difference")
@@ -206,10 +206,10 @@ def _mimics(point: Point) -> Found:
     moving = {joint.name() for joint in joints(point.model.plant) if joint.num_velocities()}
     mimics = [m for m in point.model.file_facts.followers.values() if m.follower in moving]
     if mimics and point.model.coupling is None:
-        says = "joints should follow others, but Drake does not read that, and they move freely"
+        says = "mimic joints that Drake does not read, so that they move freely"
         if all(m.in_drake for m in mimics):
-            says = "joints follow others, and stay in the state, held by constraints"
-        remedy = 'mimic="reduce" takes them out of the state, "fix" welds them; collocation and other engines need that'
+            says = "mimic joints that stay in the state, coupled by constraints"
+        remedy = 'mimic="reduce" (out of the state) or mimic="fix" (welds); collocation and other engines need this'
         subject, message = ", ".join(m.follower for m in mimics), f"{says}: {'; '.join(map(str, mimics))}"
         yield Finding("warning", "mimic_joint", subject, message, remedy, {"mimic": "reduce"})
 
@@ -217,11 +217,13 @@ def _mimics(point: Point) -> Found:
 def _constraints(point: Point) -> Found:
     plant, context = point.model.plant, point.model.double.context
     if point.model.num_constraints:
-        message = f"constraints in every step ({plant.num_constraints()}), which the implicit method cannot handle"
-        remedy = "nothing to do: method auto takes autodiff; `certify` one state, as a few kinds have no AutoDiffXd"
+        message = f"the plant has constraints ({plant.num_constraints()}), which the implicit method does not support"
+        remedy = "no action is needed: method auto uses autodiff; `certify` a state, as a few kinds lack AutoDiffXd"
         yield Finding("info", "constraints", "plant", message, remedy)
     if locked := [joint.name() for joint in joints(plant) if joint.is_locked(context)]:
-        message = "locked in the double context, of which the AutoDiffXd twin knows nothing: its derivative is refused"
+        message = (
+            "the lock exists only in the double context, not in the AutoDiffXd twin, so that its derivative is refused"
+        )
         remedy = "weld it in the plant instead (WeldFrames), or joint.Unlock(model.double.context)"
         yield Finding("info", "locked_joint", ", ".join(locked), message, remedy)
 
@@ -232,9 +234,9 @@ def _undriven(point: Point) -> Found:
     driven = sum(row.driven for row in point.joints)
     undriven = [r for r in point.joints if not (r.driven or r.follows or (r.says is not None and r.says.passive))]
     meant = [row.name for row in undriven if row.says is not None and (row.says.effort or 0) > 0]
-    remedy = 'load_model(..., actuators="all"), names of joints, or {joint: effort limit}; nothing if it is passive'
+    remedy = 'load_model(..., actuators="all"), names of joints, or {joint: effort limit}; no action if it is passive'
     if undriven and not driven:
-        message = f"none of its {len(undriven)} joints has an actuator in the file, so that there is no input"
+        message = f"the file has no actuator for any of the {len(undriven)} joints, so that the model has no input"
         names, all_joints = listed(row.name for row in undriven), {"actuators": "all"}
         yield Finding("warning", "no_actuator", names, message, remedy, all_joints)
     elif meant:
@@ -256,7 +258,7 @@ def _left_out_actuators(point: Point) -> Found:
 
 def _switched_off(point: Point) -> Found:
     off, gravity = point.model.file_facts.disabled, point.model.plant.gravity_field().gravity_vector()
-    message = "the file switches it off, and Drake has it all the same"
+    message = "the file disables it, but Drake simulates it"
     if off & {"contact", "constraint"} and point.pairs:
         remedy = "load_model(..., contact=False)"
         yield Finding("warning", "switched_off", "contact", message, remedy, {"contact": False})
@@ -270,16 +272,16 @@ def _massless(point: Point) -> Found:
     for base in sorted(plant.GetFloatingBaseBodies()):
         welded = plant.GetBodiesWeldedTo(plant.get_body(base))
         if sum(body.default_mass() for body in welded) == 0:
-            message = "it has no mass and floats, so that nothing holds up what hangs on it and the step is singular"
+            message = "it floats and has no mass, so that the step is singular"
             carries = any(joint.num_velocities() and joint.parent_body() in welded for joint in joints(plant))
-            remedy = 'load_model(..., base="weld") if it stands fixed, else ' if carries else ""
+            remedy = 'load_model(..., base="weld") if it is fixed to the world, else ' if carries else ""
             remedy, arguments = f"{remedy}give it a mass in the file", {"base": "weld"} if carries else {}
             yield Finding("error", "massless_root", plant.get_body(base).name(), message, remedy, arguments)
     set_state(point.model.double, point.x)
     mass = np.diag(plant.CalcMassMatrix(point.model.double.context))
     light = [row.name for row in point.joints if mass[row.joint.velocity_start()] < NO_MASS]
     if light:
-        message = "nothing that they move has a mass or an inertia, so that the step is singular"
+        message = "the bodies that they move have no mass and no inertia, so that the step is singular"
         fixed = _fixed(point, light)
         remedy = "load_model(..., fix_joints=) fixes them, or give the links a mass in the file"
         remedy = remedy if fixed else "give the links a mass in the file"
@@ -309,10 +311,10 @@ def _lost_shapes(point: Point) -> Found:
     given = [b for b in bodies(model.plant) if (says := point.link_says(b)) is not None and says.collisions]
     lost = [body.name() for body in given if body.index() not in with_shapes]
     if lost:
-        much = "no collision shape of the file is left" if len(lost) == len(given) else "they have lost all shapes"
-        remedy = 'load_model(..., meshes="convex") or "spheres"; contact=False says that nothing is to touch'
+        much = "the model" if len(lost) == len(given) else "these links"
+        remedy = 'load_model(..., meshes="convex") or "spheres"; contact=False declares a model without contact'
         arguments = {"meshes": "spheres"} if _has_usable_meshes(point) else {"contact": False}
-        message = f"{much}, so that they pass through things"
+        message = f"no collision shape of {much} is loaded, so that links pass through other bodies"
         yield Finding("warning", "collision_gone", listed(lost), message, remedy, arguments)
 
 
@@ -335,14 +337,14 @@ def _falls(point: Point) -> Found:
         stands = any(set(pair.bodies) & tree and set(pair.bodies) & fixed for pair in point.pairs)
         if stands or not (moves or shapes & tree):
             continue
-        why, arguments = "there is nothing fixed below it that it could touch", dict[str, Any](ground=True)
+        why, arguments = "the world has no ground or fixed shape below it", dict[str, Any](ground=True)
         if not shapes & tree:
-            why = "nothing of it can touch, as it has no collision shapes"
+            why = "it has no collision shapes"
             arguments = {"meshes": "spheres", "ground": True} if _has_usable_meshes(point) else {"base": "weld"}
-        message = f"it floats and falls for ever: {why}"
+        message = f"it floats and falls without end: {why}"
         remedy = (
             'load_model(..., ground=True), with meshes="convex" or "spheres" if it has no shapes; base="weld" if it '
-            "stands fixed, or nothing if it flies"
+            "is fixed to the world, or no action if it flies"
         )
         yield Finding("warning", "falls", plant.get_body(base).name(), message, remedy, arguments)
 
@@ -365,14 +367,19 @@ def _invention(body: Any, says: Any) -> tuple[Severity, str] | None:
     mass, about_center = inertia.get_mass(), inertia.Shift(inertia.get_com()).CalcRotationalInertia()
     trace = float(np.trace(about_center.CopyToFullMatrix3()))
     if says.mass is None and says.defaults:
-        return "warning", "the file gives no mass, so that it is the format's own, 1 kg"
+        return "warning", "the file gives no mass, so that the format's default of 1 kg applies"
     if says.mass is not None and not np.isclose(mass, says.mass, rtol=SAME_MASS, atol=0):
-        message = f"the file's mass {says.mass:g} kg goes with no inertia; Drake takes {mass:g} kg, a ball of water"
+        message = (
+            f"no inertia fits the file's mass of {says.mass:g} kg; Drake uses a ball of water of {mass:g} kg instead"
+        )
         return "error", message
     if says.trace is None and says.defaults:
-        return "warning", "the file gives no inertia, so that it is the format's own, 1 kg m^2 about each axis"
+        return "warning", "the file gives no inertia, so that the format's default of 1 kg m^2 about each axis applies"
     if says.trace is not None and not np.isclose(trace, says.trace, rtol=SAME_MASS, atol=1e-12):
-        return "warning", "no body can have the file's inertia; Drake takes that of a ball of water of the same mass"
+        return (
+            "warning",
+            "the file's inertia is impossible for a body; Drake uses that of a ball of water of the same mass",
+        )
     return None
 
 
@@ -386,8 +393,8 @@ def _ignored(point: Point) -> Found:
     for kind, count in kinds.items():
         quoted = re.search(r"'([^']+)'", kind)
         severity: Severity = "info" if any(word in kind for word in HARMLESS) else "warning"
-        message = f"{count} times in the file, and Drake does not read it: {kind}"
-        remedy = "nothing if it does not matter, else say it in a way that Drake reads, or change the plant"
+        message = f"Drake does not read it ({count} times in the file): {kind}"
+        remedy = "no action if it does not matter; else use an element that Drake reads, or change the plant"
         yield Finding(severity, "ignored", quoted[1] if quoted else "file", message, remedy)
 
 
@@ -406,10 +413,10 @@ def _zero_limits(point: Point) -> Found:
         remedy = "load_model(..., fix_joints=) fixes such joints there" if arguments else "give it limits in the file"
         if mended == "actuators":
             arguments = {"actuators": names}
-            remedy = "load_model(..., actuators=) takes limits of 0 of joints that it drives as none; or fix_joints="
+            remedy = "load_model(..., actuators=) removes limits of 0 of the joints that it drives; or fix_joints="
         elif mended == "mimic":
             remedy, arguments = 'load_model(..., mimic="fix") welds joints that follow others', {"mimic": "fix"}
-        yield Finding("error", "zero_limit", listed(names), f"{kind}: no plan can move what has it", remedy, arguments)
+        yield Finding("error", "zero_limit", listed(names), f"{kind}: no plan can move these joints", remedy, arguments)
 
 
 _CHECKS_WITHOUT_POSES: tuple[Callable[[Point], Found], ...] = (_no_step, _pd_gains, _identity_frame, _joint_limit)

@@ -110,7 +110,9 @@ def judge(
     reasons |= _stairs(around, size) | _broken(around, a, difference, size)
     if beside is not None:
         jittery = np.argwhere(_jittery(around, a, beside)).tolist()
-        reasons = {(i, j): f"1e-9 beside the point the derivative is {beside[i, j]:.6g}" for i, j in jittery} | reasons
+        reasons = {
+            (i, j): f"at a distance of 1e-9 from the point the derivative is {beside[i, j]:.6g}" for i, j in jittery
+        } | reasons
     for entry in reasons:
         codes[entry] = DISCONTINUOUS
     return Judgement(difference, tolerance, noticeable, size, codes, reasons)
@@ -192,7 +194,7 @@ def _beside(around: Neighbourhood, a: Array, gap: Array, codes: Codes) -> dict[t
     steep = (codes == DISAGREE) & (last >= 0) & (nearest <= LIMITS.nearer * gap)
     grows = (LIMITS.nearer * gaps[1:-1] > gaps[:-2]) & (gaps[1:-1] * steps[2:] > scatter)
     jumps = (codes == UNDECIDED) & np.any(grows & (gaps[2:] <= LIMITS.gone * gaps[1:-1]), axis=0)
-    why = "it is the slope over small steps and not over larger ones: {} beside the point"
+    why = "the derivative is the slope over small steps but not over larger steps: {} near the point"
     kinds = [(steep, "there is a break"), (jumps, "the value jumps")]
     return {(i, j): why.format(what) for where, what in kinds for i, j in np.argwhere(where).tolist()}
 
@@ -294,10 +296,10 @@ class ModeChange:
     rows: tuple[str, ...]
 
     def __str__(self) -> str:
-        touched = f", which touches d({', '.join(self.rows)})/d{self.column}" if self.rows else ""
+        touched = f", which affects d({', '.join(self.rows)})/d{self.column}" if self.rows else ""
         return (
-            f"{self.pair[0]} and {self.pair[1]}: {self.before} here, {self.after} where {self.column} "
-            f"is {self.displacement:+.3g}{touched}"
+            f"{self.pair[0]} and {self.pair[1]}: {self.before} at this point, {self.after} with {self.column} "
+            f"moved by {self.displacement:+.3g}{touched}"
         )
 
 

@@ -27,7 +27,9 @@ from drake_diff.model.plant import actuators
 from drake_diff.model.step import advance, check_point
 from drake_diff.model.tangent import TangentSpace, tangent_space
 
-SHARED = "the derivative is of differences too, of another step: the two share a method, and what it misses is missed"
+SHARED = (
+    "the derivative is computed by differences too, with another step size: an error of this method stays unnoticed"
+)
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,7 @@ def certify_inside(
     note = _joined(certificate.told, _beside_limits(model, inside != u))
     leap = _leap_at_limits(model, x, u, np.sign(inside - u), parameters)
     if np.any(np.abs(leap) > STEP.leap * certificate.size):
-        note += f", at which the derivative is another one, by up to {np.max(np.abs(leap)):.3g}"
+        note += f", at which the derivative differs by up to {np.max(np.abs(leap)):.3g}"
         certificate = replace(certificate.of(certificate.derivative + leap), mode_changes=certificate.mode_changes)
     return replace(certificate, told=note)
 

@@ -51,17 +51,17 @@ def refused_pairs(point: Point) -> Iterator[Finding]:
         (" - ".join(links), _refusal(point, pairs), pairs) for links, pairs in list(groups.items())[: OPTIONS.pairs]
     ]
     if rest := list(groups)[OPTIONS.pairs :]:
-        message = f"of such shapes, too: {listed(' - '.join(links) for links in rest)}"
+        message = f"pairs of the same kinds of shapes: {listed(' - '.join(links) for links in rest)}"
         rows.append((f"{len(rest)} more pairs of links", message, [pair for links in rest for pair in groups[links]]))
     for subject, message, pairs in rows:
         arguments = {} if by_choice else _route(point, pairs)
         remedy = (
-            'load_model(..., contact_geometry="corner_spheres") replaces boxes, cylinders and capsules by spheres, '
-            '"hydroelastic" gives every geometry a mesh, "differences" differences the step by choice; or filter the '
-            "pair (CollisionFilterDeclaration, or <drake:collision_filter_group> in the file) if it never touches"
+            'load_model(..., contact_geometry="corner_spheres") (for boxes, cylinders, capsules), "hydroelastic" or '
+            '"differences"; or filter the pair if it never touches (CollisionFilterDeclaration, or '
+            "<drake:collision_filter_group> in the file)"
         )
         if by_choice:
-            remedy = "nothing to do: it is differenced by choice, which needs method auto or finite_difference"
+            remedy = "no action is needed: the step uses differences as chosen, with method auto or finite_difference"
         elif "meshes" in arguments:
             remedy = f'meshes="spheres" and {remedy}'
         yield Finding("info" if by_choice else "error", "pair_refused", subject, message, remedy, arguments)
@@ -86,7 +86,7 @@ def _refusal(point: Point, pairs: list[ColliderPair]) -> str:
     if any(pair.contact == "none" for pair in pairs):
         why = "hydroelastic contact alone needs properties on both, one of them not rigid; the double step throws too"
     if any("HalfSpace" in pair.kinds for pair in pairs):
-        why += ", and that of a tilted half space is infinite: it throws without touching"
+        why += ", and the bounding box of a tilted half space is infinite, so that the step throws without contact"
     if not isinstance(error, SimulationError):
         return f"{names}: {why}. The AutoDiffXd step does not throw at x."
     named = any(all(kind.lower() in str(error).lower() for kind in pair.kinds) for pair in pairs)
@@ -105,12 +105,12 @@ def aligned_faces(point: Point) -> Iterator[Finding]:
         if angle is None:
             continue
         severity: Severity = "info"
-        consequence = "tilted now; if they come to lie flat the hydroelastic step jumps"
+        consequence = "the hydroelastic step would jump if the faces came to lie flat"
         if angle <= PARALLEL and gap <= OPTIONS.reach:
             severity = "error"
             consequence = "the hydroelastic step jumps there, and AutoDiffXd gives a finite, plausible, wrong number"
         elif angle <= OPTIONS.nearly_parallel:
-            severity, consequence = "warning", "if they meet like this the hydroelastic step jumps"
+            severity, consequence = "warning", "the hydroelastic step jumps if the faces meet at this angle"
         message = f"faces {angle:.2g} rad from parallel at x, {gap:.3g} m apart: {consequence}"
         arguments = {} if severity == "info" else {"contact_model": "point", "contact_geometry": "corner_spheres"}
         yield Finding(severity, "aligned_faces", pair.label, message, remedy, arguments)
@@ -180,11 +180,11 @@ def contact_defaults(point: Point) -> Iterator[Finding]:
     for missing, colliders in groups.items():
         values = {name: _value(colliders[0], name) for name in missing}
         defaults = ", ".join(f"{PROXIMITY[name][1]} {value}" for name, value in values.items())
-        message = f"not given, so the scene graph's default decides: {defaults}"
+        message = f"no value is set, so that the scene graph's defaults apply: {defaults}"
         if values.get("relaxation_time") == "0.1 s":
             message += " (with which a ball hardly bounces)"
         tags = ", ".join(f"drake:{'mu_dynamic' if name == 'friction' else PROXIMITY[name][1]}" for name in missing)
-        remedy = f"give them in <drake:proximity_properties> ({tags}) or in the geometry's ProximityProperties"
+        remedy = f"set them in <drake:proximity_properties> ({tags}) or in the geometry's ProximityProperties"
         yield Finding("warning", "default_decides", ", ".join(c.label for c in colliders), message, remedy)
 
 
@@ -202,8 +202,8 @@ def unread_compliance(point: Point) -> Iterator[Finding]:
     names = [collider.label for collider in point.colliders if collider.has(given) and not collider.has(read)]
     if names:
         by, other = ("sap", "similar") if point.is_sap else ("similar and lagged", "sap")
-        message = f"{PROXIMITY[given][1]} is given, and {by} read {PROXIMITY[read][1]}, which is not"
-        remedy = f'give drake:{PROXIMITY[read][1]} too, or load_model(..., contact_approximation="{other}")'
+        message = f"{PROXIMITY[given][1]} is set, but {by} read {PROXIMITY[read][1]}, which is not set"
+        remedy = f'set drake:{PROXIMITY[read][1]} too, or load_model(..., contact_approximation="{other}")'
         yield Finding("warning", "unread_compliance", listed(names), message, remedy, {"contact_approximation": other})
 
 
@@ -219,12 +219,14 @@ def pairs_at_touch(point: Point) -> Iterator[Finding]:
             continue
         exact = (pair.kinds <= MEETS_A_SPHERE and "Sphere" in pair.kinds) or pair.kinds == {"Box"}
         if abs(distance) < (OPTIONS.touch if exact else OPTIONS.rough_touch):
-            message = f"exactly at touch (signed distance {distance:.2g} m): the derivative is that of one side"
-            remedy = "start a little apart or a little in contact, or use `smooth_step`"
+            message = f"the shapes just touch (signed distance {distance:.2g} m), where the derivative is one-sided"
+            remedy = "start with a small gap or a small overlap, or use `smooth_step`"
             yield Finding("warning", "touching", pair.label, message, remedy)
     if unmeasured:
-        message = "Drake computes no distance between these, so whether they are exactly at touch is not known"
-        remedy = "compare x with x moved by 1e-6 m yourself, or replace one of them by spheres (corner_spheres)"
+        message = (
+            "Drake computes no distance between these shapes, so that the audit cannot say whether they just touch"
+        )
+        remedy = "compare the steps from x and from x moved by 1e-6 m, or replace one shape by spheres (corner_spheres)"
         yield Finding("info", "not_measured", ", ".join(unmeasured), message, remedy)
 
 
@@ -239,8 +241,8 @@ def inseparable(point: Point) -> Iterator[Finding]:
         return  # as no step of it can be taken then, which is a finding of its own
     if pairs:
         message = (
-            f"they overlap wherever the joints are (pairs of shapes: {len(pairs)}), and push each other apart in every "
-            "step; of deep overlaps Drake's point of contact jumps, and has no derivative"
+            f"the links overlap at all joint positions (pairs of shapes: {len(pairs)}) and push each other apart in "
+            "every step; in a deep overlap Drake's contact point jumps and has no derivative"
         )
         remedy = 'load_model(..., contact="separable") lets these pairs alone pass through each other'
         subject = links_of(model.plant, model.double.scene_graph, pairs)
@@ -265,9 +267,11 @@ def corners_on_both_sides(point: Point) -> Iterator[Finding]:
         if CORNER.search(pair.a.label) and CORNER.search(pair.b.label) and roots[pair.a.body] != roots[pair.b.body]
     ]
     if links:
-        message = "both are spheres in their corners alone, which miss each other: what one holds falls out of it"
+        message = (
+            "both links have spheres in their corners only, which miss each other, so that one falls through the other"
+        )
         remedy = (
             'contact_geometry="hydroelastic" with contact_model="hydroelastic_with_fallback", or "differences"; or '
-            "give one of them spheres over the face that touches, in the file"
+            "cover the face of one of them that touches with spheres, in the file"
         )
         yield Finding("warning", "corners_miss", listed(links), message, remedy, {"contact_geometry": "differences"})

@@ -129,7 +129,7 @@ def is_broken(changes: Many, n: int) -> str:
     for k in range(DIFFERENCES.near):
         through = np.concatenate([along[1, k, ::-1], np.zeros((1, len(unsolved))), along[0, k]])
         if np.any(_scatter(through) > DIFFERENCES.significant * still):
-            return "it is broken beside the point"
+            return "the function has a break near the point"
     some = _stairs(lambda t: changes(np.multiply.outer(t, direction)), along, by_spacing, rounding, unsolved)
     return next(iter(some.values()), "")
 
@@ -196,7 +196,8 @@ def _stairs(
         if all(len(some) >= DIFFERENCES.stairs for some in jumps):
             (up, here), (down, there) = jumps[0][0], jumps[1][0]
             reasons[row] = (
-                f"it jumps by {up:.2g} at {here:.2g} and by {down:.2g} at {there:.2g} of a line through the point"
+                f"the function jumps by {up:.2g} at {here:.2g} and by {down:.2g} at {there:.2g} of a line through "
+                "the point"
             )
     return reasons
 

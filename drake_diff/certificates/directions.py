@@ -121,22 +121,22 @@ class FirstLook:
     def doubt(self) -> str:
         """Why every entry has to be looked at; empty where the derivative is that of the function."""
         if np.any(self.left_out != 0):
-            return "what the derivative says to have no effect has one"
+            return "a column that is 0 in the derivative has an effect"
         gaps, moved = self._gaps(), self.plan.weights > 0
         allowed = LIMITS.power * np.min((self.plan.weights * self.size)[:, moved], axis=1, initial=np.inf)  # (m,)
         bounds = _bound(gaps)
         significant = bounds <= allowed
         hidden = _bound(np.broadcast_to(self.rounding / self.plan.widths[-1], gaps[0].shape))
         if not np.all(significant.any(axis=0)):
-            return f"along random directions row {int(np.argmin(significant.any(axis=0)))} is another one"
+            return f"row {int(np.argmin(significant.any(axis=0)))} disagrees with the slopes along random directions"
         # The smallest steps decide: where they say something else it is rounding, or there is something at the point.
         if not np.all(significant[-1] | (bounds[-1] <= hidden)):
-            return "along random directions slopes are others over smaller steps"
+            return "the slopes along random directions change with smaller steps"
         corners = self._corners()
         significant = corners <= np.maximum(allowed, hidden)
         if not np.all(significant[-1] & (corners <= allowed).any(axis=0) | (corners <= hidden).all(axis=0)):
-            return "slopes ahead and behind do not approach each other"
-        return "a row is flat here, and changes farther away" if np.any(self._stairs()) else ""
+            return "the forward and backward slopes do not approach each other"
+        return "a row is constant near the point and changes farther away" if np.any(self._stairs()) else ""
 
     def _stairs(self) -> Flags:
         """(m,) rows that are flat here and change to both sides farther away, not as smooth curves do, h^2 and h^3."""

@@ -310,8 +310,8 @@ def check_memory(policy: Any, g: RolloutGradient, time_step: float) -> None:
         if not np.all(np.abs(again - u) <= PARITY_TOLERANCE * np.maximum(1.0, np.abs(u))):
             i = int(np.argmax(np.abs(again - u)))
             raise GradientError(
-                f"the policy remembers: at t = {k * time_step:g} s and the same x, u[{i}] was {u[i]:.9g}, and after "
-                f"another motion it is {again[i]:.9g}; make it a function of x and t alone"
+                f"the policy depends on earlier calls: at t = {k * time_step:g} s and the same x, u[{i}] was "
+                f"{u[i]:.9g} and is {again[i]:.9g} after another motion; make it a function of x and t only"
             )
 
 
@@ -341,8 +341,8 @@ def wrong_derivative(policy: Any, space: TangentSpace, g: RolloutGradient, time_
             i, j = np.unravel_index(int(np.argmax(gap)), gap.shape)
             unit = np.concatenate([np.ones(space.size), scale])[j]
             return (
-                f"the policy states a wrong derivative: at t = {t:g} s that of u[{i}] by {columns[j]} is "
-                f"{stated[i, j] / unit:.6g}, differences of the policy say {quotients[-1][i, j] / unit:.6g}"
+                f"the policy's derivative is wrong: at t = {t:g} s the derivative of u[{i}] by {columns[j]} is "
+                f"{stated[i, j] / unit:.6g}, and differences of the policy give {quotients[-1][i, j] / unit:.6g}"
             )
     return ""
 
@@ -367,8 +367,8 @@ def stairs_of_loss(loss: Loss, g: RolloutGradient, space: TangentSpace) -> str:
         return ""
     size = along(jump[1]) - along(jump[0])
     return (
-        f"the loss is a staircase: of {ASK.cells} parts of a line through the motion {jump[2]} jump, one by {size:.3g} "
-        f"at {jump[0]:.3g}"
+        f"the loss is a staircase: it jumps in {jump[2]} of {ASK.cells} parts of a line through the motion, by "
+        f"{size:.3g} at {jump[0]:.3g}"
     )
 
 
@@ -421,7 +421,7 @@ class _PolicyProbe:
 
     def _staircase(self, k: int, way: Array, name: str, lengths: Sequence[float] = LENGTHS) -> str:
         jump = _stairs(self._along(k, way), self._least(k), lengths)
-        where = f"of {ASK.cells} parts of {name} {jump[2]} jump, " if jump else ""
+        where = f"jumps in {jump[2]} of {ASK.cells} parts of {name}, " if jump else ""
         return f"the policy is a staircase: {self._jump_text(k, way, jump[:2], where)} at {jump[0]:.3g}" if jump else ""
 
     def _switch(self, k: int, way: Array, name: str) -> str:
@@ -429,7 +429,7 @@ class _PolicyProbe:
         with np.errstate(all="ignore"), suppress(*OUTSIDE):
             jumps = _jumps(self._along(k, way), np.linspace(0.0, 1.0, ASK.cells // 2 + 1), least)
             if jumps:
-                return f"the policy jumps: {self._jump_text(k, way, jumps[0])} on the way from there {name}"
+                return f"the policy jumps: {self._jump_text(k, way, jumps[0])} on the way from this state {name}"
         return ""
 
     def _jump_text(self, k: int, way: Array, jump: Jump, where: str = "") -> str:

@@ -200,7 +200,7 @@ def judge(first: Gaps, second: Gaps | None, doubt: float) -> tuple[str, str]:
         return "agree", ""
     if _steady(fine.gap, coarse.gap) and _size(coarse.gap) > max(doubt, coarse.rounding):
         return "disagree", "the gap is the same at both step sizes"
-    return "undecided", "what the differences leave is more than what must be noticed"
+    return "undecided", "the error bound of the differences exceeds the error that must be noticed"
 
 
 def _bound(values: Array) -> float:
@@ -240,7 +240,9 @@ def certify_sampled(moved: Displaced, g: RolloutGradient, seed: int) -> SampledC
     if verdict == "disagree" and (explanation := probe.alone(best)):
         j, error = explanation
         stated, right = (value / moved.scale[j] for value in (derivative[j], derivative[j] - error))
-        reason += f"; by {moved.columns[j]} alone it would be explained: {stated:.6g} is stated, {right:.6g} is right"
+        reason += (
+            f"; an error by {moved.columns[j]} alone would explain it: {stated:.6g} is stated, {right:.6g} is right"
+        )
     off = np.linalg.lstsq(probe.normals(len(best.gap)), best.gap, rcond=None)[0] / weight
     code, size, noticeable = VERDICTS.index(verdict), 1 / weight[None], best.bound / weight[None]
     return SampledCertificate(

@@ -105,9 +105,9 @@ class TrueSlope(ShowsItsRepr):
     def __repr__(self) -> str:
         if not self.exists:
             over = ", ".join(f"{s:.4g} over +-{w:.2g}" for w, s in zip(self.widths, self.slopes, strict=True))
-            return f"by {self.column} ours is {self.ours:.4g}, {self.reason}{f': {over}' if over else ''}"
-        sign = {True: "", False: ", of the other sign", None: ""}[self.sign_agrees]
-        law = f", {self.by_other_law:+.4g} by the other law" if np.isfinite(self.by_other_law) else ""
+            return f"by {self.column} our slope is {self.ours:.4g}, {self.reason}{f': {over}' if over else ''}"
+        sign = {True: "", False: ", of the opposite sign", None: ""}[self.sign_agrees]
+        law = f", {self.by_other_law:+.4g} under the other law" if np.isfinite(self.by_other_law) else ""
         return f"by {self.column} the slope is {self.value:.6g} (+-{self.error:.1g}), ours {self.ours:.6g}{sign}{law}"
 
 
@@ -147,12 +147,12 @@ class Truth(ShowsItsRepr):
     def __repr__(self) -> str:
         formula = f" ({self.law}, {FORMULAS[self.law]})" if self.touches else ""
         lines = [
-            f"in continuous time{formula} the loss is {self.loss:.6g} (+-{self.error:.1g}); ours is {self.ours:.6g}, "
-            f"error of the step {self.ours - self.loss:.3g}"
+            f"in continuous time{formula} the loss is {self.loss:.6g} (+-{self.error:.1g}), in the model's steps it is "
+            f"{self.ours:.6g}, error of the step {self.ours - self.loss:.3g}"
         ]
         if self.other_law:
             difference = self.other_reason or f"the loss changes by {self.by_other_law:.3g}"
-            lines.append(f"difference of the laws, to {self.other_law} of Drake's continuous plant: {difference}")
+            lines.append(f"difference to {self.other_law}, the contact law of Drake's continuous plant: {difference}")
         for label, slopes in (
             ("not ours", self.wrong),
             ("without a slope", [slope for slope in self.slopes if slope.exists is False]),
@@ -194,7 +194,7 @@ def softest_contact(model: Model, xs: Array) -> str | None:
             factor = beta**2 * float(np.linalg.norm(inverse)) / 3 / (4 * np.pi**2) / stated
             if factor > worst:
                 worst = factor
-                note = f"the steps make {name} {factor:.3g} times softer than it is stated: near-rigid at h = {h:g} s"
+                note = f"the steps make {name} {factor:.3g} times softer than specified: near-rigid at h = {h:g} s"
     return note
 
 
@@ -264,7 +264,7 @@ class _Measurement:
         widths = self._widths()
         measured = TrueSlope(line.name, tuple(line.columns.tolist()), self._ours(line))
         if widths[0] * line.scale > line.room:
-            return replace(measured, reason=f"not measured: moved by {widths[0] * line.scale:.2g} it is cut off")
+            return replace(measured, reason=f"not measured: a move by {widths[0] * line.scale:.2g} would be clipped")
         try:
             over = [self._slope(line, w) for w in widths]
             if not abs(over[0][0] - over[1][0]) <= TRUTH.settled * max(abs(slope) for slope, _ in over):
@@ -273,7 +273,7 @@ class _Measurement:
         except TimeoutError:
             return replace(measured, reason=self._beyond())
         except DrakeDiffError as error:
-            return replace(measured, reason=f"not measured: a little away there is no motion: {error}")
+            return replace(measured, reason=f"not measured: the motion near this one fails: {error}")
         slopes, corners = zip(*over, strict=True)
         return replace(measured, widths=tuple(w * line.scale for w in widths), slopes=slopes, corners=corners)
 
@@ -304,7 +304,7 @@ def judged(slope: TrueSlope, noise: Array, least: float) -> TrueSlope:
     size = max(abs(narrow), abs(middle), least)
     sized = replace(slope, size=max(size, abs(slope.ours)) if size > 0 else abs(slope.ours))
     if least > 0 and hidden[-1] > TRUTH.known * size and hidden[-1] > abs(narrow - middle):
-        return replace(sized, reason=f"not known: the integration's error is {hidden[-1]:.1g} of it")
+        return replace(sized, reason=f"unknown: the integration's error is {hidden[-1]:.1g} of the slope")
     narrows = abs(narrow - middle) <= TRUTH.settled * size + hidden[1] + hidden[2]
     gap, slack = wide - middle, TRUTH.settled * size + hidden[0] + hidden[1]
     bends = (
@@ -313,10 +313,12 @@ def judged(slope: TrueSlope, noise: Array, least: float) -> TrueSlope:
     corner, before = abs(slope.corners[-1]), abs(slope.corners[-2])
     if corner > TRUTH.settled * size + 4 * hidden[2] and corner > TRUTH.shrinks * before:
         ahead, behind = (narrow + s * slope.corners[-1] / 2 for s in (1, -1))
-        return replace(sized, exists=False, reason=f"it has a corner here, {ahead:.4g} ahead and {behind:.4g} behind")
+        return replace(
+            sized, exists=False, reason=f"the loss has a kink here: slope {ahead:.4g} ahead, {behind:.4g} behind"
+        )
     if narrows and (abs(gap) <= slack or bends):
         return replace(sized, exists=True, value=narrow, error=abs(narrow - middle) + hidden[2])
-    return replace(sized, exists=False, reason="the slopes do not settle")
+    return replace(sized, exists=False, reason="the slopes do not converge")
 
 
 def by_truth(truth: Truth, subject: str) -> Certificate:
@@ -344,7 +346,7 @@ def by_truth(truth: Truth, subject: str) -> Certificate:
         method=CONTINUOUS,
         subject=subject,
         scale=np.ones(len(slopes)),
-        told="differences are of another integration of the same motion",
+        told="the differences use another integration of the same motion",
     )
 
 
@@ -377,14 +379,16 @@ class Refinement:
         )
         if self.apart:
             more = f" and {len(self.apart) - 1} more" if len(self.apart) > 1 else ""
-            text += f"; it is not known to be the slope of the motion in continuous time by {self.apart[0]}{more}"
+            text += f"; by {self.apart[0]}{more} it is not known to be the slope of the motion in continuous time"
         return text
 
 
 def _at_finer_steps(moved: Displaced) -> Iterator[Array]:
     """The gradient at h/2 and h/4 under the same inputs, the loss seeing the states at the same times."""
     if TIME_STEP in {p.name for p in moved.vector.parameters}:
-        raise InputError("parameters", got=TIME_STEP, expected="others, as refine=True changes the time step")
+        raise InputError(
+            "parameters", got=TIME_STEP, expected="parameters other than the time step, which refine=True changes"
+        )
     model, loss, (count, nu) = moved.model, moved.loss, moved.us.shape
     options: dict[str, Any] = {"parameters": moved.vector.to_dict(), "method": moved.method}
     for m in REFINEMENTS[1:]:

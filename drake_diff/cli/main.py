@@ -102,12 +102,14 @@ def _status_of_app() -> Any:
         print(f"drake-diff: {type(error).__name__}: {words}", file=sys.stderr)
         return MISSING if isinstance(error, MissingDependencyError) else USAGE
     except MemoryError:
-        text = "drake-diff: MemoryError: it needs more memory than there is, or than this command may take"
+        text = "drake-diff: MemoryError: the command needs more memory than is free, or than its limit allows"
         print(text, file=sys.stderr)
         return USAGE
     except Exception:
         traceback.print_exc()
-        advice = "the last lines above say where it failed: mend your script there, or report a bug in drake-diff"
+        advice = (
+            "the last lines above show where the error occurred: correct your script, or report a bug in drake-diff"
+        )
         print(f"drake-diff: {advice}", file=sys.stderr)
         return INTERNAL
     return 0

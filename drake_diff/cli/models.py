@@ -60,10 +60,10 @@ def certify(
     model: Any,
     file: Path,
     states: Annotated[
-        int, typer.Option(help="How many states to sample; every second one in contact, if it can be.")
+        int, typer.Option(help="Number of states to sample, every second one in contact where possible.")
     ] = 20,
     seed: Seed = 0,
-    parameters: Annotated[str | None, names_option("Parameters to differentiate by too", "none")] = None,
+    parameters: Annotated[str | None, names_option("Parameters to differentiate by as well", "none")] = None,
     method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "auto",
     out: Annotated[Path | None, out_option("artifacts/certify_<model>")] = None,
 ) -> None:
@@ -100,7 +100,9 @@ def certify(
 def compare(
     model: Any,
     file: Path,
-    engines: Annotated[str | None, names_option("Engines, such as mujoco or drake:lagged", "all installed")] = None,
+    engines: Annotated[
+        str | None, names_option("Engines to compare, such as mujoco or drake:lagged", "all installed")
+    ] = None,
     recording: Annotated[
         list[Path] | None, typer.Option(help="A recorded motion to repeat: CSV, MCAP or a ROS 2 bag.")
     ] = None,
@@ -152,18 +154,19 @@ def compare(
 def identify(
     model: Any,
     file: Path,
-    recording: Annotated[
-        list[Path], typer.Option(help="A recorded motion: CSV, MCAP or a ROS 2 bag. Can be given again.")
-    ],
+    recording: Annotated[list[Path], typer.Option(help="A recorded motion: CSV, MCAP or a ROS 2 bag. Repeatable.")],
     parameters: Annotated[str | None, names_option("Parameters to estimate", "all")] = None,
     noise: Annotated[list[str] | None, repeated("STATE=DEVIATION", "Standard deviation of a state's noise")] = None,
     held_out: Annotated[
         str,
-        typer.Option(metavar="PART|NAME", help="The part at the end of each recording, or a recording, to predict."),
+        typer.Option(
+            metavar="PART|NAME",
+            help="The part at the end of each recording, or the recording, to predict and not to fit.",
+        ),
     ] = "0.2",
     motion: Annotated[str, typer.Option(help="auto, continuous, steps or impacts")] = "auto",
-    prior: Annotated[list[str] | None, repeated("PARAMETER=MEAN,DEVIATION", "What is known of a parameter")] = None,
-    bounds: Annotated[list[str] | None, repeated("PARAMETER=LOWER,UPPER", "Between which a parameter is")] = None,
+    prior: Annotated[list[str] | None, repeated("PARAMETER=MEAN,DEVIATION", "Prior of a parameter")] = None,
+    bounds: Annotated[list[str] | None, repeated("PARAMETER=LOWER,UPPER", "Bounds of a parameter")] = None,
     sensor: Annotated[
         list[str] | None, repeated("LABEL=BODY:X,Y,Z[,R,P,Y]", "Where a sensor sits on a body [m, rad]")
     ] = None,
@@ -211,21 +214,25 @@ def identify(
 def excite(
     model: Any,
     file: Path,
-    parameters: Annotated[str | None, names_option("Parameters to be told", "all")] = None,
-    duration: Annotated[float, typer.Option(help="Of the motion [s].")] = 5.0,
-    period: Annotated[float, typer.Option(help="Between samples [s], at which inputs change too.")] = 0.01,
+    parameters: Annotated[str | None, names_option("Parameters to identify", "all")] = None,
+    duration: Annotated[float, typer.Option(help="Duration of the motion [s].")] = 5.0,
+    period: Annotated[float, typer.Option(help="Time between samples [s]; inputs change at samples.")] = 0.01,
     x0: Annotated[
         str | None,
         typer.Option(
-            metavar="NUMBERS", show_default="the model's", help="The first state, at rest, with commas between."
+            metavar="NUMBERS", show_default="the model's", help="The initial state, at rest, with commas between."
         ),
     ] = None,
-    noise: Annotated[list[str] | None, repeated("STATE=DEVIATION", "What is measured, and how well")] = None,
-    limit: Annotated[list[str] | None, repeated("NAME=MOST|LOWER,UPPER", "Of a state or an input")] = None,
-    harmonics: Annotated[int, typer.Option(help="Frequencies of the series.")] = 4,
-    max_iterations: Annotated[int, typer.Option(min=0, help="Of the search; 0: the best of random motions.")] = 20,
+    noise: Annotated[
+        list[str] | None, repeated("STATE=DEVIATION", "A measured state and the standard deviation of its noise")
+    ] = None,
+    limit: Annotated[list[str] | None, repeated("NAME=MOST|LOWER,UPPER", "Limits of a state or an input")] = None,
+    harmonics: Annotated[int, typer.Option(help="Number of frequencies in the input signals.")] = 4,
+    max_iterations: Annotated[
+        int, typer.Option(min=0, help="Iterations of the search; 0 takes the best of the random motions.")
+    ] = 20,
     seed: Seed = 0,
-    out: Annotated[Path | None, typer.Option(dir_okay=False, help="A CSV file to write, of motion and inputs.")] = None,
+    out: Annotated[Path | None, typer.Option(dir_okay=False, help="CSV file to write, with motion and inputs.")] = None,
 ) -> None:
     """Find inputs for MODEL whose recording tells its parameters, and say how well it will tell each.
 

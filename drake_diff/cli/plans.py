@@ -49,14 +49,15 @@ PAUSE = 5.0  # [s] between two lines of progress where there is no terminal
 
 def plan(
     robot: Annotated[
-        Path | None, typer.Argument(metavar="ROBOT", help="A URDF, SDF, MJCF (.xml) or .dmd.yaml file; else a Panda.")
+        Path | None,
+        typer.Argument(metavar="ROBOT", help="A URDF, SDF, MJCF (.xml) or .dmd.yaml file. Default: a Panda."),
     ] = None,
     goal: Goals = None,
     avoid: Obstacles = None,
-    time: Annotated[str | None, typer.Option(help="least: as fast as can be; else with the least effort.")] = None,
+    time: Annotated[str | None, typer.Option(help="least: the least time. Default: the least effort.")] = None,
     out: Annotated[Path | None, out_option("artifacts/plan_<robot>")] = None,
     seed: Seed = 0,
-    restarts: Annotated[int, typer.Option(min=0, help="More first guesses, to list other optima.")] = 0,
+    restarts: Annotated[int, typer.Option(min=0, help="Additional initial guesses, to list other optima.")] = 0,
     without_meshes: WithoutMeshes = False,
     packages: Packages = None,
 ) -> None:
@@ -96,7 +97,7 @@ def plan(
             done = planned(file, **asked, report=lambda stage, sentence: report(f"{stage:9} {sentence}"))
     except KeyboardInterrupt as error:
         show("; ".join(("interrupted", *getattr(error, "__notes__", ()))))
-        show("drake-diff recover measures the plan there, if there is one")
+        show("`drake-diff recover` measures the plan of that directory, if it has one")
         raise typer.Exit(INTERRUPTED) from None
     show(judged("pass" if done.success else "fail"), f" {file.name}: {done.solution.status.value}")
     for line in done.lines:

@@ -88,10 +88,10 @@ def _run_into(directory: Path, script: Path, cross_check: bool, options: dict[st
             try:
                 problem, asked = _asked(script, cross_check)
             except KeyboardInterrupt:
-                sentence = "the run was interrupted while its problem was set up, before the search began"
+                sentence = "the run was interrupted during the setup of its problem, before the search began"
                 with held_interrupts():
                     record_without_problem(directory.name, sentence).begin(folder)
-                show(f"{sentence}; a record that says so is in {folder}")
+                show(f"{sentence}; its record is in {folder}")
                 raise typer.Exit(INTERRUPTED) from None
             return _solved_into(directory, folder, problem, asked | options, cross_check, meshes)
     except KeyboardInterrupt:
@@ -113,7 +113,9 @@ def _asked(script: Path, cross_check: bool) -> tuple[Any, dict[str, Any]]:
     if not isinstance(problem, (Problem, PhasedProblem)):
         raise InputError("problem()", got=type(problem).__name__, expected="a Problem or a PhasedProblem")
     if cross_check and not (isinstance(problem, Problem) and problem.has_model):
-        raise InputError("--cross-check", got="a problem without a model, or in phases", expected="a model's problem")
+        raise InputError(
+            "--cross-check", got="a problem without a model, or in phases", expected="a Problem with a model"
+        )
     if not isinstance(options, dict):
         raise InputError("solve_options", got=type(options).__name__, expected="a dictionary")
     known = [name for name in inspect.signature(solve).parameters if name not in OURS]
@@ -162,16 +164,16 @@ def _solved_into(
             hooked = replace(options.pop("options", Options()), on_start=on_start, on_plan=on_plan)
             solution: Any = solve(problem, progress=report, options=hooked, **options)
         if checked:
-            with progress_line("replaying it in other plants"):
+            with progress_line("replaying the plan in other simulators"):
                 solution = cross_check(solution)
         with plan_kept(solution, directory.name, folder):
             record: Any = write_run(solution, folder, meshes=meshes)
     except KeyboardInterrupt:
         with held_interrupts():
             begin_interrupted(folder, problem)
-        show(f"interrupted: what there is of the run is in {folder}")
+        show(f"interrupted: the partial run is in {folder}")
         if begun:
-            show(plain(f"drake-diff recover {shlex.quote(str(folder))} measures its plan, if there is one"))
+            show(plain(f"drake-diff recover {shlex.quote(str(folder))} measures its plan, if it has one"))
         raise typer.Exit(INTERRUPTED) from None
     except Exception as error:
         if begun and not isinstance(error, WriteError):
@@ -179,7 +181,7 @@ def _solved_into(
         raise
     if record.solver.status == "interrupted" and is_taken(directory):
         show(judged(record.verdict), f" interrupted: {record.sentence}")
-        show(f"{directory} has an earlier run, which stays; this one is in {folder}")
+        show(f"{directory} has an earlier run and is unchanged; this run is in {folder}")
         raise typer.Exit(1)
     return record
 
@@ -231,8 +233,8 @@ def _show_record(record: Any) -> None:
 def verify(
     run: RunDirectory,
     models: ModelFolder = None,
-    time_limit: Annotated[float, typer.Option(help="Seconds that making it again may take.")] = 60.0,
-    memory_limit: Annotated[float, typer.Option(help="GiB of memory that it may take.")] = 1.0,
+    time_limit: Annotated[float, typer.Option(help="Time limit of the new computation [s].")] = 60.0,
+    memory_limit: Annotated[float, typer.Option(help="Memory limit of the new computation [GiB].")] = 1.0,
 ) -> None:
     """Check every file of RUN, run it again from its own files, and compare record, trace and pages.
 
@@ -255,7 +257,9 @@ def verify(
 
 @memory_at_most(MOST_MEMORY)
 def list_all(
-    directory: Annotated[Path, typer.Argument(metavar="DIRECTORY", help="Where the runs are.")] = Path("artifacts"),
+    directory: Annotated[Path, typer.Argument(metavar="DIRECTORY", help="The directory with the runs.")] = Path(
+        "artifacts"
+    ),
 ) -> None:
     """List the records in DIRECTORY and their verdicts as written; `verify` checks them."""
     from drake_diff.runs.view import list_runs

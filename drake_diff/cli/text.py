@@ -24,10 +24,11 @@ GREEN, RED, YELLOW = ("pass", "holds", "agree"), ("fail", "broken", "error", "da
 
 RunDirectory = Annotated[Path, typer.Argument(metavar="RUN", help="A run directory.")]
 ModelFolder = Annotated[
-    Path | None, typer.Option("--models", help="A folder below which meshes and models that RUN names may be read.")
+    Path | None, typer.Option("--models", help="A folder from which meshes and models that RUN names may be read.")
 ]
 WithoutMeshes = Annotated[
-    bool, typer.Option("--without-meshes", help="Leave the meshes where they are; verify needs --models then.")
+    bool,
+    typer.Option("--without-meshes", help="Do not copy the meshes into the run directory; verify then needs --models."),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="The same seed gives the same draws.")]
 
@@ -44,10 +45,10 @@ def names_option(what: str, otherwise: str) -> Any:
 
 def repeated(metavar: str, what: str) -> Any:
     """An option that can be given several times."""
-    return typer.Option(metavar=metavar, help=f"{what}. Can be given again.")
+    return typer.Option(metavar=metavar, help=f"{what}. Repeatable.")
 
 
-Packages = Annotated[list[str] | None, repeated("NAME=FOLDER", "Where a package:// is")]
+Packages = Annotated[list[str] | None, repeated("NAME=FOLDER", "Folder of a package:// name")]
 
 
 def packages_in(given: list[str] | None) -> dict[str, str] | None:
@@ -86,22 +87,28 @@ def _load(
     contact_model: Annotated[str, typer.Option(help="point, hydroelastic or hydroelastic_with_fallback")] = "point",
     contact_approximation: Annotated[str, typer.Option(help="sap, similar or lagged")] = "sap",
     contact_geometry: Annotated[
-        str | None, typer.Option(help="For pairs that Drake refuses: corner_spheres, hydroelastic or differences")
+        str | None,
+        typer.Option(help="Contact geometry where Drake refuses pairs: corner_spheres, hydroelastic or differences"),
     ] = None,
     actuators: Annotated[
-        str | None, typer.Option(metavar="all|NAMES|NAME=EFFORT,...", help="Joints to drive beside those of the file.")
+        str | None,
+        typer.Option(metavar="all|NAMES|NAME=EFFORT,...", help="Joints to drive in addition to those of the file."),
     ] = None,
     base: Annotated[
         str | None,
-        typer.Option(metavar="weld|free|FRAME", help="weld fixes what floats; a frame is put at the origin."),
+        typer.Option(
+            metavar="weld|free|FRAME", help="weld fixes a floating base; FRAME is welded to the world's origin."
+        ),
     ] = None,
-    fix_joints: Annotated[str | None, names_option("Joints to replace by welds", "none")] = None,
-    meshes: Annotated[str, typer.Option(help="What becomes of collision meshes: skip, convex or spheres")] = "skip",
+    fix_joints: Annotated[str | None, names_option("Joints to fix by welds", "none")] = None,
+    meshes: Annotated[str, typer.Option(help="Treatment of collision meshes: skip, convex or spheres")] = "skip",
     packages: Packages = None,
-    mimic: Annotated[str | None, typer.Option(help="Joints that follow others: reduce or fix")] = None,
+    mimic: Annotated[str | None, typer.Option(help="Treatment of mimic joints: reduce or fix")] = None,
     ground: Annotated[
         str | None,
-        typer.Option(metavar="FRICTION", help="Add a floor at z = 0 with this friction; true: the usual one."),
+        typer.Option(
+            metavar="FRICTION", help="Add a ground at z = 0 with this friction coefficient; true: the default one."
+        ),
     ] = None,
     gravity: Annotated[
         str | None, typer.Option(metavar="X,Y,Z", show_default="0,0,-9.81", help="Gravity in m/s^2.")

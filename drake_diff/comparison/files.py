@@ -303,7 +303,7 @@ def _gap_plots(comparison: Comparison) -> Iterator[Plot]:
         columns = [_on(e.motion.times, ours, x) for x in ours.xs.T]
         distance = np.abs(e.motion.xs - np.array(columns).T).max(axis=1)
         distances.append(Line(e.engine, _on(ours.times, e.motion, distance)))
-    note = "of one step to Drake's from the same state, relative to the state; 0 is not on a log scale"
+    note = "difference of one step from Drake's, relative to the state, from the same state; a log scale omits 0"
     yield Plot("gap of each step", "1", ours.times, steps, log=True, note=note, group="Gaps")
     note = "the largest difference of a state, in its own unit"
     yield Plot("distance from Drake's motion", "q, v", ours.times, distances, log=True, note=note, group="Gaps")
@@ -317,7 +317,7 @@ def _measure_plots(comparison: Comparison) -> Iterator[Plot]:
             energies.append(Line(e.engine, _on(times, e.motion, e.motion.energy - e.motion.energy[0])))
         if e.motion.depth is not None:
             depths.append(Line(e.engine, _on(times, e.motion, e.motion.depth)))
-    note = "kinetic and potential, less that at the start; inputs, damping and contact change it too"
+    note = "kinetic and potential energy, minus their sum at the start; inputs, damping and contact change it too"
     yield Plot("energy", "J", times, energies, note=note, group="Energy and contact")
     note = "the deepest overlap that the engine finds"
     yield Plot("penetration", "m", times, depths, note=note, group="Energy and contact")

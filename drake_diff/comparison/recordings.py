@@ -117,8 +117,8 @@ class _Found:
                 xs[k, model.nq + j : model.nq + j + 6] = bases[link.body][time][7:]
             for i, joint in enumerate(self.description.actuated if k < len(us) else ()):
                 if self.description.actuated.count(joint) > 1:
-                    expected = "one effort, one input"
-                    raise InputError(f"joint {joint}", got="not driven by one actuator alone", expected=expected)
+                    expected = "a joint with one actuator"
+                    raise InputError(f"joint {joint}", got="several actuators", expected=expected)
                 us[k, i] = self._joint(joints[time], time, joint, "effort")
         return np.array([time - stamps[0] for time in stamps]) / 1e9, xs, us
 
@@ -145,7 +145,7 @@ class _Found:
         names, values = list(message.name), getattr(message, what)
         subject = f"{self.path}: JointState at {time} ns, {what} of {joint}"
         if joint not in names or len(values) != len(names):
-            raise InputError(subject, got=f"{len(values)} of {', '.join(names)}", expected="one of each joint")
+            raise InputError(subject, got=f"{len(values)} of {', '.join(names)}", expected="one value for each joint")
         value = float(values[names.index(joint)])
         if not np.isfinite(value):
             raise InputError(subject, got=value, expected="a finite number")
@@ -187,7 +187,7 @@ class _Found:
         for t, pose in poses.items():
             frame, world = twists[t].header.frame_id, pose.header.frame_id
             if (frame != world and frame not in _names(link.body)) or world in _names(link.body):
-                expected = f"{world!r}, the pose's, or {link.body!r}, the body"
+                expected = f"the frame of the pose, {world!r}, or the body, {link.body!r}"
                 raise InputError(f"{self.path}: frame_id of TwistStamped", got=repr(frame), expected=expected)
             bases[t] = _base(pose.pose, twists[t].twist, in_body=frame != world)
         return bases
@@ -356,7 +356,7 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None, g
     """
     path = Path(path)
     if not path.exists():
-        raise InputError("recording", got=f"{path}, which is not there", expected=SUFFIXES)
+        raise InputError("recording", got=f"{path}, which does not exist", expected=SUFFIXES)
     facts: Mapping[str, str] = {}
     outputs: dict[str, Array] = {}
     with reading(path, "a ROS 2 bag" if path.is_dir() else f"a complete {path.suffix} file"):

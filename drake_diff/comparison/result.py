@@ -171,7 +171,7 @@ class Compared:
             clauses.append(f"each of {len(self.step_gaps)} steps within {gap} of Drake's")
         else:
             terms = _list(list(dict.fromkeys((self.first.responsible, self.largest.responsible))))
-            start = f"apart from t = {self.motion.times[self.first_apart]:.4g} s on"
+            start = f"different from t = {self.motion.times[self.first_apart]:.4g} s on"
             clauses.append(f"{start}, by up to {gap} of the state in one step, by its {terms}")
         if self.other_states:
             i = max(self.other_states, key=lambda state: self.jacobian_gaps[state])
@@ -263,7 +263,7 @@ def sentence_of(engines: Sequence[Compared | EngineEvidence]) -> str:
     after_contact = any(
         "contact law" in (e.first.responsible, e.largest.responsible) for e in others if e.verdict != "same"
     )
-    note = " From the first touch on a state is only as good as the contact law: examples/studies/contact_table.py."
+    note = " After the first contact a state is only as accurate as the contact law: examples/studies/contact_table.py."
     return f"{'; '.join(parts)}.{note if after_contact else ''}"
 
 

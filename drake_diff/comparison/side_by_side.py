@@ -167,7 +167,9 @@ def _check_contact(reference: Engine, engine: Engine) -> None:
     lines = contact_lines(Match(reference, engine))
     lacking = [line for line in lines if line.quantity in MUST_HAVE and line.verdict == "different" and line.reason]
     if lacking:
-        raise ModelError(f"it does not have the model's contacts ({lacking[0].reason}); name it to compare it even so")
+        raise ModelError(
+            f"it does not have the model's contacts ({lacking[0].reason}); name the engine to compare it anyway"
+        )
 
 
 class _Panel:

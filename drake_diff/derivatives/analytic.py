@@ -43,7 +43,7 @@ SAME_STEP = 1e-12  # of the largest entry of x' (or 1): the same positions, summ
 CERTIFIED_STATES, STATES_TRIED = 3, 60
 FAR = 4.0  # [m or rad]
 ACTS = "contact, a limit or a constraint acts"
-BESIDE = "something else acts beside contact, joint limits and couplers"
+BESIDE = "forces other than contact, joint limits and couplers act"
 DIFFERS, STEP_DIFFERENCES = "its Jacobian with impulses differs from", "the differences of the step solved to rounding"
 
 
@@ -59,7 +59,7 @@ class Analytic:
         """All in one call."""
         parameters, count = steps.vector.parameters, steps.model.nx + steps.model.nu
         if parameters and any(p.kind.quantity not in QUANTITIES for p in parameters):
-            return Refusal("derivatives by parameters other than of contact are asked for")
+            return Refusal("derivatives by parameters other than those of contact are requested")
         if steps.model.coupling is not None:
             return self._of_reduced(steps, steps.model.coupling)
         smooth = analytic_of(steps.model)
@@ -87,7 +87,7 @@ class Analytic:
         """Where mimic joints are reduced: from the whole plant's."""
         model = steps.model
         if steps.vector.parameters:
-            return Refusal("mimic joints are reduced, and parameters are asked for")
+            return Refusal("derivatives by parameters are requested of a model with reduced mimic joints")
         smooth = analytic_of(model.whole)
         if isinstance(smooth, Refusal):
             return smooth
@@ -155,7 +155,7 @@ def _first_difference(model: Model, smooth: SmoothStep) -> str:
         try:
             missing = differentiate_equation(smooth.form, steps, 0, exact)
         except (SimulationError, ModelError) as error:
-            return f"AutoDiffXd, to certify it by, is refused: {error}"
+            return f"AutoDiffXd cannot certify it: {error}"
         if not missing <= RESIDUAL_TOLERANCE:
             return f"its step leaves {missing:.2g} of the forces in Drake's equation"
         moved = x[: model.nq] + model.time_step * np.asarray(model.double.rates(v_next)) - ends[0, : model.nq]
@@ -167,7 +167,7 @@ def _first_difference(model: Model, smooth: SmoothStep) -> str:
         left -= 1
         if not left:
             return ""
-    return f"of {STATES_TRIED} random states in all but {CERTIFIED_STATES - left} controllers are at their limits"
+    return f"controllers reach their limits at all but {CERTIFIED_STATES - left} of {STATES_TRIED} random states"
 
 
 def _random_point(model: Model, coordinates: Coordinates, random: np.random.Generator) -> tuple[Array, Array]:
@@ -253,7 +253,7 @@ def _unlike_differences(steps: Steps, k: int, jacobian: Array, *, iterated: bool
     for size in DIFFERENCES:
         sides = _differences(steps, k, size)
         if isinstance(sides, Refusal):
-            return f"neither AutoDiffXd nor differences are had to certify it by: {sides}", ""
+            return f"neither AutoDiffXd nor differences can certify it: {sides}", ""
         forward, backward = sides
         central = (forward + backward) / 2
         if _gap(jacobian, central) <= SAME_DIFFERENCES:

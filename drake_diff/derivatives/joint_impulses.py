@@ -203,13 +203,13 @@ def _read(model: Model, constraint: Any) -> tuple[Array, float] | Refusal:
     try:
         probes = [_probe(model, context, random) for _ in range(PROBES)]
     except RuntimeError as error:
-        return Refusal(f"a constraint acts, which could not be read: {error}")
+        return Refusal(f"a constraint acts that could not be read: {error}")
     positions, _, single = single_joints(model)
     position, velocity = positions[single], np.flatnonzero(single)
     impulse = probes[0][2]
     coupled = np.flatnonzero(np.abs(impulse) > SAME * np.abs(impulse).max())
     if len(coupled) != 2 or not np.isin(coupled, velocity).all():
-        return Refusal("a constraint acts that couples no two joints")
+        return Refusal("a constraint acts that does not couple two joints")
     direction = np.zeros(model.nv)
     direction[coupled] = impulse[coupled] / impulse[coupled[0]]
     q = np.zeros((PROBES, model.nv))
@@ -219,9 +219,9 @@ def _read(model: Model, constraint: Any) -> tuple[Array, float] | Refusal:
         R = NEAR_RIGID * float((direction**2 / np.diag(A)).sum())
         offsets.append(float(direction @ q[k] + 2 * model.time_step * (R * impulse[coupled[0]] + direction @ v_next)))
         if not np.abs(impulse - impulse[coupled[0]] * direction).max() <= SAME * np.abs(impulse).max():
-            return Refusal("a constraint acts that couples no two joints")
+            return Refusal("a constraint acts that does not couple two joints")
     if not np.ptp(offsets) <= SAME:
-        return Refusal("a constraint acts between two joints that is no coupler")
+        return Refusal("a constraint between two joints acts that is not a coupler")
     return direction, float(np.mean(offsets))
 
 

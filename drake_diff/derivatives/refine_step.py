@@ -512,8 +512,8 @@ def _solved(
     whys = {}
     for i in np.flatnonzero(~(left <= DRAKES_STOP)):
         whys[int(i)] = (
-            f"Drake's step leaves {left[i]:.2g} of the momentum in the equation known here, its solver stops at "
-            f"{SAP_RELATIVE_TOLERANCE:g}: the equation is not Drake's"
+            f"Drake's step leaves {left[i]:.2g} of the momentum in the equation of drake_diff, but Drake's solver "
+            f"stops at {SAP_RELATIVE_TOLERANCE:g}: the equation is not Drake's"
         )
     for i in np.flatnonzero(~(elsewhere <= FREE_STEP)):
         whys[int(i)] = f"Drake's step without impulses differs by {elsewhere[i]:.2g} of the momentum"

@@ -114,8 +114,8 @@ def check_parity(model: Model, autodiff: Array, double: Array) -> None:
     if not np.all(excess <= 0):  # NaN must not pass
         worst = int(np.argmax(np.where(np.isnan(excess), np.inf, excess)))
         raise GradientError(
-            f"the AutoDiffXd step is not the double step: {model.state_names[worst]} is {autodiff[worst]:.12g} "
-            f"there and {double[worst]:.12g} here, tolerance {PARITY_TOLERANCE:g} relative"
+            f"the AutoDiffXd step differs from the double step: {model.state_names[worst]} is {autodiff[worst]:.12g} "
+            f"and not {double[worst]:.12g}, relative tolerance {PARITY_TOLERANCE:g}"
         )
 
 
@@ -316,7 +316,7 @@ def _ask(order: tuple[Source, ...], steps: Steps, method: str, whys: list[str], 
     """`whys` (N,) is what the sources before had against each step, `error` the last of it."""
     if not order:
         if steps.taken and method == ANALYTIC.name:
-            raise GradientError(f"asked for by name, the analytic derivative is not known of a step: {whys[0][:-2]}")
+            raise GradientError(f"method analytic: no analytic derivative of this step is known: {whys[0][:-2]}")
         if steps.taken and error is not None:
             raise error
         return choose(take_steps(steps.model, steps.vector, steps.xs[0], steps.us, steps.xs), method)

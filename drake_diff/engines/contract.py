@@ -148,7 +148,7 @@ class Match:
         """M and bias at random states in Drake's coordinates; of a closed form the parts of its forces."""
         kinds = [j.kind for j in self.one.joints]
         if kinds != [j.kind for j in self.two.joints]:
-            why = "not comparable: the joints are of other types"
+            why = "not comparable: the joint types differ"
             return ContractLine("M(q)", "different", why), ContractLine("bias(q, v)", "different", why)
         random, (a, b) = np.random.default_rng(0), self.engines
         states = [_random_state(kinds, random) for _ in range(RANDOM_STATES)]

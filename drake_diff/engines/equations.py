@@ -255,7 +255,7 @@ class ClosedForm(Arguments):
         raise self._not_offered("forces alone")
 
     def _not_offered(self, what: str) -> NotOfferedError:
-        return NotOfferedError(f"{self.name}: accelerations say nothing of {what}")
+        return NotOfferedError(f"{self.name}: a function of accelerations does not provide {what}")
 
     @property
     def contract(self) -> EngineContract:
@@ -298,11 +298,11 @@ def _how_different(wanted: Array, given: Array) -> str:
     size, gap = float(wanted @ wanted), float(np.abs(given - wanted).max())
     at_most = f"off by up to {gap:.4g} of {np.abs(wanted).max():.4g}"
     if not size:
-        return f"{at_most}: it is to be 0"
+        return f"{at_most}: expected 0"
     factor = float(given @ wanted) / size
     if np.abs(given - factor * wanted).max() > ALONE * max(float(np.abs(given).max()), ALONE * np.abs(wanted).max()):
         return at_most
-    return f"{at_most}: {factor:.6g} times what it is to be"
+    return f"{at_most}: {factor:.6g} times the expected value"
 
 
 def _name_of(function: Any) -> str:

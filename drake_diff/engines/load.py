@@ -71,9 +71,7 @@ def load_engine(name: str, model: Any, **options: Any) -> Engine:
     module, kind = ENGINES[name]
     if isinstance(model, Model) and model.coupling is not None and name != "drake":
         if name not in TAKEN:
-            raise ModelError(
-                f'{name} does not take mimic joints that are reduced: {", ".join(TAKEN)} do, or mimic="fix"'
-            )
+            raise ModelError(f'{name} does not support reduced mimic joints: use {", ".join(TAKEN)}, or mimic="fix"')
         return ReducedEngine(load_engine(name, model.whole, **options), model)
     with _safe_children():
         engine: Engine = getattr(import_module(f"drake_diff.{module}"), kind)(model, **options)

@@ -78,7 +78,7 @@ class NewtonEngine(RigidEngine):
         contacts = self._contacts(before)
         self.solver.step(before, after, control, contacts, self.time_step)
         contact_count, room = 0 if contacts is None else int(contacts.rigid_contact_count.numpy()[0]), _count(contacts)
-        self.status = "ok" if contact_count <= room else f"{contact_count} contacts, and Newton has room for {room}"
+        self.status = "ok" if contact_count <= room else f"{contact_count} contacts, but Newton's buffer holds {room}"
         return self._drakes(after, x, u)
 
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
@@ -88,7 +88,7 @@ class NewtonEngine(RigidEngine):
         """
         x, u = self._point(x, u)
         if self.contact_depth(x) > 0:
-            raise NotOfferedError("Newton's tape does not differentiate where bodies touch, and here they do")
+            raise NotOfferedError("Newton's tape does not differentiate contact, and bodies touch in this state")
         before, control = self._given(x, u)
         after, tape = self.newton.state(requires_grad=True), wp.Tape()
         with tape:

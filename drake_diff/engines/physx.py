@@ -251,7 +251,7 @@ def groups_by_shape(pairs: tuple[PairContract, ...]) -> dict[str, tuple[int, int
     partners = {a: frozenset(b for pair in pairs if a in pair.names for b in pair.names if b != a) for a in names}
     kinds = list(dict.fromkeys(partners[name] for name in names))
     if len(kinds) > GROUPS:
-        raise ModelError(f"PhysX can tell {GROUPS} groups of shapes apart; this model needs {len(kinds)}")
+        raise ModelError(f"PhysX supports {GROUPS} collision groups; this model needs {len(kinds)}")
     bit = {name: 1 << kinds.index(partners[name]) for name in names}
     masks = dict.fromkeys(names, 0)
     for name in names:

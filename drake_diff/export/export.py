@@ -291,7 +291,7 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
     if target not in TARGETS:
         raise UnknownNameError("target", got=target, known=TARGETS)
     if directory.exists() or not directory.parent.is_dir():
-        raise InputError("directory", got=str(directory), expected="one that does not exist, in one that does")
+        raise InputError("directory", got=str(directory), expected="a new directory in an existing one")
     samples = sample_states(model, positive_int("states", states), seed)
     form, description = TARGETS[target], describe_whole(model)
     text = written(form, description, model.time_step)
@@ -305,8 +305,8 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
             from drake_diff.export import usd
 
             made_usd = {"model.usda": usd.usd(description)}
-            losses = "; ".join(usd.lost(description)) or "nothing that is missed"
-            about_usd = f"`model.usda` is the same model in USD, in float32. It does not say: {losses}."
+            losses = "; ".join(usd.lost(description)) or "nothing"
+            about_usd = f"`model.usda` is the same model in USD, in float32. It lacks: {losses}."
         except (MissingDependencyError, ModelError) as error:
             about_usd = f"No USD is written: {error}. UrdfConverter makes one."
     names = {g.name: collision_name(g.name) if form == "sdf" else g.name for g in description.geometries}
@@ -350,8 +350,8 @@ def _followers_text(followers: Sequence[Follower]) -> str:
         return "none."
     listed = "; ".join(map(str, followers))
     return (
-        f"{listed} (m and rad). The file says so. Check that your reader holds them, and that they start so. "
-        "A recording has no columns of them."
+        f"{listed} (m and rad), as in the file. Check that your reader enforces it, also at the start. "
+        "A recording has no columns for these joints."
     )
 
 

@@ -558,7 +558,7 @@ class Candidates(Ranking):
             z, starts = solved.z, solved.starts
             shorter = fit.shorter
             if shorter is not None and not problem.follows(fit, z, starts):
-                solved = replace(solved, converged=False, why="its steps are too long for the motion")
+                solved = replace(solved, converged=False, why="the integration steps are too long for the motion")
                 fit = problem.fit(shorter, pieces, fit.noise)
                 continue
             size = noise_of(fit, solved)

@@ -79,7 +79,7 @@ def mistakes(model: Model, chart: Chart, pieces: Sequence[Excerpt]) -> list[Mist
         add(f"columns {names[a]} and {names[b]} are exchanged", (a, b), (b, a))
     measured = [[i for i in pair if seen[i]] for pair in (*along, *turning)]
     for alone in (*_sets(*((both, *([i] for i in both)) for both in measured)), *((i,) for i in inputs)):
-        add(f"{_listed([names[i] for i in alone])} the other sign", alone, alone, -1.0)
+        add(f"{_listed([names[i] for i in alone])} the opposite sign", alone, alone, -1.0)
     angles = [i for i, _ in turning if seen[i]]
     rates = [i for i in (*(j for _, j in turning), *spins) if seen[i]]
     for group in _sets((angles + rates, angles, rates)):

@@ -112,7 +112,7 @@ class ContactExplanation(Ranking):
         if base.explains:
             return self.nothing()
         near = min(tried, key=self.bic, default=None)
-        what = f"with {near.names[0]}, {near.doubt}" if near and near.doubt else "none comes near it"
+        what = f"with {near.names[0]}, {near.doubt}" if near and near.doubt else "no change comes close"
         return self.unexplained(f"{NO_CHANGE}; {what}.")
 
     def is_nothing(self, candidate: Tried) -> bool:
@@ -229,7 +229,7 @@ class ContactExplanation(Ranking):
         candidate = self.judge(names, self.problem(unknowns, stage.fit.segments.pieces), stage.fit, solved)
         if stage.stage == len(self.stages) - 1:
             return candidate
-        return candidate._replace(score=np.inf, doubt="its motion leaves the recordings")
+        return candidate._replace(score=np.inf, doubt="its motion departs from the recordings")
 
     def unchanged(self, pieces: Sequence[Excerpt]) -> tuple[float, bool]:
         """How well the model as it is goes through other pieces."""

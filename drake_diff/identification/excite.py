@@ -220,7 +220,7 @@ class _Design:
             for joint in joints(model.plant):
                 for i in model.places(joint)[0] if joint.num_positions() == 1 else ():
                     if not np.isfinite(high[i] - low[i]) and joint.type_name() == "prismatic":
-                        got, expected = "none", "some, as the model has none of its own"
+                        got, expected = "none", "limits, as the model sets no limits"
                         raise InputError(f"limits of {names[i]}", got=got, expected=expected)
                     low[i] = low[i] if np.isfinite(low[i]) else self.x0[i] - np.pi
                     high[i] = high[i] if np.isfinite(high[i]) else self.x0[i] + np.pi
@@ -234,7 +234,7 @@ class _Design:
             low, high = low[self.model.nx :], high[self.model.nx :]
             for name, a, b in zip(self.model.input_names, low, high, strict=True):
                 if not np.isfinite(b - a):
-                    raise InputError(f"limits of {name}", got="none", expected="some, as the model has none of its own")
+                    raise InputError(f"limits of {name}", got="none", expected="limits, as the model sets no limits")
             return np.zeros(len(low)), np.minimum(-low, high)
         q0, nq = self.x0[: self.model.nq], self.model.nq
         for name, q, a, b in zip(self.model.position_names, q0, low, high, strict=False):
@@ -345,7 +345,7 @@ class _Design:
         cut = Fit(self.model, self.law, self.chart, self.unknowns, growth_cuts(fit, z, starts), self.noise)
         point = cut.at(z, self.starts(cut))
         if point is None:
-            raise ModelError(f"{self.model.name} has no motion under the inputs that were planned")
+            raise ModelError(f"{self.model.name} has no motion under the planned inputs")
         R = cut.reduce(point).R
         return R, unidentifiable(self.unknowns, z, known_of(self.unknowns, z, R).open)
 
@@ -360,7 +360,7 @@ class _Design:
         random = np.random.default_rng(seed).standard_normal((RANDOM, size)) / np.sqrt(2 * self.harmonics)
         starts = [c for c in map(self.within, random) if c is not None]
         if not starts:
-            raise ModelError(f"{self.model.name}: no random motion from x0 keeps the limits without bodies that touch")
+            raise ModelError(f"{self.model.name}: no random motion from x0 keeps the limits and avoids contact")
         Rs = self.informed(*self.planned(self.rough, np.array(starts), self.few)[:2], self.few)
         norms = np.median([np.linalg.norm(R, axis=0) for R in Rs], axis=0)
         widths = self.unknowns.widths

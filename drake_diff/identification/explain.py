@@ -105,14 +105,14 @@ def explain(
     if why == TOUCH:
         return ContactExplanation(model, chart, pieces, given_noise(model, chart, noise)).explanation()
     if why or isinstance(tree, Refusal):
-        raise ModelError(f"{model.name}: causes are looked for in motions in continuous time only, and {why}")
+        raise ModelError(f"{model.name}: causes can be found in motion in continuous time only, and {why}")
     explanation = _Search(model, chart, pieces, given_noise(model, chart, noise), tree=tree).explanation()
     if explanation.explained or motion != "auto" or not may_touch(model, chart, pieces):
         return explanation
     touched = ContactExplanation(model, chart, pieces, given_noise(model, chart, noise)).explanation()
     if touched.explained:
         return touched
-    more = f"Where bodies touch, none that was tried explains it either{touched.sentence.removeprefix(NO_CHANGE)}"
+    more = f"With contact, no change that was tried explains it either{touched.sentence.removeprefix(NO_CHANGE)}"
     return replace(explanation, sentence=f"{explanation.sentence} {more}")
 
 

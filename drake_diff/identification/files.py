@@ -44,7 +44,7 @@ from drake_diff.runs.reproduce import contract_as, model_as
 REPORT = "report.html"
 MADE = (TRACE, REPORT)  # what is made again, beside the record
 OF_RECORDINGS = (
-    "inputs, model and the recordings: they are what was asked, and whether a robot moved so is for who recorded it; "
+    "inputs, model and recordings: they define the task, and only who made a recording knows if a robot moved so; "
     "recordings[...].sha256 is the hash of the file that was read"
 )
 MOST_PLOTS = 12  # of coordinates
@@ -89,7 +89,9 @@ def write_identification(identification: Identification, folder: Path, *, meshes
 def _check_file(name: str, path: Path, sha256: str, stored: Path) -> None:
     subject = f"recording {name}"
     if path.resolve().is_relative_to(stored):
-        raise InputError(subject, got=f"{path}, which is in the directory to be written", expected="one elsewhere")
+        raise InputError(
+            subject, got=f"{path}, which is in the directory to be written", expected="a path outside of it"
+        )
     if not path.exists() or hash_of(path) != sha256:
         raise ArtifactError(f"{subject}: {path} has changed since it was read")
     if (size := sum(file.stat().st_size for file in _files(path))) > LARGEST:
@@ -124,7 +126,7 @@ def _begun(name: str, asked: Request) -> FitRecord:
     return FitRecord(
         name=name,
         verdict="incomplete",
-        sentence="it is still being written, or that was killed or broke off",
+        sentence="the run is still being written, or writing it was killed or failed",
         model=model_input(asked.model),
         contract=contract_of(asked.model),
         inputs=inputs,
@@ -166,7 +168,7 @@ def _data(recordings: Sequence[records.RecordingEvidence]) -> DataBoundary:
     held_out = [use(r, span, not r.fitted_s) for r in recordings for span in r.held_out_s]
     fitted, stored = ("1 span" if len(uses) == 1 else f"{len(uses)} spans" for uses in (seen, held_out))
     statement = (
-        f"parameters were fitted on {fitted}, and the fit is judged on {stored} that it did not see, and its own"
+        f"parameters were fitted on {fitted}, and the fit is judged on these and on {stored} that it did not see"
     )
     names = [use.name for use in held_out]
     return DataBoundary(statement=statement, seen=seen, judged_on=[*seen, *held_out], held_out=names)
@@ -174,7 +176,9 @@ def _data(recordings: Sequence[records.RecordingEvidence]) -> DataBoundary:
 
 def _asked(e: Identification) -> Request:
     if e.asked is None:
-        raise InputError("identification", got="one without what was asked", expected="what dd.identify returned")
+        raise InputError(
+            "identification", got="an Identification without its request", expected="the result of dd.identify"
+        )
     return e.asked
 
 
@@ -261,7 +265,7 @@ def reproduce(folder: Path, record: FitRecord, models: Path | None) -> Reproduce
     `models` as in `rebuilt`.
     """
     if record.inputs.parameters == [] or not record.recordings:
-        raise ArtifactError(f"{record.FILE}: it names no parameters or no recordings")
+        raise ArtifactError(f"{record.FILE}: it lists no parameters or no recordings")
     carried = "" if record.model.file is None else record.model.file.path
     with rebuilt(folder, record, models) as model:
         given, files = zip(*(_stored(folder, record, i, model) for i in range(len(record.recordings))), strict=True)
@@ -276,7 +280,7 @@ def reproduce(folder: Path, record: FitRecord, models: Path | None) -> Reproduce
         write_made(Path(location), again, made)
         contents = {name: (Path(location) / name).read_bytes() for name in MADE}
     lacking = (name for name in MADE if name not in record.files)
-    problems = tuple(f"{name}: every fit is written with it, and the directory has none" for name in lacking)
+    problems = tuple(f"{name}: the file is missing, and every fit is written with it" for name in lacking)
     stored = [name for name in record.files if any(name.startswith(r.path) for r in record.recordings)]
     written = (carried, *stored, *MADE)
     return Reproduced(
@@ -338,7 +342,7 @@ def _motion_plots(e: Identification) -> Iterator[Plot]:
     for i, recording in enumerate(_asked(e).recordings):
         times, ys, xs, before = _joined(e, i)
         for j in [j for j in range(model.nx) if np.any(np.isfinite(ys[:, j]))][:MOST_PLOTS]:
-            lines = [Line("measured", ys[:, j]), Line("with the values found", xs[:, j])]
+            lines = [Line("measured", ys[:, j]), Line("with the estimated values", xs[:, j])]
             if np.any(np.isfinite(before[:, j])):
                 lines.append(Line("with the model's own values", before[:, j], dashed=True))
             yield Plot(model.state_names[j], units[j], times, lines, group=recording.name)

@@ -38,7 +38,7 @@ HALVINGS = 8
 FARTHER = 3.0  # by which a step may lead farther each time that a whole one did well, where motion kinks
 NEAR = 10.0  # times how well a velocity is known from the samples around: about how far a step leads where motion kinks
 TOO_LARGE = 1e100  # of a derivative, in units of the noise: its square is beyond what numbers hold
-STUCK = "no part of a step made the motion nearer to what was measured"
+STUCK = "the line search found no motion that is closer to the measurements"
 NO_PRIOR = 1e-7  # [1/rad, 1/m] what keeps a first state that nothing measures from going anywhere
 
 
@@ -241,7 +241,7 @@ class Fit:
     def _continuous(self) -> TreeMotion:
         """The law, which has rates between its steps."""
         if isinstance(self.law, DiscreteMotion):
-            raise ModelError("sensors and delays of inputs are of motion in continuous time")
+            raise ModelError("sensors and delays of inputs need motion in continuous time")
         return self.law
 
     def _read_slopes(self, z: Array, s: Segments, xs: Array) -> list[tuple[Array, Array]]:
@@ -391,7 +391,7 @@ class Fit:
                 return Solved(here.z, here.starts, reduced, ended, steps, "" if ended else STUCK)
             reach = reach * FARTHER if fraction == 1.0 else max(reach / FARTHER, 1.0)
             here = ahead
-        return Solved(here.z, here.starts, reduced, False, most, "it took too many steps")
+        return Solved(here.z, here.starts, reduced, False, most, f"it reached the limit of {most} steps")
 
     def _promised(self, here: "FittedMotion", reduced: Reduced) -> tuple[Array, float]:
         """The step dz (np,), and how much less of |r|^2 it leaves by the linearized motion."""

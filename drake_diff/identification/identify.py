@@ -127,9 +127,7 @@ def identify(
     continuous = motion == "continuous" or (motion == "auto" and not why)
     own_tree = tree if continuous and not isinstance(tree, Refusal) else None
     if columns and own_tree is None:
-        raise ModelError(
-            f"{model.name}: sensors are read from motion in continuous time, and {why or 'steps are fitted'}"
-        )
+        raise ModelError(f"{model.name}: sensors need motion in continuous time, and {why or 'steps are fitted'}")
     outputs = choose_sensors(model, own_tree, columns, sensors)
     unknowns = choose_unknowns(model, own_tree, parameters, priors, bounds, columns)
     stated = given_noise(model, chart, noise, columns)
@@ -273,7 +271,7 @@ class Problem:
     def shortened(self, fit: Fit, pieces: Sequence[Excerpt], noise: Array) -> Fit:
         law = fit.shorter
         if law is None or np.max(fit.segments.hs) < SHORTEST:
-            raise ModelError(f"{self.model.name}: its motion is too stiff: {fit.law.words} does not follow it")
+            raise ModelError(f"{self.model.name}: its motion is too stiff for {fit.law.words}")
         return self.fit(law, pieces, noise)
 
     def weighted(self, fit: Fit, z: Array, starts: Array, most: int) -> tuple[Fit, Solved]:
@@ -348,7 +346,7 @@ class Problem:
         allowed = float(stats.f.ppf(0.999, left, max(freedom, 1))) * (1 + extra / left)
         if fixed.converged and errors[1] ** 2 <= allowed:
             return errors[0], errors[1], "", motions
-        why = f"samples that were held out are missed by {errors[1]:.3g} times the noise"
+        why = f"the error on held-out samples is {errors[1]:.3g} times the noise"
         return errors[0], errors[1], why, motions
 
     def doubt(self, fit: Fit, solved: Solved, why_not: str) -> str:
@@ -368,10 +366,10 @@ class Problem:
             if np.isfinite(self.stated[j]) and numbers[j]:
                 ratio = float(size[j] / self.stated[j])
                 if ratio**2 > stats.chi2.ppf(0.9999, numbers[j]) / numbers[j]:
-                    return f"what is left of {name} is {ratio:.3g} times the noise that was given"
+                    return f"the residual of {name} is {ratio:.3g} times the noise that was given"
             elif numbers[j] and size[j] > most_scatter(int(numbers[j]), len(names), jumps=self.jumps) * self.scatter[j]:
-                return f"what is left of {name} is {size[j] / self.scatter[j]:.3g} times the scatter of its samples"
+                return f"the residual of {name} is {size[j] / self.scatter[j]:.3g} times the scatter of its samples"
         name, p = colour_of(solved.reduced.residuals, names)
         if p < (FALSE_ALARM if self.jumps else COLOURED):
-            return f"what is left of {name} is not noise: it hangs together over time (probability {p:.1g})"
+            return f"the residual of {name} is not noise: it is correlated over time (probability {p:.1g})"
         return why_not

@@ -102,7 +102,7 @@ def steps_between(model: Model, piece: Excerpt) -> int:
     count = max(1, round(float(np.median(periods)) / model.time_step))
     if np.any(np.abs(periods - count * model.time_step) > CLOCK_TOLERANCE * model.time_step * count):
         got = f"from {1e3 * np.min(periods):.6g} to {1e3 * np.max(periods):.6g} ms"
-        expected = f"the same, and a whole number of steps of {1e3 * model.time_step:.6g} ms"
+        expected = f"one constant period, a whole number of steps of {1e3 * model.time_step:.6g} ms"
         raise InputError(f"times between samples of {piece.name}", got=got, expected=expected)
     return count
 
@@ -285,14 +285,14 @@ class ImpactSearch:
     def _scale(self, unknown: Unknown) -> tuple[float, bool]:
         """What w = 1 changes, and whether it is of the logarithm."""
         if unknown.quantity in (INERTIA, STRENGTH):
-            expected = "one of contact; see dd.identify"
+            expected = "a quantity of contact; see dd.identify"
             raise InputError(unknown.name, got="a quantity of smooth motion", expected=expected)
         if unknown.quantity == CENTER:
             return CENTER_SCALE * unknown.size, False
         if unknown.quantity == BIAS or unknown.name in self.lengths:
             return LENGTH_SCALE, False
         if not np.all(unknown.start > 0):
-            raise InputError(unknown.name, got=unknown.start, expected="a value above 0 to begin from")
+            raise InputError(unknown.name, got=unknown.start, expected="an initial value above 0")
         return LENGTH_SCALE / unknown.size if unknown.quantity == "radius" else LOG_SCALE, True
 
     def values(self, w: Array) -> Array:
@@ -518,8 +518,8 @@ def fit_through_impacts(
     entries = tangent_space(model).names
     reason = (
         ("" if solution.converged else "the search did not converge: its last step was longer than the cloud")
-        or _doubt(entries, fitted, "what is left of {} is {:.3g} times what noise explains")
-        or _doubt(entries, held, "{} of what was held out is missed by {:.3g} times the noise")
+        or _doubt(entries, fitted, "the residual of {} is {:.3g} times the expected noise")
+        or _doubt(entries, held, "the error of {} on held-out samples is {:.3g} times the noise")
     )
     limits = search.intervals(solution)
     deviations = (limits[:, 1] - limits[:, 0]) / (2 * 1.96)
@@ -528,7 +528,9 @@ def fit_through_impacts(
     covariance[~known, ~known] = np.inf
     squares = np.concatenate(fitted)[:, :nv] ** 2
     motions = [Followed(p, frozen(a), frozen(b)) for p, a, b in zip(pieces, after, before, strict=True)]
-    without = "" if solution.half is not None else "; intervals leave out what the step does: the model has but one"
+    without = (
+        "" if solution.half is not None else "; intervals omit the error of the time step, as the model has only one"
+    )
     steps = f"the model's own steps of {1e3 * search.law.model.time_step:.4g} ms through impacts"
     return identification(
         search.unknowns,

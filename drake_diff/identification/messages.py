@@ -10,7 +10,7 @@ from drake_diff.identification.unknowns import Unknowns
 
 PART = 0.03  # of the largest change in a combination: what is not told
 COMBINED = ("friction", "stiffness")  # of two bodies that touch, which Drake makes one of: 2 a b / (a + b), half of it
-NOISE_IS_LEFT = "what is left is like noise, and what was held out is predicted"
+NOISE_IS_LEFT = "the residuals are noise, and held-out samples are predicted"
 NO_CHANGE = "Not explained: no change that was tried explains the recording"
 
 
@@ -41,7 +41,7 @@ def _combination(unknowns: Unknowns, values: Array, change: Array) -> str:
     names = [unknowns.columns[j] for j in columns]
     quantities = {u.name for u, s in unknowns.items() for j in columns if s.start <= j < s.stop}
     if len(names) == 1:
-        return f"{names[0]}: a change of it leaves the motion as it is"
+        return f"{names[0]}: a change of this value leaves the motion as it is"
     if len(quantities) == 1:
         together = f"{', '.join(names[:-1])} and {names[-1]}"
         return f"{quantities.pop()}: a change of {together} together leaves the motion as it is"
@@ -125,6 +125,6 @@ def excitation_sentence(
     more = f" and {len(clauses) - 4} more" if len(clauses) > 4 else ""
     open_ = f" Open: {'; '.join(unidentifiable[:3])}." if unidentifiable else ""
     return (
-        f"{duration:.3g} s that tell {', '.join(clauses[:4])}{more}, at one standard deviation: "
+        f"A motion of {duration:.3g} s that determines {', '.join(clauses[:4])}{more} (one standard deviation), "
         f"{gain:.3g} times better than a random motion.{open_}"
     )

@@ -213,7 +213,7 @@ class TreeMotion:
 
     @property
     def words(self) -> str:
-        friction = ", with dry friction that holds" if self.dry else ""
+        friction = ", with Coulomb friction that sticks" if self.dry else ""
         return f"continuous time, by steps of order 8 of at most {1e3 * self.longest:.3g} ms{friction}"
 
     def cut(self, period: float) -> tuple[float, ...]:
@@ -414,7 +414,9 @@ def discrete_motion(model: Model, unknowns: Unknowns, pieces: Sequence[Excerpt])
     period = float(np.median(every))
     if np.any(np.abs(every - period) > CLOCK_TOLERANCE * min(period, model.time_step)):
         got = f"from {1e3 * np.min(every):.6g} to {1e3 * np.max(every):.6g} ms"
-        raise InputError("times between samples", got=got, expected="the same, as the model's own steps are fitted")
+        raise InputError(
+            "times between samples", got=got, expected="a constant period, as the model's own steps are fitted"
+        )
     h = period / max(1, round(period / model.time_step))
     if abs(h - model.time_step) > CLOCK_TOLERANCE * model.time_step:
         model = model.at_time_step(h)

@@ -35,7 +35,7 @@ ENDED = "The search was ended after"  # in the sentence of a cause: by the limit
 LOST = "its cause was not looked for again: its recording is not in the directory"
 WRITTEN = (TRACE, REPLAY, PAGE)
 NEVER = (  # what is not checked
-    "model and recordings: they are what was asked, and whether a robot moved so is for who recorded it",
+    "model and recordings: they define the task, and only who made a recording knows if a robot moved so",
     "all but the recordings, plots, scenes and frames: the engines were not run again",
 )
 
@@ -70,7 +70,7 @@ def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Re
         motion = next((use.sha256 for use in uses if use.name == MOTION), None)
         is_same_motion = motion == hash_of_arrays(compared.x0, compared.us)
         if not is_same_motion:
-            unchecked.append("engines[...].final_gap of recordings: the motion began elsewhere")
+            unchecked.append("engines[...].final_gap of recordings: the motion began in another state")
         fields, engines = _of_the_model(record, model), list[dict[str, Any]]()
         for row, now, recording in zip(rows, compared.engines, compared.recordings, strict=True):
             cause = None
@@ -101,7 +101,7 @@ def _odd_recordings(record: ComparisonRecord) -> Iterator[str]:
             yield f"{record.FILE}: recording {r.name} is not where drake_diff keeps it"
     for e in record.engines:
         if e.cause is not None and (e.jacobians or names.count(e.engine) != 1):
-            yield f"{record.FILE}: {e.engine} has a cause, and is not one recording in the directory"
+            yield f"{record.FILE}: {e.engine} has a cause, but is not exactly one recording in the directory"
 
 
 def _of_the_model(record: ComparisonRecord, model: Model) -> dict[str, Any]:
@@ -142,7 +142,7 @@ def as_recorded(name: str, recorded: CauseEvidence, repeated: CauseEvidence) -> 
     if recorded == repeated or _is_same(recorded, repeated):
         return recorded, []
     if ENDED in recorded.sentence or ENDED in repeated.sentence:
-        why = "a search that its limit of processor time ends is not repeated"
+        why = "a search that reached its limit of processor time is not reproducible"
         return recorded, [f"{name}: recorded {recorded.sentence!r}, again {repeated.sentence!r}: {why}"]
     return repeated, []
 

@@ -152,9 +152,11 @@ def read_pieces(
         if held_out not in names:
             raise UnknownNameError("recording to be held out", got=held_out, known=names)
         if set(names) == {held_out}:
-            raise InputError("held_out", got=held_out, expected="another recording to fit")
+            raise InputError("held_out", got=held_out, expected="one of several recordings, as the others are fitted")
     elif not 0 <= held_out <= 0.8:
-        raise InputError("held_out", got=held_out, expected="from 0 to 0.8 of the samples, or a recording's name")
+        raise InputError(
+            "held_out", got=held_out, expected="a part of the samples from 0 to 0.8, or a recording's name"
+        )
     pieces = []
     for i, r in enumerate(logs):
         whole = replace(_checked(r, model, columns), recording=i)
@@ -206,7 +208,9 @@ def _checked(recording: Recording, model: Model, columns: Sequence[str]) -> Exce
         raise InputError(f"{subject}: samples", got=len(times), expected=f"{LEAST} or more")
     if np.any(np.diff(times) <= 0):
         k = int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1
-        raise InputError(f"{subject}: time of sample {k}", got=f"{times[k]} s", expected="later than the one before")
+        raise InputError(
+            f"{subject}: time of sample {k}", got=f"{times[k]} s", expected="a time after that of the sample before"
+        )
     ys = np.array(array_with_gaps(f"{subject}: xs", recording.xs, (len(times), model.nx)))
     us = finite_array(f"{subject}: us", recording.us, (len(times) - 1, model.nu))
     check_sizes(f"{subject}: times", times[:, None], ["s"])

@@ -61,11 +61,11 @@ def choose_sensors(
     mounted = dict(mounted or {})
     wanted = dict.fromkeys(sensor_of(column) for column in columns)
     if wanted and (tree is None or tree.coupling is not None):
-        why = "joints follow others" if tree is not None else "there is none here"
-        raise ModelError(f"{model.name}: sensors are read from motion in continuous time, and {why}")
+        why = "mimic joints are reduced" if tree is not None else "the model's steps are fitted"
+        raise ModelError(f"{model.name}: sensors need motion in continuous time, and {why}")
     for name in mounted:
         if name not in {label for label, _ in wanted}:
-            raise UnknownNameError("sensor of which there are columns", got=name, known=[s for s, _ in wanted])
+            raise UnknownNameError("sensor with columns", got=name, known=[s for s, _ in wanted])
     if tree is None:
         return Sensors(None, (), ())
     return Sensors(
@@ -88,7 +88,9 @@ def _sensor(model: Model, tree: Tree, label: str, quantity: str, mounted: Any) -
         raise UnknownNameError(f"body of sensor {label}", got=body, known=list(labelled(bodies(model.plant))))
     index, pose = tree.placed[body]
     if index < 0:
-        raise InputError(f"sensor {label}", got=f"on {body}, which is fixed to the world", expected="one that moves")
+        raise InputError(
+            f"sensor {label}", got=f"on {body}, which is fixed to the world", expected="a sensor on a moving body"
+        )
     R = pose.rotation().matrix()
     return MountedSensor(label, quantity, index, R @ turn, R @ point + pose.translation())
 

@@ -275,9 +275,11 @@ def _bounds_of(name: str, given: Any, lower: float) -> tuple[float, float]:
     except (TypeError, ValueError) as error:
         raise InputError(subject, got=given, expected="a lower and an upper number") from error
     if name.endswith(f".{INERTIA}"):
-        raise InputError(subject, got=given, expected="none: an inertia is kept possible; give a prior")
+        raise InputError(subject, got=given, expected="a prior instead, as an inertia takes no bounds")
     if not max(low, lower) < high:
-        raise InputError(subject, got=given, expected=f"a lower one below the upper, from {lower:g}")
+        raise InputError(
+            subject, got=given, expected=f"a lower bound below the upper one, and an upper one above {lower:g}"
+        )
     return max(low, lower), high
 
 
@@ -317,11 +319,11 @@ def _extra(model: Model) -> dict[str, tuple[str, Array, float]]:
 def _why_not(model: Model, tree: Tree | None, name: str, value: Array) -> str | None:
     label, quantity = name.rsplit(".", 1)
     if quantity == "time_step":
-        return "the model's time step, of which a fit makes no sense"
+        return "the model's time step, which cannot be fitted"
     if tree is None and quantity == DELAY:
-        return 'a delay, which is looked for in motion in continuous time only; see motion="continuous"'
+        return 'a delay, which needs motion in continuous time; see motion="continuous"'
     if tree is not None and quantity not in (*OF_TREE, BIAS, DELAY):
-        return 'a quantity of contact or control, of which motion in continuous time knows nothing; see motion="steps"'
+        return 'a quantity of contact or control, which motion in continuous time does not have; see motion="steps"'
     if quantity in (MASS, CENTER, INERTIA) and not labelled(bodies(model.plant))[label].default_mass() > 0:
         return "a body without mass"
     if quantity == INERTIA and room_of_inertia(value) <= 0:

@@ -35,10 +35,10 @@ ROUNDING = 1e-13  # of m c^2: what is left of an inertia of 0 that was moved fro
 OVERLAY = ".dmd.yaml"
 KINDS = (".urdf", ".sdf", OVERLAY)
 NO_ROOM = {
-    COULOMB: "Drake has no dry friction of joints",
-    STRENGTH: "no file says how strong an input is",
+    COULOMB: "Drake has no Coulomb friction of joints",
+    STRENGTH: "model files have no scale factor of inputs",
     BIAS: "it is a property of the recording",
-    DELAY: "no file says how late inputs act",
+    DELAY: "model files have no delay of inputs",
     "gravity": "it is an option of load_model",
 }
 
@@ -76,14 +76,16 @@ def write_model(identification: Identification, path: str | Path) -> Path:
     """
     asked, path = identification.asked, Path(path)
     if asked is None:
-        raise InputError("identification", got="one without what was asked", expected="what dd.identify returned")
+        raise InputError(
+            "identification", got="an Identification without its request", expected="the result of dd.identify"
+        )
     source = asked.model.source
     kind = None if source is None else next((kind for kind in KINDS if source.name.endswith(kind)), None)
     if source is None or kind is None:
         got = "a diagram" if source is None else source.name
         raise ModelError(
-            f"{asked.model.name} is from {got}: a corrected model is written of one URDF or SDF file, or of a "
-            f"{OVERLAY} that adds such files"
+            f"{asked.model.name} is from {got}: a corrected model needs one URDF or SDF file, or a "
+            f"{OVERLAY} file that adds such files"
         )
     if not path.name.endswith(kind):
         raise InputError("path", got=str(path), expected=f"a {kind} file, as the model's own")
@@ -93,7 +95,7 @@ def write_model(identification: Identification, path: str | Path) -> Path:
         texts = {path: _Corrected(identification, asked, source, _changed(identification)).text()}
     for target in texts:
         if target.exists() or not target.parent.is_dir():
-            raise InputError("path", got=str(target), expected="a file that does not exist, in a folder that does")
+            raise InputError("path", got=str(target), expected="a new file in an existing folder")
     try:
         for target, text in texts.items():
             write_whole(target, text.encode())
@@ -125,7 +127,7 @@ def _overlay(e: Identification, asked: Request, source: Path, path: Path) -> dic
         places = [uri for uri, names in has.items() if label in names]
         if len(places) != 1:
             got = f"{len(places)} URDF or SDF files that {source.name} itself adds have {label}"
-            raise InputError(name, got=got, expected="one, to be changed")
+            raise InputError(name, got=got, expected="exactly one such file")
         by_file.setdefault(places[0], {})[name] = value
     texts = {}
     for uri, values in by_file.items():
@@ -146,7 +148,7 @@ def _pointed(text: str, uri: str, new: str, source: Path) -> str:
     line = re.compile(rf"^([^#\n]*\bfile:\s*)(['\"]?){re.escape(uri)}\2(?=[\s,}}]|$)", re.MULTILINE)
     matches = list(line.finditer(text))
     if len(matches) != 1:
-        raise InputError(source.name, got=f"{uri} in {len(matches)} of its lines", expected="file: with it in one line")
+        raise InputError(source.name, got=f"{len(matches)} such lines", expected=f"one line with file: {uri}")
     return f"{text[: matches[0].start()]}{matches[0][1]}{json.dumps(new)}{text[matches[0].end() :]}"
 
 
@@ -223,7 +225,7 @@ class _Corrected:
     def _write_body(self, label: str, values: dict[str, Any], comment: str) -> None:
         inertial = self._element(label, "link").find("inertial")
         if inertial is None:
-            raise InputError(f"{label}.mass", got="a link without inertial", expected="one with it, to be changed")
+            raise InputError(f"{label}.mass", got="a link without inertial", expected="a link with an inertial")
         mass, center, inertia = _inertia(self.model, self.e, label)
         names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
         entries = {name: inertia["xyz".index(name[1]), "xyz".index(name[2])] for name in names}
@@ -240,7 +242,7 @@ class _Corrected:
         tags = {SPRING.get(quantity, quantity): _number(float(value)) for quantity, value in values.items()}
         parent = joint.find("axis") if self.is_sdf else joint
         if parent is None:
-            raise InputError(f"{label}.damping", got="a joint without axis", expected="one with it, to be changed")
+            raise InputError(f"{label}.damping", got="a joint without axis", expected="a joint with an axis")
         dynamics = parent.find("dynamics")
         if dynamics is None:
             inside = "".join(f"<{tag}>{value}</{tag}>" for tag, value in tags.items())
@@ -278,7 +280,7 @@ class _Corrected:
             actuators = [actuator for actuator in transmissions if actuator.get("name") == label]
             if len(actuators) != 1:
                 got = f"{len(actuators)} transmissions in the file that have this actuator"
-                raise InputError(f"{label}.{next(iter(values))}", got=got, expected="one, to be changed")
+                raise InputError(f"{label}.{next(iter(values))}", got=got, expected="exactly one transmission")
             element = actuators[0]
         self.xml.before(element, comment)
         self._set_children(element, tags)

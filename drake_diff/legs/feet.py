@@ -102,8 +102,8 @@ class Legs:
             body = plant.GetBodyByName(name)
             foot = _foot(model, shapes, body, (int(b.index()) for b in plant.GetBodiesWeldedTo(body)))
             if foot is None:
-                expected = 'spheres or boxes: meshes="spheres" and contact_geometry="corner_spheres" make them'
-                got = "none to stand on"
+                expected = 'spheres or boxes, which meshes="spheres" and contact_geometry="corner_spheres" make'
+                got = "no such shape"
                 raise InputError(f"ContactSchedule: shapes of foot {name}", got=got, expected=f"{expected} of others")
             feet.append(foot)
         return cls(model, feet, *model.position_limits)
@@ -298,7 +298,7 @@ def find_feet(model: Model, q: Array) -> tuple[Foot, ...] | Refusal:
     moving = [body for body in bodies(plant) if int(body.index()) not in fixed]
     shaped = [foot for body in moving if (foot := _foot(model, shapes, body, [int(body.index())]))]
     if min(_lowest(model, foot) for foot in shaped) < ground - SOLE:
-        return Refusal("what is lowest of it is not the end of a limb")
+        return Refusal("its lowest point is not at the end of a limb")
     tall = float(plant.CalcCenterOfMassPositionInWorld(context)[2]) - ground
     lower = [b.name() for b in moving if b.EvalPoseInWorld(context).translation()[2] < ground - LEVEL * tall]
     if lower:
@@ -306,7 +306,7 @@ def find_feet(model: Model, q: Array) -> tuple[Foot, ...] | Refusal:
     legs = [limb for limb, height in zip(candidates, heights, strict=True) if height - ground <= LEVEL * tall]
     drawn = sum(_travel(model, q, limb) >= TRAVEL * tall for limb in legs)
     if drawn < max(FEWEST, len(legs)):
-        return Refusal(f"{drawn or 'none'} of the {len(legs)} limbs that end lowest can be drawn in")
+        return Refusal(f"{drawn or 'none'} of the {len(legs)} lowest limbs can be retracted")
     return tuple(legs)
 
 

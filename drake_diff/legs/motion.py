@@ -82,7 +82,7 @@ def scheduled_motion(
         way[a : b + 1, :2] += INWARD * (middle - way[a : b + 1, :2])
     plan = plan_forces(legs.mass, gravity, h, start, way, places, carries, friction, slow)
     if not isinstance(plan, tuple):
-        raise InputError("ContactSchedule", got=str(plan), expected="phases in which there are such forces")
+        raise InputError("ContactSchedule", got=str(plan), expected="phases with feasible contact forces")
     mass, forces = plan
     landing = on & ~np.vstack([on[:1], on[:-1]])
     if slow or len(legs.owners) > len(legs.feet):
@@ -317,7 +317,7 @@ class _Program:
             self.program.AddBoundingBoxConstraint(0.0, 0.0, self.forces)
         result = ClarabelSolver().Solve(self.program)
         if not result.is_success():
-            return Refusal("no forces of its feet, within friction, bring its centre of mass to where it is to end")
+            return Refusal("no forces of its feet within friction move its centre of mass to the required end")
         forces = np.zeros((*self.stands.shape, 3))
         forces[self.stands] = self.weight * np.asarray(result.GetSolution(self.forces))[: len(self.carries)]
         return np.asarray(result.GetSolution(self.at)), forces

@@ -186,7 +186,7 @@ def hold(legs: Legs, q: Array, needed: Array | None = None) -> Stance | Refusal:
     program.AddQuadraticCost(2 * np.eye(model.nu), np.zeros(model.nu), u)
     result = ClarabelSolver().Solve(program)
     if not result.is_success():
-        return Refusal("no forces of its feet, within friction, and of its motors, within their limits, balance it")
+        return Refusal("no forces of its feet within friction and of its motors within their limits balance it")
     forces = share * np.asarray(result.GetSolution(f)).reshape(-1, 3)
     still = np.zeros(model.nv)
     u_hold = model.commands(np.append(q, still), still, scale * np.asarray(result.GetSolution(u)))
@@ -362,7 +362,7 @@ def shift_to(legs: Legs, start: Rest, frames: Mapping[str, Array], joints: Mappi
         aimed = aimed + off
         places = {name: position + misses[name] for name, position in places.items()}
     return Refusal(
-        f"its frames end {far:.2g} m and its joints {np.max(np.abs(off), initial=0.0):.2g} off what is asked"
+        f"its frames end {far:.2g} m and its joints {np.max(np.abs(off), initial=0.0):.2g} from their targets"
     )
 
 
@@ -391,7 +391,7 @@ def _shift_to(
         away, speed = float(np.max(np.abs(legs.apart(x[:nq], end.x[:nq])))), float(np.max(np.abs(x[nq:])))
         if away <= ARRIVED and speed <= SLOW_ENOUGH:
             return shift
-        why = Refusal(f"it ends {away:.2g} rad or m from where it would rest, at {speed:.2g} rad/s or m/s")
+        why = Refusal(f"it ends {away:.2g} rad or m from its rest posture, with {speed:.2g} rad/s or m/s")
     return why
 
 

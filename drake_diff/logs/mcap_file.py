@@ -209,7 +209,7 @@ def _unpacked_size(body: bytes, most: int) -> int:
     """What a chunk says that it unpacks to; ValueError where that is more than `most`, or not what is packed in it."""
     chunk = kinds.Chunk.read(ReadDataStream(BytesIO(body)))
     if chunk.uncompressed_size > most:
-        raise ValueError(f"it unpacks to more than is read: {most} bytes are left for {chunk.uncompressed_size}")
+        raise ValueError(f"it unpacks to {chunk.uncompressed_size} bytes, but at most {most} are read")
     if chunk.compression == "zstd":
         packed = zstandard.frame_content_size(chunk.data)
         if packed not in (-1, chunk.uncompressed_size):  # -1: the frame does not say it, and no more is unpacked
@@ -276,7 +276,7 @@ class _Reading:
             check_memory()
         self.counted += 1
         if number not in self.channels:
-            raise ValueError(f"a message is of channel {number}, which there is not")
+            raise ValueError(f"a message has the unknown channel {number}")
         messages, decode = self.channels[number]
         messages.append((time, decode(body[MESSAGE.size :])))
 
@@ -301,7 +301,7 @@ class _Reading:
         if len(self.channels) >= MOST_CHANNELS:
             raise ValueError(f"it has more than {MOST_CHANNELS} channels")
         if channel.schema_id not in self.schemas:
-            raise ValueError(f"channel {topic} has schema {channel.schema_id}, which there is not")
+            raise ValueError(f"channel {topic} has the unknown schema {channel.schema_id}")
         decode: Any = self.decoders.decoder_for(channel.message_encoding, self.schemas[channel.schema_id])
         if decode is None:
             raise ValueError(f"channel {topic} is encoded as {channel.message_encoding!r}, not as protobuf")

@@ -79,7 +79,9 @@ ROUNDED = 1e-9  # of a column's largest number: what a step of a plant differs b
 COUPLED = 1e-5  # of the largest number of all columns: rounding reaches from one column to the others
 PARTS = ("xs", "us", "observations", "estimates", "applied")  # what the parts of a loop make of the rows before
 RAISED: Mapping[str, Label] = {"sensor": "perception_error", "estimator": "state_error", "controller": "control_error"}
-DEADLINES = "/deadlines: how long the controller took is for who ran it; what follows from it was made again"
+DEADLINES = (
+    "/deadlines: latencies of the controller cannot be reproduced; all values that follow from them were made again"
+)
 HERE = "along the run"
 
 
@@ -150,7 +152,7 @@ def _section(record: PlanRecord) -> ClosedLoopSection:
 
 def _judged_by(problem: Problem | None) -> str:
     if problem is None:
-        return "nothing but the plant: the controller follows no problem that is known"
+        return "only the plant, as the controller has no known problem"
     return "the problem's bounds" + ("" if np.all(np.isnan(problem.goal)) else " and its goal")
 
 
@@ -438,7 +440,7 @@ def _metrics_of_the_problem(
     definition = f"largest excess of a state over a bound of the problem, of {check.where}"
     yield measured("bound violation", definition, check.value, check.unit, check.tolerance)
     for i, check in enumerate(clearance_checks(plan, again.motion)):
-        definition = f"what lacks of the margin of an obstacle, of {check.where}"
+        definition = f"largest shortfall from the margin of an obstacle, of {check.where}"
         yield measured(f"clearance {i}", definition, check.value, check.unit, check.tolerance)
     excess_of_inputs = np.maximum(problem.bounds.u_lower - rows.us, rows.us - problem.bounds.u_upper)
     definition = "largest excess of an applied input over a bound of the problem"
@@ -449,7 +451,7 @@ def _metrics_of_the_problem(
 def _failures(rows: LoopRows, metrics: Sequence[Metric]) -> Iterator[Failure]:
     if rows.ended:
         label = RAISED.get(rows.failed_part, "state_error")
-        yield failure(label, "broke_off", f"it broke off {rows.ended}", "the loop", "closed_loop")
+        yield failure(label, "broke_off", f"the loop broke off {rows.ended}", "the loop", "closed_loop")
     for metric in metrics:
         if metric.verdict == "fail":
             is_of_the_loop = metric.name == "loop error"
@@ -505,7 +507,7 @@ def _checks_of(record: PlanRecord, run: ClosedLoop) -> list[PageCheck]:
     given = " and ".join(section.given)
     text = "plant, sensor, estimator and actuator make the same rows again" + f"; {given}: data" * bool(given)
     if error.verdict != "pass":
-        text = f"rows differ from what the parts of the loop make again: loop error {error.value}"
+        text = f"plant, sensor, estimator and actuator make other rows: loop error {error.value}"
     result.append(PageCheck("Loop", error.verdict, text))
     for title, name in (("Goal", "goal error"), ("Bounds", "bound violation"), ("Contact", "penetration")):
         if name in metrics and metrics[name].tolerance is not None:
@@ -514,12 +516,14 @@ def _checks_of(record: PlanRecord, run: ClosedLoop) -> list[PageCheck]:
     late, budget = int(metrics["deadline misses"].value or 0), f"{1e3 * loop.latency_budget_s:.4g} ms"
     text = f"all {loop.steps} answers within {budget}, {loop.latency_budget_is}"
     if late:
-        held_then = ": the last command is held" if loop.latency_budget_is == "stated" else ": they were waited for"
+        held_then = (
+            ": the last command stays in effect" if loop.latency_budget_is == "stated" else ": they were waited for"
+        )
         text = f"{late} of {loop.steps} answers later than {budget}, {loop.latency_budget_is}{held_then}"
     result.append(PageCheck("Deadlines", "warn" if late else "pass", text))
     away = sum(status.startswith((FAILED, UNSEEN)) for status in run.controller_status)
     if loop.fallback is not None:
-        result.append(PageCheck("Fallback", "warn" if away else "pass", f"in charge in {away} of {loop.steps} steps"))
+        result.append(PageCheck("Fallback", "warn" if away else "pass", f"active in {away} of {loop.steps} steps"))
     return result
 
 
@@ -588,7 +592,7 @@ def _other_plots(run: ClosedLoop, loop: LoopEvidence) -> Iterator[Plot]:
     yield Plot("latency", "ms", run.times, taken, limits=(None, 1e3 * loop.latency_budget_s), group="Deadlines")
     kinds = (("kinetic", motion.kinetic_energy), ("potential", motion.potential_energy), ("total", motion.energy))
     yield Plot("energy", "J", motion.times, [Line(*kind) for kind in kinds], group=group)
-    note = "what neither actuators nor damping account for: time stepping, contact and pushes"
+    note = "energy change not explained by actuators and damping: time stepping, contact and pushes"
     yield Plot("unexplained energy", "J", motion.times, [Line("error", motion.energy_error)], note=note, group=group)
     if np.any(motion.penetration):
         yield Plot("penetration", "m", motion.times, [Line("largest overlap", motion.penetration)], group=group)
@@ -625,12 +629,12 @@ def _compared(rows: LoopRows, again: ClosedLoop, mpc: MPC, followed: _Followed) 
         _relative_difference(followed.arrays[name], made)
         for name, made in zip(("xs", "us"), mpc.reference, strict=True)
     )
-    odd = [f"{PLAN}: MPC plans otherwise from the recorded guess, {plan:.2g} of the largest number away"]
+    odd = [f"{PLAN}: the plan of MPC from the recorded guess differs by {plan:.2g} of the largest number"]
     odd = odd if plan > RELATIVE else []
     commands = _relative_difference(rows.commands, again.commands)
     if exact:
         return odd, []
-    doubts = [f"MPC, run again, commands otherwise, {commands:.2g} of the largest command away"]
+    doubts = [f"the commands of MPC, run again, differ by {commands:.2g} of the largest command"]
     return [], odd + (doubts if commands > RELATIVE or rows.controller_status != again.controller_status else [])
 
 
@@ -681,7 +685,9 @@ def reproduce(folder: Path, record: PlanRecord, models: Path | None) -> Reproduc
             _write_files(target, again, made, followed, files)
             written = {path.name: path.read_bytes() for path in target.iterdir()}
     made_by = {"commands": section.loop.controller, "estimates": section.loop.estimator}
-    data = [f"{name}: data, as {made_by.get(name, 'what made them')} is not executed" for name in section.given]
+    data = [
+        f"{name}: used as recorded, as {made_by.get(name, 'their source')} is not executed" for name in section.given
+    ]
     unchecked = (DEADLINES, *data)
     fields = made.model_dump(mode="json")
     return Reproduced(

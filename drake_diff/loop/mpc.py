@@ -242,7 +242,7 @@ class MPC:
                 if paid <= FAR_MORE * step.merit:
                     break
         if not candidates:
-            raise SimulationError("the last plan cannot be followed on the plant from where it is")
+            raise SimulationError("the plant cannot follow the last plan from its current state")
         return min(candidates, key=lambda candidate: candidate[0])[1]
 
     def _same_sign(self, x: Array, planned: Array) -> Array:
@@ -258,9 +258,9 @@ class MPC:
         """What is to be said of a step at the problem's step `k`."""
         remarks = []
         if not step.size and not step.is_reached:
-            remarks.append(f"{FOLLOWED}: no step lowers what is paid, though the derivatives promise it")
+            remarks.append(f"{FOLLOWED}: no step lowers the cost, although the derivatives predict it")
         elif step.size and step.is_doubtful:
-            remarks.append("the derivatives are not those of the plant's steps")
+            remarks.append("the derivatives disagree with the plant's steps")
         elif 0 < step.size < 1:
             remarks.append(f"a step of {step.size:g}: the plant does not follow its derivatives further")
         if step.given_way is not None:
@@ -320,8 +320,8 @@ class MPC:
             step = step if isinstance(outcome, Refusal) else outcome
         apart = float(np.max(np.abs(motion.gaps) / ranges))
         if apart > GAP or step.given_way is not None:
-            got = f"steps that are {apart:.2g} of a range off" if apart > GAP else self._status_of(step, 0)
-            raise InputError("plan", got=got, expected="a plan near which a motion keeps all that the problem asks for")
+            got = f"steps with gaps of {apart:.2g} of a range" if apart > GAP else self._status_of(step, 0)
+            raise InputError("plan", got=got, expected="a plan near a motion that satisfies the problem")
         if step.tails is None:
             raise InputError("running_cost", got="no positive curvature by the inputs", expected="one with a minimum")
         rolling.tails = step.tails
@@ -346,7 +346,7 @@ def _check(problem: Problem) -> None:
         "parameter_cost": problem.parameter_cost is not None,
     }
     for subject in (name for name, is_given in given.items() if is_given):
-        raise InputError(subject, got="given", expected="none: MPC cannot keep it, and steps the model as it is")
+        raise InputError(subject, got="given", expected="a problem without it, as MPC does not support it")
 
 
 def _staying(problem: Problem, xs: Array, us: Array) -> Staying | None:
@@ -360,11 +360,13 @@ def _staying(problem: Problem, xs: Array, us: Array) -> Staying | None:
         return None
     goal, u = _fixed_point(problem, xs[-1], us[-1])
     if np.any(u < bounds.u_lower) or np.any(u > bounds.u_upper):
-        raise InputError("x_goal", got=f"held by u = {u}", expected="a state that inputs within their bounds can hold")
+        raise InputError(
+            "x_goal", got=f"a state held by u = {u}", expected="a fixed point of inputs within their bounds"
+        )
     for constraint in at_end:
         if constraint.miss(goal) > constraint.tolerance:
-            got = f"{constraint.told(constraint.miss(goal))} where inputs can hold the model"
-            raise InputError(f"goal {constraint.label}", got=got, expected="one that can be stayed at")
+            got = f"{constraint.told(constraint.miss(goal))} at the nearest fixed point"
+            raise InputError(f"goal {constraint.label}", got=got, expected="a goal that is a fixed point")
     cost = problem.objective(xs, us)
     plan = ReplayPlan(problem, problem.parameters, model.time_step, held(xs, us), False, cost)
     cost = cost if cost > 0 else 1.0

@@ -592,12 +592,13 @@ class _LoopRun:
             budget = self.loop.latency_budget
             if command is not None and budget is not None and taken > budget:
                 message = (
-                    f"the controller took {taken:.3g} s, expected at most {budget:.3g} s: the last command is held"
+                    f"the controller took {taken:.3g} s, expected at most {budget:.3g} s: the last command stays in "
+                    "effect"
                 )
                 self.events.append(LoopEvent(t, "late", message))
                 command, status = self.model.neutral_input(estimate) if last is None else last, LATE
         if command is not None and not self.in_charge:
-            self.events.append(LoopEvent(t, "recovery", "the controller is followed again"))
+            self.events.append(LoopEvent(t, "recovery", "the controller is active again"))
         elif command is None and self.in_charge and fallback is not None:
             self.events.append(LoopEvent(t, "fallback", f"{fallback.mode}: {status}"))
         self.in_charge = command is not None

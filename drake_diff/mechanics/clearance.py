@@ -133,7 +133,7 @@ class Clearance:
     def refuse_parameters(self) -> None:
         """InputError where a parameter that distances depend on is changed."""
         for quantity in sorted(self.model.other_quantities & PLACE):
-            raise InputError("parameters", got=quantity, expected="only such as distances do not depend on")
+            raise InputError("parameters", got=quantity, expected="parameters that do not change distances")
 
     def values(self, xs: Array) -> Array:
         """(K, m) [m] at xs (K, nx)."""

@@ -122,11 +122,11 @@ def _doubts(pieces: Sequence[Piece], bare: Sequence[str]) -> Iterator[str]:
     if bones:
         radii = [p.radius for p in pieces if p.source == "skeleton"]
         yield (
-            f"{', '.join(bones)}: no shape that could be read, kept clear as capsules from joint to joint, of radius "
+            f"{', '.join(bones)}: no readable shape, represented by capsules from joint to joint, of radius "
             f"{min(radii):.3g} to {max(radii):.3g} m"
         )
     if bare:
-        yield f"{', '.join(bare)}: no shape, no mass and no next joint, not kept clear of anything"
+        yield f"{', '.join(bare)}: no shape, no mass and no next joint, and no clearance"
 
 
 def _of_shapes(model: Model, inspector: Any, body: Any, unread: list[str]) -> Iterator[tuple[Any, list[Piece]]]:
@@ -143,7 +143,7 @@ def _of_shapes(model: Model, inspector: Any, body: Any, unread: list[str]) -> It
             around = [(g, list(_around(inspector.GetShape(g), inspector.GetPoseInFrame(g)))) for g in geometries]
         except (ModelError, RuntimeError) as error:
             kind = "collision shapes" if role == Role.kProximity else "drawn shapes"
-            unread.append(f"{body.name()}: its {kind} cannot be read ({error}), so others stand for them")
+            unread.append(f"{body.name()}: its {kind} cannot be read ({error}) and are replaced by others")
             continue
         shapes = [(g if role == Role.kProximity else None, pieces) for g, pieces in around if pieces]
         if shapes:

@@ -150,8 +150,8 @@ def fixed_contact_plant(
     singular = np.array([np.linalg.svd(J[k][rows], compute_uv=False) for k in range(TRIED)])
     if len(rows) > n or np.max(singular[:, -1] / singular[:, 0]) < DEPENDENT:
         return Refusal(
-            f"the {len(rows)} coordinates that are held depend on each other, so that their forces are not unique: "
-            "hold fewer axes of some points"
+            f"the {len(rows)} fixed coordinates depend on each other, so that their forces are not unique: "
+            "fix fewer axes of some points"
         )
     plant = FixedContactPlant(model, places, speeds, rows, EquationsOfMotion(model), tree)
     probe = np.hstack([states, random.standard_normal((TRIED, model.nu))])

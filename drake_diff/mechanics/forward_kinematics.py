@@ -244,11 +244,11 @@ def forward_kinematics(model: Model) -> ForwardKinematics | Refusal:
 
     def compared() -> ForwardKinematics | Refusal:
         if not model.nq:
-            return Refusal("nothing in it can move")
+            return Refusal("the model has no joint that moves")
         for joint in joints(model.plant):
             if joint.type_name() not in KNOWN:
                 return Refusal(
-                    f"joint {joint.name()} is a {joint.type_name()} joint, and where that leads is not written out: "
+                    f"joint {joint.name()} is a {joint.type_name()} joint, which forward kinematics does not support: "
                     "replace it by hinges and slides"
                 )
         whole = read_links(model.plant, {}, backwards=True)
@@ -269,7 +269,7 @@ def forward_kinematics(model: Model) -> ForwardKinematics | Refusal:
         here, random = model.double.state(), np.random.default_rng(0)
         same = all(_is_same(model, kinematics, random.standard_normal(model.nq)) for _ in range(2))
         set_state(model.double, here)
-        return kinematics if same else Refusal("its links are not where Drake has them")
+        return kinematics if same else Refusal("its forward kinematics differs from Drake's")
 
     return model.cache("forward kinematics", compared)
 

@@ -354,7 +354,7 @@ def _twin_at(model: Model, depends_on: frozenset[str], x: Any, *inputs: Any) -> 
 
 def _check_parameters(model: Model, depends_on: frozenset[str]) -> None:
     for quantity in sorted(model.other_quantities & depends_on):
-        expected = "only such as the functions of dd.quantities do not depend on"
+        expected = "parameters that do not change the functions of dd.quantities"
         raise InputError("parameters", got=quantity, expected=expected)
 
 

@@ -74,7 +74,9 @@ def assembled(model: Model, x: ArrayLike, *, keep: Collection[str] = ()) -> Arra
     q = closed(model, state[: model.nq], fixed)
     if q is None:
         distance, _ = gap(model, state[: model.nq])
-        raise ModelError(f"the loops cannot be closed from there, where points are {distance:.3g} m apart; keep less")
+        raise ModelError(
+            f"the loops cannot be closed from this posture: points stay {distance:.3g} m apart; keep fewer coordinates"
+        )
     return np.concatenate([q, state[model.nq :]])
 
 

@@ -290,9 +290,9 @@ def softened(model: Model, contact: SoftContact) -> Model:
         raise InputError("contact", got=type(contact).__name__, expected="a SoftContact")
     if not model.takes_forces:
         got = "a diagram that sets the applied generalized forces"
-        raise InputError("model", got=got, expected="one that leaves that input port free")
+        raise InputError("model", got=got, expected="a diagram that leaves this input port free")
     if not model.contract.contact.collision_pairs:
-        raise InputError("model", got="no geometries that may collide", expected="at least one pair")
+        raise InputError("model", got="no geometries that may collide", expected="at least one collision pair")
 
     def rebuild(**change: Any) -> Model:
         return softened(model.changed(**change), contact)

@@ -70,9 +70,7 @@ def replace_collision_geometry(plant: MultibodyPlant, scene_graph: pg.SceneGraph
             return _to_hydroelastic(plant, scene_graph)
     except RuntimeError as error:
         raise ModelError(f"Drake refuses the route {route!r}: {error}") from error
-    return (
-        "Where geometries touch that AutoDiffXd refuses, steps are differentiated by finite differences, as chosen.",
-    )
+    return ("Steps with contacts that AutoDiffXd refuses are differentiated by finite differences, as chosen.",)
 
 
 def _to_corner_spheres(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
@@ -137,10 +135,10 @@ def _replace(
     became = f"a {type(shape).__name__.lower()} became {len(centres)} spheres of radius {radius:.4g} m"
     stiffness = "each with the stiffness of the whole, as every contact point has its own spring"
     if isinstance(shape, pg.Capsule):
-        return spheres, f"{became}, its ends ({stiffness}); nothing touches between them."
+        return spheres, f"{became} at its ends ({stiffness}); between them there is no contact."
     if isinstance(shape, pg.Box):
         where = f"in its corners ({stiffness}: a face rests on 4 springs)"
-        return spheres, f"{became} {where}; edges and faces between them are open."
+        return spheres, f"{became} {where}; edges and faces between them have no contact."
     return spheres, f"{became} along its rims, which is approximate ({stiffness}); it rolls like a polygon."
 
 
@@ -326,7 +324,7 @@ def touch_what_can_separate(plant: MultibodyPlant, scene_graph: pg.SceneGraph, d
         return ()
     number = f"{len(pairs)} pairs of shapes pass" if len(pairs) > 1 else "One pair of shapes passes"
     return (
-        f"{number} through each other, as they overlap wherever the joints are: {links_of(plant, scene_graph, pairs)}.",
+        f"{number} through each other, as they overlap at all joint positions: {links_of(plant, scene_graph, pairs)}.",
     )
 
 

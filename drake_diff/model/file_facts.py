@@ -243,7 +243,7 @@ def _motors_and_servos(xml: XmlText) -> list[str]:
             xml.drop(element, name)
         xml.rename(element, kind)
         written.append(f"{says.get('name', '?')} ({kind})")
-    what = "<general> actuators read as what they are, a servo's input as (gain ctrl + bias) / (kp gear)"
+    what = "<general> actuators became motors and servos; the input of a servo is (gain ctrl + bias) / (kp gear)"
     return [f"{what}: {', '.join(written)}."] if written else []
 
 
@@ -703,7 +703,7 @@ def correct(plant: MultibodyPlant, instance: ModelInstanceIndex, mjcf: Mjcf) -> 
         lower, upper = meant.sides
         if meant.gains is not None and lower != -upper:
             raise ModelError(
-                f"line {meant.line}: expected a servo that pushes as hard to both sides, got {lower:g} to {upper:g} of "
+                f"line {meant.line}: expected a servo with symmetric limits, got {lower:g} to {upper:g} of "
                 f"{actuator.name()}: Drake's have one limit"
             )
         if lower != -upper or not math.isclose(actuator.effort_limit(), upper, rel_tol=1e-12):
@@ -717,9 +717,7 @@ def correct(plant: MultibodyPlant, instance: ModelInstanceIndex, mjcf: Mjcf) -> 
                 actuator.set_controller_gains(PdControllerGains(p=meant.gains[0], d=meant.gains[1]))
     notes = []
     if limits:
-        notes.append(
-            f"Effort limits at the joint, gear times range, which Drake does not take so: {', '.join(limits)}."
-        )
+        notes.append(f"Effort limits at the joint (gear times range), which Drake does not read: {', '.join(limits)}.")
     if gains:
         notes.append(f"Gains kp and kv of position actuators at the joint, with the gear: {', '.join(gains)}.")
     unread = [a for a in mjcf.actuators if not a.read]

@@ -131,7 +131,7 @@ def add_body_forces(builder: DiagramBuilder, plant: MultibodyPlant, forces: Sequ
         if force.body not in links:
             raise UnknownNameError(f"body of the BodyForce {force.name}", got=force.body, known=links)
         if force.name in driven:
-            raise InputError("body_forces", got=force.name, expected="no name of an actuator")
+            raise InputError("body_forces", got=force.name, expected="a name that no actuator has")
         direction = np.array(force.direction) / np.max(np.abs(force.direction))  # Drake refuses a short one
         pose = RigidTransform(RotationMatrix.MakeFromOneVector(direction, 2), np.array(force.point))
         propellers.append(PropellerInfo(links[force.body].index(), pose, 1.0, force.moment_ratio))

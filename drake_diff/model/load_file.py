@@ -153,7 +153,7 @@ def _one_colour_for_each_material(xml: XmlText) -> list[str]:
             known[name] = given
         elif given:
             xml.fill(material, "")
-            renamed[f"{name} is defined in two ways, of which the first is drawn"] = None
+            renamed[f"{name} is defined twice, and the first definition is drawn"] = None
         else:
             xml.remove(material)
             renamed[f"{name} is not defined"] = None

@@ -173,7 +173,9 @@ def close_loops(plant: MultibodyPlant, loops: Sequence[HeldBodies], held: list[H
         names.append(f"{loop.body} and {loop.other}{lost}")
     if not names:
         return ()
-    return (f"{len(names)} loops are closed, nearly rigidly (softly in MuJoCo): {', '.join(names)}.",)
+    return (
+        f"{len(names)} kinematic loops are closed by nearly rigid constraints (soft in MuJoCo): {', '.join(names)}.",
+    )
 
 
 def _body(plant: MultibodyPlant, instance: str, name: str) -> Any:
@@ -186,7 +188,7 @@ def _body(plant: MultibodyPlant, instance: str, name: str) -> Any:
         index = plant.GetModelInstanceByName(full)
         if plant.HasBodyNamed(last, index):
             return plant.GetBodyByName(last, index)
-    raise ModelError(f"expected bodies of {instance} that are held together, got {name}, which is none")
+    raise ModelError(f"expected a body of {instance} to connect, got the unknown name {name}")
 
 
 def _stand_in_for_the_world(plant: MultibodyPlant, instance: str) -> Any:

@@ -432,7 +432,7 @@ def _describe_meshes(meshes: list[CollisionMesh], treatment: str) -> str:
         for s, kind in fits
     ]
     return (
-        f"{len(meshes)} collision meshes became {count} spheres inside their convex hulls. The first gap is how "
-        "much later a flat ground is met at most, the second how far the hull's surface is from the spheres: "
+        f"{len(meshes)} collision meshes became {count} spheres inside their convex hulls. The first gap is the "
+        "largest delay of contact with flat ground, the second the largest distance from the hull to the spheres: "
         f"{_listed(lines)}.{less}"
     )

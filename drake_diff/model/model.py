@@ -161,8 +161,8 @@ class Model(ShowsItsRepr):
         """A model pickles by its file and what `load_model` was asked, and is loaded again where it is read."""
         if self.options is None or self.source is None:
             raise ModelError(
-                f"the model {self.name} cannot be pickled: `load_model` did not make it from a file, by which it could "
-                "be made again; build it in each process"
+                f"the model {self.name} cannot be pickled, as `load_model` did not load it from a file: build it in "
+                "each process"
             )
         return _load_again, (str(self.source.absolute()), sha256(self.source.read_bytes()).hexdigest(), self.options)
 
@@ -696,8 +696,8 @@ def _load_again(path: str, digest: str, options: dict[str, Any]) -> Model:
     """A model that was pickled; its file must be what it was, that files it names are is not looked at."""
     source = Path(path)
     if not source.is_file() or sha256(source.read_bytes()).hexdigest() != digest:
-        was = "is another one now" if source.is_file() else "is not there"
-        raise ModelError(f"{source}: a model that was pickled is loaded from its file, which {was}")
+        was = "has changed" if source.is_file() else "does not exist"
+        raise ModelError(f"{source}: a pickled model is loaded from its file, which {was}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)  # said when the model was loaded first
         return load_model(source, **options)
@@ -778,8 +778,8 @@ def _check_time(model: Model, twin: Twin) -> None:
         raise ModelError(f"the diagram's systems cannot be evaluated: {error}") from error
     if changed is not None:
         raise ModelError(
-            f"what the systems {', '.join(model.inputs.systems)} exert on the plant depends on time ({changed:g} s is "
-            "not 0 s), which a step of x and u does not know: export it as an input, and give it by u"
+            f"the forces of the systems {', '.join(model.inputs.systems)} on the plant depend on time ({changed:g} s "
+            "differs from 0 s), which is not an argument of a step: export the forces as an input, and pass them in u"
         )
     twin.reset()
     twin.set_input(np.zeros(model.nu))
@@ -808,7 +808,7 @@ def _repaired(
     if base is not None and weld_base is not None:
         raise InputError("base", got=f"{base!r} and weld_base={weld_base!r}", expected="one of them")
     if options["ground"] is not None and not options["contact"]:
-        raise InputError("ground", got="contact=False too", expected="contact, without which nothing stands on it")
+        raise InputError("ground", got="contact=False", expected="contact, as a ground acts by contact")
     mimics: tuple[Mimic, ...] = ()
     try:
         loops = in_pose_of_files(plant, facts.loops, partial(position_in_file, plant, facts))

@@ -236,9 +236,9 @@ def lay_out(
         nonlocal left
         left -= len(wanted)
         if left < 0:
-            raise ModelError(f"{name}: what it names has more than {GIB} bytes")
+            raise ModelError(f"{name}: the files that it names have more than {GIB} bytes")
         if location.is_file() and location.read_bytes() != wanted:
-            raise ArtifactError(f"record.json: {label} is where another file is")
+            raise ArtifactError(f"record.json: {label} has the path of another file")
         location.parent.mkdir(parents=True, exist_ok=True)
         location.write_bytes(wanted)
 

@@ -445,16 +445,14 @@ class ParameterVector:
             if p.kind.quantity == "inertia":
                 scale[s] = room_of_inertia(value)
                 if scale[s][0] <= 0:
-                    expected = (
-                        "an inertia that may change a little and stay possible, which that of a point or a rod may not"
-                    )
+                    expected = "an inertia that stays valid under small changes, unlike that of a point or a rod"
                     raise InputError(p.name, got=value, expected=expected)
             elif not p.kind.positive:
                 scale[s] = np.maximum(1.0, np.abs(value))
             elif np.all(value > 0):
                 scale[s] = value
             else:
-                expected = "a value above 0, so that differences can go both ways; give one by parameters={name: value}"
+                expected = "a value above 0 for central differences; set it by parameters={name: value}"
                 raise InputError(p.name, got=float(value[0]), expected=expected)
         return scale[entries]
 
@@ -488,7 +486,7 @@ def select(model: Model, parameters: Parameters) -> ParameterVector:
     for p in selected:
         whole = f"{p.label.rsplit('/', 1)[0]}.{p.kind.quantity}"
         if p.kind in CONTACT_KINDS and "/" in p.label and whole in names:
-            expected = "only one of them, as the first sets the second too"
+            expected = "one of the two names, as the first includes the second"
             raise InputError("parameters", got=f"{whole} and {p.name}", expected=expected)
     given = parameters if isinstance(parameters, Mapping) else {}
     values = [_check_value(p, given[p.name]) if p.name in given else p.value for p in selected]
@@ -630,7 +628,7 @@ def to_log_cholesky(inertia: Array) -> Array:
     Raises InputError for a point or a rod, which lie at infinity.
     """
     if room_of_inertia(inertia) <= 0:
-        raise InputError("inertia", got=inertia, expected="that of a body which is neither a point nor a rod")
+        raise InputError("inertia", got=inertia, expected="the inertia of a body that is neither a point nor a rod")
     lower = np.linalg.cholesky(second_moment(inertia))
     return np.array([*np.log(np.diag(lower)), lower[1, 0], lower[2, 0], lower[2, 1]])
 

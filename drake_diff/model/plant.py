@@ -126,7 +126,7 @@ def named(kind: str, elements: list[Any], name: str) -> Any:
     if not matches:
         raise UnknownNameError(kind, got=name, known=[element.name() for element in elements])
     if len(matches) > 1:
-        raise ModelError(f"{len(matches)} {kind}s are called {name!r}: expected one of that name")
+        raise ModelError(f"{len(matches)} {kind}s are called {name!r}: expected exactly one")
     return matches[0]
 
 

@@ -122,7 +122,7 @@ def add_actuators(plant: MultibodyPlant, asked: Actuated, facts: FileFacts) -> t
         why = "as asked" if given_here else "as the file gives none or 0"
         notes.append(f"{len(unlimited)} actuators added without an effort limit, {why}: {', '.join(unlimited)}.")
     if opened:
-        notes.append(f"Limits of 0 of driven joints taken as none: {', '.join(opened)}.")
+        notes.append(f"Limits of 0 of driven joints removed: {', '.join(opened)}.")
     return tuple(notes)
 
 
@@ -143,7 +143,7 @@ def check_servos(inputs: str | None, gains: Any) -> None:
     if inputs is not None and inputs not in INPUTS:
         raise UnknownNameError("inputs", got=inputs, known=INPUTS)
     if gains is not None and inputs != "position":
-        raise InputError("inputs", got=f"{inputs!r} and gains", expected='"position", which they are of')
+        raise InputError("inputs", got=f"{inputs!r} and gains", expected='inputs="position" with gains')
 
 
 def as_gains(value: Any) -> Gains | dict[str, Gains] | None:
@@ -169,7 +169,7 @@ def add_servos(
     if gains is None:
         without = [actuator.name() for actuator in actuators(plant) if not actuator.has_controller()]
         if without or not actuators(plant):
-            expected = "(kp, kd): the file has no servo of " + (", ".join(without) or "any joint")
+            expected = "(kp, kd), as the file has no servo of " + (", ".join(without) or "any joint")
             raise InputError("gains", got=None, expected=expected)
         return ()
     indices = [actuator.joint().index() for actuator in actuators(plant)]
@@ -217,7 +217,7 @@ def _chosen(
         if name not in possible:
             raise UnknownNameError(f"{subject}: revolute or prismatic joint", got=name, known=possible)
         if name in copies:
-            raise InputError(subject, got=repr(name), expected=f"no joint that mimics another, as {name} does")
+            raise InputError(subject, got=repr(name), expected="a joint that mimics no other joint")
     return {name: possible[name] for name in asked}
 
 
@@ -269,7 +269,9 @@ def hold_base(plant: MultibodyPlant, base: str | None) -> tuple[str, ...]:
         with_joints = [tree for tree in trees if _can_move(plant, tree)]
         if trees and not with_joints:
             names = ", ".join(tree[0].name() for tree in trees)
-            raise ModelError(f'base="weld": nothing could move any more, as no joint hangs on what floats: {names}')
+            raise ModelError(
+                f'base="weld": no joint would be left to move, as the floating bodies carry no joints: {names}'
+            )
         notes = []
         for root, *_ in with_joints:
             pose = plant.GetDefaultFloatingBaseBodyPose(root)
@@ -397,7 +399,7 @@ def take_away_contact(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tupl
     geometries = collision_geometries(plant, scene_graph)
     for _, geometry in geometries:
         scene_graph.RemoveRole(plant.get_source_id(), geometry, pg.Role.kProximity)
-    return (f"{len(geometries)} collision shapes taken away: nothing touches.",) if geometries else ()
+    return (f"{len(geometries)} collision shapes removed: the model has no contact.",) if geometries else ()
 
 
 def touch_the_world_alone(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
@@ -430,7 +432,7 @@ def add_ground(plant: MultibodyPlant, ground: float | bool | None) -> tuple[str,
     try:
         plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), pg.HalfSpace(), "ground", properties)
     except DRAKES_REFUSALS as error:
-        raise ModelError(f"ground: the file has a ground of its own: leave ground= out ({_plain(error)})") from error
+        raise ModelError(f"ground: the file has its own ground: omit ground= ({_plain(error)})") from error
     return (f"A ground was added at z = 0, with friction {friction:g}.",) if ground is True else ()
 
 
@@ -529,10 +531,10 @@ def _called(plant: MultibodyPlant, mimic: Mimic, name: str) -> list[Any]:
 def _joint(plant: MultibodyPlant, mimic: Mimic, name: str) -> Any:
     matches = _called(plant, mimic, name)
     if len(matches) != 1:
-        raise ModelError(f"mimic: the joint {mimic.follower} follows {mimic.leader}, and there is no joint {name}")
+        raise ModelError(f"mimic: the joint {mimic.follower} follows {mimic.leader}, but no joint {name} exists")
     if not can_be_driven(matches[0]):
         kind = matches[0].type_name()
-        raise ModelError(f"mimic: {mimic} is of revolute and prismatic joints here, and {name} is a {kind} joint")
+        raise ModelError(f"mimic: {mimic}: expected revolute or prismatic joints, got the {kind} joint {name}")
     return matches[0]
 
 
@@ -554,7 +556,7 @@ def _resolved(pairs: list[tuple[Mimic, Any, Any]]) -> dict[Any, tuple[Any, float
         seen = {follower}
         while leader.index() in direct:
             if leader.index() in seen:
-                raise ModelError(f"mimic: {leader.name()} follows itself, through others")
+                raise ModelError(f"mimic: {leader.name()} follows itself through other joints")
             seen.add(leader.index())
             leader, r, o = direct[leader.index()]
             ratio, offset = ratio * r, ratio * o + offset
@@ -573,8 +575,8 @@ def uncoupled(plant: MultibodyPlant, mimics: Iterable[Mimic]) -> tuple[Mimic, ..
     known, count = sum(m.in_drake for m in couplings), int(plant.num_constraints())
     if couplings and count != known:
         raise ModelError(
-            f"mimic: the model has {count} constraints for {known} mimic joints, and Drake does not tell which are "
-            "which: take the other constraints (balls, welds, distances) out of the file"
+            f"mimic: the model has {count} constraints for {known} mimic joints, and Drake does not identify "
+            "them: remove the other constraints (balls, welds, distances) from the file"
         )
     for constraint in plant.GetConstraintIds() if couplings else ():
         plant.RemoveConstraint(constraint)

@@ -188,8 +188,8 @@ class Twin:
         check_time()
         if self.thread != get_ident():
             raise ModelError(
-                "a context that was made in one thread is used in another, where it would hold two states: take "
-                "model.double, or make what holds it, in the thread that uses it"
+                "a context of one thread is used in another thread: use model.double there, or create the object that "
+                "owns the context in the thread that uses it"
             )
         self.plant.SetPositionsAndVelocities(self.context, x if self.coupling is None else self.coupling.state(x))
 
@@ -286,7 +286,7 @@ class Twin:
         try:
             return self.applied_force() + self._driven_force()
         except RuntimeError as error:
-            raise SimulationError(f"what the diagram's systems exert cannot be told: {error}") from error
+            raise SimulationError(f"the forces of the diagram's systems cannot be evaluated: {error}") from error
 
     def _driven_force(self) -> Any:
         """(nv,) of the actuators that the diagram's systems drive."""
@@ -384,7 +384,7 @@ class SharedPlant:
         with self.lock:
             others = [thread.name for thread in self._users if thread is not me and thread.is_alive()]
             if others:
-                raise ModelError(f"another thread ({others[0]}) uses this model: none may set {names}, {REMEDY}")
+                raise ModelError(f"another thread ({others[0]}) uses this model: no thread can set {names}, {REMEDY}")
             outer, self._changed = self._changed, (me, names)
         try:
             yield

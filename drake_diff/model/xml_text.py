@@ -83,7 +83,7 @@ class XmlText:
         self.root: Element = self._roots[0]
 
     def _refuse_entity(self, parser: Any) -> None:
-        raise ModelError(f"line {parser.CurrentLineNumber}: entities are not read, by Drake neither")
+        raise ModelError(f"line {parser.CurrentLineNumber}: XML entities are not supported, as in Drake")
 
     def _begin(self, parser: Any, tag: str, attributes: dict[str, str]) -> None:
         if len(self._open) >= DEEPEST:

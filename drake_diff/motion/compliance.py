@@ -38,7 +38,9 @@ def read_material(inspector: Any, pairs: Sequence[tuple[Any, Any]], law: str) ->
         values = {name: proximity_property(inspector, geometry, name) for name in QUANTITIES}
         missing = [name for name in ("friction", "stiffness", DAMPING[law]) if values[name] is None]
         if missing:
-            raise ModelError(f"{inspector.GetName(geometry)} states no {missing[0]}: its contact has no law of motion")
+            raise ModelError(
+                f"{inspector.GetName(geometry)} sets no {missing[0]}, without which contact has no law of motion"
+            )
         sides.append([values[name] or 0.0 for name in QUANTITIES])
     return combine(np.array(sides, dtype=float).reshape(len(pairs), 2, 4))
 

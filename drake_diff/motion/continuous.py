@@ -70,11 +70,11 @@ class ContinuousMotion(System):
     def __init__(self, model: Model, law: str | None = None, *, works: bool = False, sizes: Any = 1.0):
         plant, contact = model.plant, model.contract.contact
         if contact.collision_pairs and contact.model != "point":
-            raise ModelError(f"{contact.model} contact has none here")
+            raise ModelError(f"{contact.model} contact is not supported in continuous time")
         if any(actuator.has_controller() for actuator in actuators(plant)):
-            raise ModelError("PD controllers have none")
+            raise ModelError("PD controllers are not supported in continuous time")
         if model.num_constraints:
-            raise ModelError("constraints have none")
+            raise ModelError("constraints are not supported in continuous time")
         self.model, self.twin, self.time_step, self.works = model, model.double, model.time_step, works
         self.law, self.sizes = law or compliance.limit_law(model), sizes
         self.limits = model.inputs.of_actuators([actuator.effort_limit() for actuator in actuators(plant)])
@@ -163,7 +163,7 @@ class ContinuousMotion(System):
     def check(self, x: Array) -> None:
         (lower, upper), q = self.position_limits, x[: self.model.nq]
         if np.any(q < lower) or np.any(q > upper):
-            raise SimulationError("it reaches a joint limit, which has none")
+            raise SimulationError("it reaches a joint limit, which is not supported in continuous time")
 
     def contact_force(self, pairs: Pairs | None = None) -> Array:
         """(nv,) of all contacts in the context's state, or of some `pairs`."""

@@ -120,7 +120,7 @@ class FlowSystem(System):
         beyond = (x[: len(self.lower)] < self.lower) | (x[: len(self.lower)] > self.upper)
         if beyond.any():
             name = self.plant.model.state_names[int(np.argmax(beyond))]
-            raise SimulationError(f"{name} reaches a joint limit, whose motion in continuous time is not known here")
+            raise SimulationError(f"{name} reaches a joint limit, which is not supported in continuous time")
         self.plant.check(x)
 
     def contacts(self, x: Array) -> Array:
@@ -205,8 +205,7 @@ class FlowSteps:
         for parameter in vector.parameters:
             if parameter.kind.quantity not in QUANTITIES:
                 raise ModelError(
-                    f'method="continuous" takes no {parameter.name}: of parameters it takes contact\'s '
-                    f"{', '.join(QUANTITIES)}"
+                    f'method="continuous" does not support {parameter.name}, only contact\'s {", ".join(QUANTITIES)}'
                 )
         self.model, self.vector, self.plant = model, vector, flow_plant(model)
         self.material = material_of(self.plant)
@@ -294,8 +293,8 @@ class FlowSteps:
             inspector = self.model.double.inspector
             names = " and ".join(inspector.GetName(j) for j in self.plant.pairs.ids[pairs[i]])
             raise GradientError(
-                f"{names} overlap so deep that they push each other out by another way: the derivative of that motion "
-                "is not known here; stiffer contact does not let them"
+                f"{names} overlap so deeply that their contact normal jumps, and the derivative of that motion "
+                "is not known: use stiffer contact"
             )
 
     def _jump(self, step: Step, u: Array, by_parameters: Array, change: Array) -> None:

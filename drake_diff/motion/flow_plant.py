@@ -116,7 +116,7 @@ class FlowPlant:
     def __init__(self, model: Model):
         contact, self.description = model.contract.contact, describe(model)
         if contact.collision_pairs and contact.model != "point":
-            raise ModelError(f"{contact.model} contact has no motion in continuous time here: point contact has one")
+            raise ModelError(f"{contact.model} contact is not supported in continuous time: use point contact")
         self.model, self.pairs, self.law = model, read_pairs(model, cylinders=True), compliance.limit_law(model)
         count = len(self.pairs.ids)
         self.is_whole = count == contact.collision_pairs  # whether all that may touch are pairs here
@@ -209,8 +209,8 @@ class FlowPlant:
             if frozenset((pair.id_A, pair.id_B)) not in known:
                 names = " and ".join(query.inspector().GetName(i) for i in (pair.id_A, pair.id_B))
                 raise SimulationError(
-                    f"{names} touch, and are no sphere beside a sphere, box, capsule, cylinder or half space: their "
-                    "motion in continuous time is not known here; see contact_geometry of load_model"
+                    f"{names} touch, but continuous time supports only spheres against a sphere, box, capsule, "
+                    "cylinder or half space; see contact_geometry of load_model"
                 )
 
     def _part(self, pushing: tuple[int, ...]) -> FlowPart:

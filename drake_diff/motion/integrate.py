@@ -172,7 +172,7 @@ class Integrator:
         is_cut = length < self._length
         while True:
             if self.system.used > self.system.most:
-                raise SimulationError(f"it is too stiff: {self.system.most} evaluations do not reach its end")
+                raise SimulationError(f"the motion is too stiff: {self.system.most} evaluations do not reach its end")
             if self.deadline < np.inf and time.thread_time() > self.deadline:
                 raise TimeoutError
             x, rates, error, stiffness = self._take(length)
@@ -180,7 +180,7 @@ class Integrator:
                 break
             length, is_cut = length * factor(error / self.tolerance), False
             if length < SHORTEST:
-                raise SimulationError("it cannot go on: its rates are not finite, or jump")
+                raise SimulationError("the integration cannot continue: the rates are not finite, or jump")
         next_length = length * factor(error / self.tolerance)
         self._length = max(self._length, next_length) if is_cut else next_length  # a step that is cut says nothing
         end = self._until_change(_Reach(length, x, rates, stiffness, *self.system.watch(x, rates)))

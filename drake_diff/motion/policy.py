@@ -97,9 +97,13 @@ class PD:
         joints = [actuator.joint() for actuator in actuators(model.plant)]
         if not model.inputs.plain:
             got = f"the inputs {', '.join(model.input_names)}"
-            raise InputError("model", got=got, expected="one whose inputs are its actuators")
+            raise InputError("model", got=got, expected="a model whose inputs are its actuators")
         if model.inputs.commanded.any():
-            raise InputError("model", got="commanded positions as inputs", expected="efforts, which this policy gives")
+            raise InputError(
+                "model",
+                got="commanded positions as inputs",
+                expected="efforts as inputs, as this policy computes efforts",
+            )
         if not joints:
             raise InputError("model", got="no actuators", expected="at least one")
         self.x_ref = finite_array("x_ref", model.default_state if x_ref is None else x_ref, (model.nx,))
@@ -108,7 +112,11 @@ class PD:
         places = [model.places(joint) for joint in joints]
         if not all(len(q) for q, _ in places):
             follower = next(joint.name() for joint, (q, _) in zip(joints, places, strict=True) if not len(q))
-            raise InputError("model", got=f"an actuator on {follower}, which follows another joint", expected="none")
+            raise InputError(
+                "model",
+                got=f"an actuator on {follower}, which follows another joint",
+                expected="actuators on other joints",
+            )
         self._positions = [q.start for q, _ in places]
         self._velocities = [model.nq + v.start for _, v in places]
 
@@ -158,7 +166,7 @@ class LQR:
         try:
             gain, cost_to_go = DiscreteTimeLinearQuadraticRegulator(A=A, B=B, Q=Q, R=R)
         except (RuntimeError, SystemExit) as error:  # pydrake makes a failed demand of Drake's a SystemExit
-            expected = "a fixed point that the inputs can stabilize, and Q that sees all of it"
+            expected = "a fixed point that the inputs can stabilize, and Q that weights all unstable directions"
             raise InputError("LQR", got=str(error), expected=expected) from error
         self.gain, self.cost_to_go = frozen(gain), frozen(cost_to_go)
         self.parameters = frozen(self.gain.ravel())
@@ -337,8 +345,8 @@ def _check(numbers: Any, rows: Array, u: Array) -> None:
     values = ExtractValue(numbers.reshape(-1, 1)).ravel() if len(u) else u
     if not np.all(np.abs(values - u) <= PARITY_TOLERANCE * np.maximum(1.0, np.abs(u))):
         raise GradientError(
-            f"the policy with AutoDiffXd is not the policy with floats: u is {values} there and {u} here, at the "
-            "same x and t (is it random, or does it remember?)"
+            f"the policy returns u = {values} with AutoDiffXd and u = {u} with floats at the same x and t: make it a "
+            "function of x and t only, without random numbers and memory"
         )
     if not np.all(np.isfinite(rows)):
         raise GradientError("the derivative of the policy is not finite")

@@ -219,10 +219,10 @@ def smooth(
     x = finite_array("x", x, ("n",))
     moved = _moved(noise, len(x))
     if jacobian is None and (method != "zeroth" or not moved.all()):
-        why = "a function (n,) -> (m, n): only zeroth order of coordinates that noise moves does without"
+        why = 'a function (n,) -> (m, n): only method="zeroth" with noise on all coordinates needs none'
         raise InputError("jacobian", got=None, expected=why)
     if positive_int("samples", samples) < 2:
-        raise InputError("samples", got=samples, expected="at least 2: one has no variance")
+        raise InputError("samples", got=samples, expected="at least 2, as one sample has no variance")
     samples, seed = int(samples), count("seed", seed, 0, LARGEST_SEED)
     sums = _moments(f, x, jacobian, noise, moved, samples, seed, corrects=method == "blend")
     common: dict[str, Any] = {"method": method, "samples": samples, "seed": seed, "noise": noise}
@@ -433,5 +433,5 @@ def _evaluate(subject: str, function: Callable[[Array], Any], point: Array, shap
         raise InputError(f"{subject}(x)", got=repr(result)[:80], expected="an array of numbers") from error
     values = array_with_gaps(f"{subject}(x)", result, shape)
     if not np.isfinite(values).all():
-        raise GradientError(f"{subject}({given.tolist()}) is {values.tolist()}: it must be finite wherever noise leads")
+        raise GradientError(f"{subject}({given.tolist()}) is {values.tolist()}: it must be finite for all samples")
     return values

@@ -121,8 +121,9 @@ class Undefined(ShowsItsRepr):
             if error <= KNOWN * abs(value):
                 return self._smooth(width, samples, random)
         raise GradientError(
-            f"no width up to {SMOOTHED[-1] * line.unit:g} has a smoothed slope by {self.column} that {samples} samples "
-            f"show: there it is {value:.3g} with a standard error of about {error:.2g}; take more samples"
+            f"the smoothed slope by {self.column} is not significant with {samples} samples: at the largest width, "
+            f"{SMOOTHED[-1] * line.unit:g}, it is {value:.3g} with a standard error of about {error:.2g}; take more "
+            "samples"
         )
 
     def _smooth(self, width: float, samples: int, random: np.random.Generator) -> Smoothed:
@@ -131,8 +132,8 @@ class Undefined(ShowsItsRepr):
         return smooth(line.value, [0.0], line.derivative, noise=noise, samples=samples, seed=seed)
 
 
-UNSETTLED = "the slopes do not settle"
-MISSED = "the slopes settle, and the derivative is not what they settle at"
+UNSETTLED = "the slopes do not converge"
+MISSED = "the slopes converge, but not to the derivative"
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,7 +316,7 @@ class _Judge:
                 reason = self._reason(line, slopes_by_width, SMOOTH)
                 reason = UNSETTLED if line.touches else reason
         except SimulationError as error:
-            reason = f"a little away there is no motion: {error}"
+            reason = f"the motion near this one fails: {error}"
         if not reason:
             return None
         widths, slopes = tuple(w * line.unit for w in slopes_by_width), tuple(slopes_by_width.values())

@@ -178,7 +178,7 @@ class _Stages:
         if followed:
             _, self.xs, self.us = min(followed, key=lambda start: start[0])
         else:
-            refusal = "refused: the true plant can follow none of the relaxed stages"
+            refusal = "refused: the true plant follows no relaxed stage"
             self.log(None, None, refusal, 0, None, None, None, kind="relaxed")
             self.xs, self.us = roll_states(problem.model, problem.x0, us), us
         if self.is_over():
@@ -219,7 +219,7 @@ class _Stages:
         except (GradientError, SimulationError) as error:
             self.log(None, None, f"refused: {error}", 0, None, None, None)
             outcome = Outcome.NO_GRADIENT if isinstance(error, GradientError) else Outcome.DIVERGED
-            message = f"iLQR: the motion that the stages lead to is refused on the true plant: {error}"
+            message = f"iLQR: the true plant refuses the motion of the last stage: {error}"
             return NlpResult(self.us.ravel(), outcome, message, ())
         self.log(None, None, *_stage_record(problem, result, xs, us))
         if result.outcome in (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.INFEASIBLE):
@@ -254,7 +254,7 @@ def default_schedule(problem: Problem) -> tuple[SoftContact, ...]:
     set_state(model.double, problem.x0)
     mass = min((1 / pair.mobility for pair in separations(model.double) if pair.mobility > 0), default=math.inf)
     if not math.isfinite(mass):
-        raise InputError("x0", got="nothing that may collide can approach", expected="a pair that can")
+        raise InputError("x0", got="no collision pair that can approach", expected="a state with such a pair")
     reach = max(*distances(model.double).values(), thinnest_geometry(model)[0] / 2)
     duration, stiffest = problem.num_steps * model.time_step, SOFT.largest_stiffness * mass / model.time_step**2
     stages: list[SoftContact] = []
@@ -270,12 +270,14 @@ def default_schedule(problem: Problem) -> tuple[SoftContact, ...]:
 def read_relaxed_plant(problem: Problem) -> RelaxedPlant:
     """What the stages need to know of the model; InputError where a problem or a model is none of theirs."""
     if not problem.initial_state_is_given:
-        raise InputError("continuation", got="'relaxed' with a free initial state", expected="one that is given")
+        raise InputError("continuation", got="'relaxed' with a free initial state", expected="a given initial state")
     plant = problem.model.cache("relaxed plant", lambda: relaxed_plant(problem.model))
     if isinstance(plant, Refusal):
         raise InputError("continuation", got=f"'relaxed': {plant.reason}", expected="another model, or 'auto'")
     if not plant.pairs.ids:
-        raise InputError("continuation", got="'relaxed': no sphere may touch anything", expected="a pair that may")
+        raise InputError(
+            "continuation", got="'relaxed': no sphere has a collision pair", expected="a model with such a pair"
+        )
     return plant
 
 

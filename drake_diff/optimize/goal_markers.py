@@ -95,10 +95,10 @@ def meaning_of(goals: Sequence[Goal]) -> list[Colour]:
 
 def colours_of(*, plan: bool, contacts: bool, thrusts: bool) -> list[Colour]:
     """What is drawn of a motion beside the robot: its path, and where there are any a ghost and forces."""
-    colours = [(css(BLUE), "dot", "the plan, where the motion is elsewhere")] if plan else []
+    colours = [(css(BLUE), "dot", "the plan, where it differs from the motion")] if plan else []
     colours.append((css(TRAIL), "line", "path of the centre of mass of the body that moves most"))
     if contacts:
-        colours.append((css(RED), "arrow", "contact forces: longer is more, and the largest tenth may be cut"))
+        colours.append((css(RED), "arrow", "contact forces: length by magnitude, the largest tenth may be clipped"))
     if thrusts:
         colours.append((css(VIOLET), "arrow", "forces of the inputs on bodies"))
     return colours

@@ -149,7 +149,7 @@ def sampled(problem: Problem, method: str, given: Any) -> Any:
     for name, signal, rows in zip(("state", "input"), given, (problem.nx, problem.nu), strict=True):
         if not isinstance(signal, Trajectory):
             raise InputError(
-                f"initial_guess {name}", got=type(signal).__name__, expected="a trajectory, as the other is"
+                f"initial_guess {name}", got=type(signal).__name__, expected="a trajectory of Drake, like the other"
             )
         if (signal.rows(), signal.cols()) != (rows, 1):
             raise ShapeError(f"initial_guess {name}", got=(signal.rows(), signal.cols()), expected=(rows, 1))

@@ -214,15 +214,13 @@ def out_of_reach(problem: Problem, variables: ShootingVariables, z: Array) -> Ou
     fixed = [i for i in asked if not plan.can_move(i)]
     if fixed and len(fixed) == len(asked) and plan.asks_of_what_moves():
         labels = ", ".join(names[i] for i in fixed)
-        return OutOfReach(constant=f"the cost depends on {labels}, which nothing that may change can move")
+        return OutOfReach(constant=f"the cost depends on {labels}, which no variable can move")
     worst = max(asked, key=lambda i: (i not in fixed, asked[i][0]))
     distance, knot = asked[worst]
     far = f" by {distance:.3g}" if np.isfinite(distance) else ""
     message = f"the cost asks {names[worst]} to move{far} at knot {knot}, and no variable moves it along the plan"
     if worst in fixed:
-        return OutOfReach(
-            f"{message}; nothing that may change can: leave it out of the cost, or let something reach it"
-        )
+        return OutOfReach(f"{message}, and no other plan moves it: remove it from the cost, or let a variable move it")
     return OutOfReach(f"{message}{_what_is_apart(problem, variables.states(z))}")
 
 
@@ -467,11 +465,11 @@ def doubt_of_the_slope(problem: Problem, vector: ParameterVector, x0: Array, us:
                     f"slopes over +-{widths[-2]:.1g} and +-{widths[-1]:.1g} along its own direction differ by "
                     f"{apart:.0%}"
                 )
-                return "no_gradient", f"the derivative of the plan's end is that of a point alone: {message}"
-            message = f"the derivative of the plan's end is {off[-1]:.1%} off the slope that another integration has"
+                return "no_gradient", f"the derivative of the plan's end holds at this point only: {message}"
+            message = f"the derivative of the plan's end differs by {off[-1]:.1%} from the slope of another integration"
             return "converged_not_verified", message
     except (GradientError, SimulationError) as error:
-        return "no_gradient", f"beside the plan there is no motion: {error}"
+        return "no_gradient", f"the motion near the plan fails: {error}"
     return None
 
 

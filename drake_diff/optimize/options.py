@@ -99,7 +99,7 @@ class Options:
         self._set("clearance_parts", tuple(count("clearance_parts", parts, 2) for parts in self.clearance_parts))
         for name in HOOKS:
             if not (getattr(self, name) is None or callable(getattr(self, name))):
-                raise InputError(name, got=repr(getattr(self, name)), expected="None or a function")
+                raise InputError(name, got=repr(getattr(self, name)), expected="a function or None")
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)

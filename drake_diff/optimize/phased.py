@@ -97,7 +97,9 @@ class PhasedSolution(Solution):
 
     def trajectory(self) -> Trajectories:
         """ModelError: every one of `phases` has its own."""
-        raise ModelError(f"{self.problem.name}: no trajectory of all phases: each of `phases` has its own")
+        raise ModelError(
+            f"{self.problem.name}: expected a phase, got all phases: each of `phases` has its own trajectory"
+        )
 
     @property
     def defects(self) -> Array:
@@ -219,7 +221,7 @@ def _stacked(arrays: Sequence[Array]) -> Array:
 def _chain_check(solution: PhasedSolution) -> Check:
     motions = [phase.transcribed for phase in solution.phases]
     if any(motion is None for motion in motions):
-        return check("chain", "a phase has entries that are no numbers", np.inf, INTEGRATION_TOLERANCE)
+        return check("chain", "a phase has entries that are not finite", np.inf, INTEGRATION_TOLERANCE)
     rows = list[Check]()
     for feedback in (None, FEEDBACK):
         worst, where = _led_through(solution, [m for m in motions if m is not None], feedback or OPEN_LOOP)

@@ -50,7 +50,7 @@ from drake_diff.optimize.transcription.drake import solve_collocation
 from drake_diff.optimize.transcription.steps import solve_shooting
 from drake_diff.optimize.verification import ended, judged, may_be_too_coarse, refused, status_of, unmeasured
 
-NEAR = "a motion near the collocated optimum, and no optimum in these steps itself"
+NEAR = "a motion near the collocated optimum, but not an optimum in these steps"
 GRACE = 0.05  # of the time limit, beyond it: for measures of what a search found that the limit ended
 # What a solve is made of, in this order; a time limit names what it cut.
 STAGES = ("certificates of the guess", "the search", "certificates of the result", "replays and other measures")
@@ -496,7 +496,7 @@ class Run:
         try:
             reach = out_of_reach(problem, variables, variables.pack(xs[0], us, solution.step_vector.values))
         except (GradientError, SimulationError) as error:
-            detail = f"whether the cost asks for what nothing moves cannot be told: {error}"
+            detail = f"the check for costs that no variable can reduce fails: {error}"
             return ended(solution, Status.CONVERGED_NOT_VERIFIED, detail)
         if reach.silent:
             return ended(solution, Status.NO_GRADIENT, reach.silent)

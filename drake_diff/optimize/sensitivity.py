@@ -128,7 +128,9 @@ def sensitivity(solution: Solution, by: Any = "x0", *, certified: bool = True) -
     if type(solution) is not Solution:
         raise InputError("solution", got=type(solution).__name__, expected="a Solution")
     if not solution.success:
-        raise InputError("solution", got=solution.status.value, expected="one that is a success: its message says why")
+        raise InputError(
+            "solution", got=solution.status.value, expected="a successful solution; its message says why it is not"
+        )
     if solution.scheme == "drake":
         raise InputError(
             "solution", got='scheme="drake"', expected="one by hermite_simpson, trapezoid, iLQR or shooting"
@@ -191,7 +193,9 @@ def _plan(solution: Solution) -> _Plan:
         z = program.phases[0].pack(np.asarray(motion.nodes), motion.horizon, motion.task.parameters)
         return _Plan(problem, collocated, z, False)
     if problem.trajectory_cost is not None:
-        raise InputError("trajectory_cost", got="given", expected="none: it joins all states, and no step does")
+        raise InputError(
+            "trajectory_cost", got="given", expected="no trajectory_cost, as it joins the states of all steps"
+        )
     rounds = solution.options.get("clearance_rounds", ())
     if rounds:  # what it was searched with besides
         more = swept(problem.kept, solution.time_step, int(rounds[-1][0]))
@@ -209,8 +213,8 @@ def _held(plan: _Plan) -> HeldPlan:
         return HeldPlan(plan.problem, plan.make, sharper)
     if held.left > WEAK:
         raise GradientError(
-            f"the plan has no derivative: it is no stationary point of its problem, {held.left:.2g} of the cost's "
-            "slope is left; it ended at a kink, as where a contact begins, or short of its optimum"
+            f"the plan has no derivative: it is not a stationary point of its problem, as {held.left:.2g} of the "
+            "cost's slope remains; it ends at a kink, as where a contact begins, or short of its optimum"
         )
     return held
 
@@ -221,7 +225,7 @@ def _change(solution: Solution, by: Any) -> Change:
         state = problem.start if by == "x0" else np.where(problem.is_orientation, np.nan, problem.goal)
         ends = np.flatnonzero(~np.isnan(state))
         if not len(ends):
-            raise InputError("by", got=repr(by), expected="an end that is given: all of its entries are free")
+            raise InputError("by", got=repr(by), expected="a state with given entries, as all of these are free")
         return Change(tuple(problem.state_names[i] for i in ends), state[ends], ends, by)
     if not problem.has_model:
         raise UnknownNameError("by", got=by, known=ENDS)
@@ -232,11 +236,9 @@ def _change(solution: Solution, by: Any) -> Change:
         expected = '"x0" or "goal", as the problem has parameters of its own'
         raise InputError("by", got=repr(by), expected=expected)
     if any(isinstance(goal, TerminalSet) for goal in problem.goals):
-        raise InputError("by", got=repr(by), expected='"x0": a TerminalSet is one of the model as it is')
+        raise InputError("by", got=repr(by), expected='"x0", as a TerminalSet does not depend on the other parameters')
     if problem.horizon is not None and solution.transcribed is None:
-        raise InputError(
-            "by", got=repr(by), expected='"x0" or "goal", as steps of a horizon have a length of their own'
-        )
+        raise InputError("by", got=repr(by), expected='"x0" or "goal", as a horizon sets the length of the steps')
     chosen = {p.name for p in problem.parameters.parameters} & {p.name for p in vector.parameters}
     if chosen and problem.optimizes_parameters:
         raise InputError("by", got=sorted(chosen), expected="parameters that the plan does not choose itself")
@@ -271,7 +273,7 @@ def _differences(plan: _Plan, held: HeldPlan, change: Change, response: Held) ->
             sides = _distance(left, right, least)
         apart.append(off)
         if off > SAME and sides > TWO_SIDED * SAME:
-            corners.append(f"the two sides of {change.columns[i]} differ by {sides:.2g} of it")
+            corners.append(f"the one-sided derivatives by {change.columns[i]} differ by {sides:.2g} of their size")
     return np.array(apart), corners
 
 

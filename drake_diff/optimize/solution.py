@@ -180,7 +180,7 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         """The same motion with other `fields` out of TOLD: its measures stay. UnknownNameError of others."""
         for name in fields:
             if name not in TOLD:
-                raise UnknownNameError("field to be told", got=name, known=TOLD)
+                raise UnknownNameError("field of a Solution", got=name, known=TOLD)
         changed = copy.copy(self)
         vars(changed).update(fields)
         return changed
@@ -329,7 +329,7 @@ class Solution(PicklesItsFields, ShowsItsRepr):
             (array([0.5, 1.5]), array([3.]))
         """
         if not self._is_whole or not (np.all(np.isfinite(self.xs)) and np.all(np.isfinite(self.us))):
-            raise ModelError(f"{self.problem.name}: no trajectory: the solution has entries that are no numbers")
+            raise ModelError(f"{self.problem.name}: no trajectory: the solution has entries that are not finite")
         return trajectories(self)
 
     @property
@@ -504,7 +504,7 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         Collocation has another Lagrangian, that of its scheme: its multipliers are the solver's.
         """
         if self.scheme != "step":
-            return Refusal("of discrete steps alone: the Lagrangian of a collocation is that of its scheme")
+            return Refusal("only discrete steps have it, as the Lagrangian of a collocation belongs to its scheme")
         if not self._is_whole or not np.all(np.isfinite(self.xs)):
             return Refusal("the plan is not finite")
         try:

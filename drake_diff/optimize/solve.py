@@ -214,7 +214,7 @@ def _check_common(problem: Any, seed: Any, callback: Any, progress: Any, view: A
     for phase in problem.phases:
         phase.check_derivatives()
     if not (callback is None or callable(callback)):
-        raise InputError("callback", got=repr(callback), expected="None or a function of an Iteration")
+        raise InputError("callback", got=repr(callback), expected="a function of an Iteration, or None")
     if not (isinstance(progress, bool) or callable(progress)):
         raise InputError("progress", got=repr(progress), expected="True, False or a function")
     if not (isinstance(view, bool) or callable(view)):
@@ -286,8 +286,10 @@ class _Task:
         guesses = first_guesses(problem, method, given, self.seed)
         continuation = attempt.options.continuation
         if continuation is not None and problem.design.vector.parameters:
-            given_too = "with parameters or a horizon"
-            raise InputError("continuation", got=given_too, expected="none of them: leave the continuation out")
+            given_too = "a continuation with parameters or a horizon"
+            raise InputError(
+                "continuation", got=given_too, expected="no continuation, or a problem without parameters and horizon"
+            )
         stages = () if continuation is None else check_schedule(problem, continuation)
         searched = kept_apart(problem) if attempt.apart else closest_to(problem, given) if attempt.closest else None
         limits = self._limits_of(attempt)
@@ -344,7 +346,7 @@ def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Any:
         return best
     by_collocation = in_phases or all(s.method == "collocation" for s in solutions)
     if len(solutions) > 1 and best.status not in PLANS and by_collocation:
-        best = best.noted(f"from none of {len(solutions)} first guesses was a plan found")
+        best = best.noted(f"no plan was found from {len(solutions)} first guesses")
     return best.told(options=best.options | {"chain": chain})
 
 
@@ -619,7 +621,7 @@ def _check_attempt(problem: Problem | PhasedProblem, attempt: Attempt) -> str:
         raise InputError("problem", got="plain dynamics", expected=expected)
     if problem.horizon is not None and not problem.model.can_rebuild:
         raise InputError(
-            "horizon", got="given", expected=f"none for steps of a diagram, which are of one length: {takes}"
+            "horizon", got="given", expected=f"no horizon with a diagram, as its steps have a fixed length: {takes}"
         )
     _check_timed_cost(problem)
     if problem.rate_limits and problem.horizon is not None and problem.horizon[0] < problem.horizon[1]:
@@ -636,7 +638,7 @@ def _check_motion(attempt: Attempt) -> None:
         expected = 'method="ilqr" or "shooting" for motion="continuous": collocation leaves contact out'
         raise InputError("method", got='"collocation"', expected=expected)
     if attempt.options.continuation is not None:
-        expected = 'none for motion="continuous": restarts try other first guesses'
+        expected = 'no continuation for motion="continuous"; use restarts to try other first guesses'
         raise InputError("continuation", got="given", expected=expected)
 
 
@@ -675,7 +677,7 @@ def _check_phases(problem: PhasedProblem, attempt: Attempt) -> str:
         raise InputError("solver", got=repr(attempt.options.solver), expected='"ipopt" for a PhasedProblem')
     scheme = _check_scheme(problem, attempt)
     if scheme == "drake":
-        raise InputError("scheme", got=repr(scheme), expected="another one for a PhasedProblem")
+        raise InputError("scheme", got=repr(scheme), expected="another scheme for a PhasedProblem")
     return scheme
 
 
@@ -684,17 +686,19 @@ def _check_scheme(problem: Problem | PhasedProblem, attempt: Attempt) -> str:
     if scheme not in SCHEMES:
         raise UnknownNameError("scheme", got=scheme, known=[name for name in SCHEMES if name != MAP])
     if (scheme == MAP) != problem.is_map:
-        expected = f"{MAP!r}, as the system is a DiscreteMap" if problem.is_map else "one of motions in time"
+        expected = f"{MAP!r}, as the system is a DiscreteMap" if problem.is_map else "a scheme for motion in time"
         raise InputError("scheme", got=repr(scheme), expected=expected)
     if problem.is_map and attempt.options.refine:
-        raise InputError("refine", got=True, expected="None or False: a DiscreteMap has no intervals to split")
+        raise InputError("refine", got=True, expected="False or None, as a DiscreteMap has no intervals to split")
     return scheme
 
 
 def _check_timed_cost(problem: Problem) -> None:
     if isinstance(problem.running_cost, TimedCost) and problem.horizon and problem.horizon[0] < problem.horizon[1]:
         raise InputError(
-            "running_cost", got="one that changes in time", expected="one that does not: the horizon is free"
+            "running_cost",
+            got="one that changes in time",
+            expected="a running_cost that is constant in time, as the horizon is free",
         )
 
 

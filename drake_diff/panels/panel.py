@@ -79,7 +79,7 @@ class TrialFunction:
             raise InputError("evaluate", got=got, expected="a file or module that can be imported") from error
         function, file = getattr(module, name, None), getattr(module, "__file__", None)
         if not callable(function):
-            raise InputError("evaluate", got=f"{self.evaluate}, which is not one", expected="a function")
+            raise InputError("evaluate", got=f"{self.evaluate}, which is not callable", expected="a function")
         return function, sha256(Path(file).read_bytes()).hexdigest() if file else None
 
 
@@ -96,7 +96,7 @@ def row_of(function: Function, fields: Mapping[str, Any]) -> Row:
             raise InputError("row", got=type(row).__name__, expected="a mapping of names to values")
         for key in row:
             if not isinstance(key, str) or key in fields or key == "id":
-                raise InputError("row", got=repr(key), expected="names that are not the trial's own")
+                raise InputError("row", got=repr(key), expected="names other than the fields of a trial")
         return {key: _plain(value) for key, value in row.items()}
     except (Exception, SystemExit) as error:  # sys.exit() in a trial ends that trial, not the panel
         return {"error": f"{type(error).__name__}: {error}"}
@@ -166,7 +166,7 @@ def _answers(
     with closing(parallel(tasks())) as answers:
         for trial, row, refusal in answers:
             if refusal:
-                raise InputError("evaluate in a worker", got=refusal, expected="a function that can be loaded there")
+                raise InputError("evaluate in a worker", got=refusal, expected="a function that a worker can load")
             if trial is not None:
                 yield trial, row
 
@@ -239,11 +239,13 @@ def _ray(workers: int | None, address: str | None) -> Iterator[tuple[int, type[B
     try:
         ray.init(address or "local", runtime_env=environment, log_to_driver=False, logging_level="error", **cores)
     except ConnectionError as error:
-        raise InputError("address", got=f"{address}: {error}", expected="a Ray cluster of ours") from error
+        raise InputError(
+            "address", got=f"{address}: {error}", expected="the address of a running Ray cluster"
+        ) from error
     try:
         if address is None and ray.util.get_node_ip_address() != "127.0.0.1":
-            expected = "it not to be imported before run_panel: only then does it listen on loopback alone"
-            raise InputError("ray", got="it is imported already", expected=expected)
+            expected = "no import of ray before run_panel, so that Ray listens on loopback only"
+            raise InputError("ray", got="an earlier import", expected=expected)
         # A process that died is started again, and Ray evaluates its trial once more.
         options = {"max_restarts": -1, "max_task_retries": 1, "scheduling_strategy": "SPREAD"}
         with joblib.parallel_config(backend="ray", ray_remote_args=options):

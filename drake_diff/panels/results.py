@@ -177,7 +177,7 @@ class Finished:
     def _read(self, path: Path) -> Row:
         trial, problems = _read_trial(path)
         if trial.conditions != self.conditions:
-            problems = (*problems, "it is of another panel; remove it")
+            problems = (*problems, "it belongs to another panel; remove it")
         if problems:
             raise ArtifactError(f"{path}: {problems[0]}")
         return trial.result
@@ -202,7 +202,7 @@ def _check_same_panel(directory: Path, conditions: Mapping[str, Any]) -> None:
     with suppress(ArtifactError):  # what has no record of a panel is refused below
         record = load_record(directory)
     if not isinstance(record, ComparisonRecord) or record.panel is None:
-        expected = "a new or empty directory, or one in which a panel was begun"
+        expected = "a new or empty directory, or the directory of an unfinished panel"
         raise InputError("out", got=f"{directory}, which holds {next(directory.iterdir()).name!r}", expected=expected)
     old = record.panel.conditions
     for key in sorted({*old, *conditions}):

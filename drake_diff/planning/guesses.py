@@ -159,7 +159,7 @@ def postures(robot: Robot, task: Goals, seed: int) -> list[Array]:
             blocked = space.obstruction(q)
             candidates += [] if blocked else [q]
     if not candidates and blocked:
-        expected = f"a goal that some posture reaches clear of all obstacles; {MORE_SEEDS} were tried"
+        expected = f"a goal that one of {MORE_SEEDS} tried postures reaches clear of all obstacles"
         raise InputError(f"goal {', '.join(task.frames)}", got=f"at the goal {blocked}", expected=expected)
     if not candidates:
         criteria = "inside all limits, without overlap and held by the motors"
@@ -186,7 +186,7 @@ def _reach(robot: Robot, task: Goals, first: Array, fixed: Array) -> tuple[Array
 def _random_goals(space: Space, random: np.random.Generator) -> list[Array]:
     goals = [q for q in (_random_posture(space, random) for _ in range(RANDOM)) if q is not None]
     if not goals:
-        message = "no posture to go to was found: none that was drawn is clear of all shapes and held by the motors"
+        message = "no goal posture was found: no random posture is free of overlap and held by the motors"
         raise ModelError(f"{message}: give a goal")
     return goals
 
@@ -266,7 +266,7 @@ def lines(space: Space, target: Array, seed: int) -> list[PostureLine]:
         if space.is_free(line.postures):
             candidates.append(line)
     if not (can_search or candidates):
-        raise MissingDependencyError("a way around what is in the way needs a search: pip install ompl")
+        raise MissingDependencyError("a path around the obstacles needs a search: pip install ompl")
     searched = [_search(space, target, seed + i) for i in range(SEARCHES if can_search else 0)]
     candidates += [line for line in searched if line is not None]
     return sorted(candidates, key=lambda line: line.length)[:MOST_LINES] or [straight]

@@ -177,8 +177,8 @@ def _fix_stuck(draft: _Draft) -> None:
             names.append(joint.name())
     stuck = _with_followers(model, names)
     if stuck and len(stuck) == _movable(model):
-        got = "each has the same lower and upper limit, which Drake keeps"
-        raise ModelError(f"{draft.path}: no joint of it can move: {got}")
+        got = "each joint has equal lower and upper limits, which Drake enforces"
+        raise ModelError(f"{draft.path}: no joint can move: {got}")
     if stuck:
         draft.fix(stuck, f"{_few(stuck)} had the same lower and upper limit")
 
@@ -242,7 +242,7 @@ def _standing(read: _Draft, seed: int) -> Robot | Refusal:
         _fix_massless(draft)
         derivatives = analytic_of(draft.model)
         if draft.model.nv > MANY and isinstance(derivatives, Refusal) and draft.options.get("mimic") == "reduce":
-            what = "what follows and what leads is fixed where it stands"
+            what = "mimic joints and their leaders are fixed at their position"
             draft.mend(f"{what} (mimic='fix'), for analytic derivatives", mimic="fix")
             derivatives = analytic_of(draft.model)
         model = draft.model
@@ -262,7 +262,7 @@ def _standing(read: _Draft, seed: int) -> Robot | Refusal:
     draft.repairs.append(f"it stands on {_few(foot.name for foot in stance[0].feet)}, {ground}")
     if besides:
         pairs = _few(map(" and ".join, sorted(besides)))
-        draft.repairs.append(f"{pairs} overlap where it stands, which is not looked at")
+        draft.repairs.append(f"{pairs} overlap where it stands, which the search ignores")
     return Robot(model, shapes, q, lower, upper, tuple(draft.repairs), False, besides, stance)
 
 
@@ -284,7 +284,7 @@ def _placed(draft: _Draft, random: np.random.Generator) -> Robot:
         else:
             posture = start(shapes, holds, first, lower, upper, random)
     except SimulationError as error:
-        repairs.append(f"its overlap is not looked for: {error}")
+        repairs.append(f"its overlap cannot be checked: {error}")
         shapes, posture = None, start(None, holds, first, lower, upper, random)
     weak = _too_weak(apart, posture) if driven and posture.load > 1 else ()
     if weak and len(weak) < model.nv:

@@ -84,7 +84,7 @@ def _in_simulator(follower: PlanFollower, name: str) -> list[Replay]:
     plan, parts = follower.plan, max(1, math.ceil(follower.period / LONGEST - 1e-9))
     try:
         if not np.array_equal(plan.vector.values, select(plan.problem.model, plan.vector.names).values):
-            raise ModelError("another simulator is given the model's own parameters, and the plan has others")
+            raise ModelError("another simulator uses the model's own parameters, but the plan has others")
         if name == "mujoco":  # which takes any step of a model that Drake has at one alone
             return replays_in(follower, load_engine(name, plan.problem.model, time_step=follower.period / parts))
         return replays_in(follower, load_engine(name, plan.problem.model.at_time_step(follower.period / parts)))
@@ -116,7 +116,7 @@ def replays_in(follower: PlanFollower, engine: Engine) -> list[Replay]:
     plan, h, x0 = follower.plan, engine.contract.time_step, follower.xs[0]
     model, pieces = plan.problem.model, round(follower.period / h)
     if not pieces or abs(pieces * h - follower.period) > 1e-9 * follower.period:
-        raise InputError("time_step [s]", got=h, expected=f"a whole part of {follower.period:.12g}")
+        raise InputError("time_step [s]", got=h, expected=f"{follower.period:.12g} divided by a whole number")
     touch = bool(model.contract.contact.collision_pairs)
     lines = [line for line in match_contracts(DrakeEngine(model), engine) if line.verdict == "different"]
     wrong = [line for line in lines if is_another_model(line, touch) and line.quantity != "time step"]

@@ -230,7 +230,7 @@ def _damage_of_files(path_of_record: Path, record: SealedRecord) -> Iterator[str
 
 
 PARTIAL = re.compile(r"(?P<name>.+)\.(partial|replaced)-\d+-[0-9a-f]{8}")
-EXPECTED = "a new or empty directory, or one that a run wrote and nobody added to"
+EXPECTED = "a new or empty directory, or one with only the files of a run"
 
 
 @contextmanager
@@ -288,8 +288,8 @@ def check_place(target: Path) -> None:
     """InputError where `target`, a whole path, is not for a run to take: it is no directory, or has others' files."""
     if target.is_dir():
         if os.path.ismount(target) or Path.cwd().is_relative_to(target):
-            got = f"{target}, which is mounted there, or is where this process works"
-            raise InputError("directory", got=got, expected="one that another can take the place of: one below it")
+            got = f"{target}, a mount point or the working directory"
+            raise InputError("directory", got=got, expected="a directory that can be replaced, such as one below it")
         other = next(_others(target), None)
         if other is not None:
             raise InputError("directory", got=f"{target}, which holds {other.name!r}", expected=EXPECTED)

@@ -41,7 +41,7 @@ Table = dict[str, JsonValue]
 def _finite(table: Any) -> Any:
     """`table` as it is; ValueError where a number in it is none that JSON has."""
     if isinstance(table, float) and table - table != 0:
-        raise ValueError("expected finite numbers, null where there is none")
+        raise ValueError("expected finite numbers, with null for a missing one")
     for item in table.values() if isinstance(table, dict) else table if isinstance(table, list) else ():
         _finite(item)
     return table

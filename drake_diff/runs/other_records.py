@@ -294,7 +294,7 @@ class ComparisonRecord(SealedRecord):
         facts: dict[str, str] = {e.engine: e.verdict for e in self.engines[1:]}
         for e in self.engines:
             if e.function is not None:
-                source = f"source sha256 {e.function.sha256}" if e.function.sha256 else "its source was not to be had"
+                source = f"source sha256 {e.function.sha256}" if e.function.sha256 else "its source was not available"
                 facts[e.engine] += f"; a user's function {e.function.name}, {source}, which this record does not hold"
         return facts | {e.engine: "not compared" for e in self.refused} | super().facts()
 

@@ -56,12 +56,12 @@ SEARCHED_IN_PHASES = ("phases.search", "phases.initial_guess", "phases.phases")
 OFFSETS_SINCE = 4  # the version of records in whose replays TVLQR follows finer steps with an offset
 SAME_PLAN = 1e-6  # of the largest number of its array: plans that are no further apart are the same
 OF_RECOVERED = (
-    "the run was recovered from one that was killed or failed, so whether a search ends at this plan, and what it told "
-    "of itself, cannot be judged"
+    "the run was recovered from one that was killed or failed, so that the end of its search and the search's own "
+    "statements cannot be checked"
 )
 ROUNDED = 1e-12  # of a number, and absolute: what the same sum may differ by on another machine
 GIVEN_BY_USER = (
-    "problem, model and inputs.search: they are what was asked; a record that asks for less can be just as true"
+    "problem, model and inputs.search: they define the task, and a record of an easier task can be equally true"
 )
 # The modules of packages above this one whose function `reproduce` makes such a directory again.
 REPRODUCED_BY = {
@@ -73,8 +73,8 @@ REPRODUCED_BY = {
     "closed_loop": "drake_diff.loop.files",
 }
 NOT_REPEATED = {
-    Status.TIME_LIMIT: "how far a search gets within its time limit is another on every run",
-    Status.INTERRUPTED: "the search was interrupted, at no moment that could be found again",
+    Status.TIME_LIMIT: "the result of a search that reached its time limit differs on every run",
+    Status.INTERRUPTED: "the search was interrupted at a moment that cannot be repeated",
 }
 
 

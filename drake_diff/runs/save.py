@@ -294,7 +294,7 @@ def _kept_elsewhere(solution: Solution | PhasedSolution, name: str) -> str:
         except OSError:  # the next one, and the sentence says where it was
             continue
         return f"the plan is in {folder}"
-    return "the plan could be kept nowhere: no temporary folder can be written"
+    return "the plan could not be saved: no temporary folder can be written"
 
 
 def fields_of(record: PlanRecord) -> dict[str, Any]:
@@ -388,7 +388,7 @@ def recover(directory: str | Path, out: str | Path | None = None) -> SealedRecor
     target = inner if out is None else Path(out).resolve()
     with nullcontext() if target == inner else writing(inner):
         if is_taken(target):
-            expected = "a new or empty directory, as no run is replaced: --out names another"
+            expected = "a new or empty directory, as recover replaces no run; set it by --out"
             raise InputError("OUT", got=str(target), expected=expected)
         record = load_record(folder)
         if record.state == "complete" and files_below(folder, record.FILE) == record.files:

@@ -189,7 +189,7 @@ def verify(
     seconds where `time_limit` says nothing else.
 
     The directory may be a stranger's. Its model is read and run in a child process with limits of time and memory, and
-    with the rights of this one (see docs/strangers.md). Where that process crashes the verdict is "broken", where it
+    with the rights of this one (see docs/verification.md). Where that process crashes the verdict is "broken", where it
     reaches a limit "undecided".
 
     Args:
@@ -278,7 +278,7 @@ def _looked_at(folder: Path) -> Verification:
         return Verification(folder, None, complaints=(str(error),))
     result = Verification(folder, record, problems, claimed=claims_of(record), notes=_other_versions(record))
     if problems:
-        return replace(result, unchecked=("anything else: it is damaged",))
+        return replace(result, unchecked=("all other contents, as the directory is damaged",))
     unsolved = record.subject in ("plan", "phases") and isinstance(record, PlanRecord) and record.solver is None
     if record.state == "incomplete" or unsolved:
         return replace(result, undecided=(f"there is nothing to run again: {record.sentence}",))
@@ -388,9 +388,9 @@ def _compared(verification: Verification, record: SealedRecord, again: Reproduce
     unchecked += [f"whatever else schema {SCHEMA_VERSION} has otherwise"] * converted
     for name in dict.fromkeys((*again.files, *again.written)):
         if name not in record.files:
-            unchecked += [f"{name}: the directory has none"] * (name in again.files)
+            unchecked += [f"{name}: the file is missing"] * (name in again.files)
         elif name not in again.files:
-            unchecked += [f"{name}: it has what was not run again"] * (bool(again.files) and not nothing)
+            unchecked += [f"{name}: its contents were not computed again"] * (bool(again.files) and not nothing)
         else:
             compared.append(_compared_file(verification.directory, name, again))
     undecided = list(again.undecided)
@@ -431,7 +431,7 @@ def _others(record: SealedRecord, known: Sequence[str]) -> Iterator[str]:
     """Files that were in the directory and are none that drake_diff writes there."""
     for name in sorted(record.files.keys() - {*known, record.SCHEMA_FILE, *OLD_SCHEMAS}):
         if not name.startswith(f"{BUNDLE}/"):  # see `_odd_bundle`
-            yield f"{name}: nothing that drake_diff writes there"
+            yield f"{name}: drake_diff does not write such a file"
 
 
 def _odd_bundle(folder: Path, record: SealedRecord) -> Iterator[str]:
@@ -466,12 +466,14 @@ def _told_of_a_solve(
     if again.missing:
         unchecked.append(f"what rests on the search: {', '.join(again.missing)}")
     if again.apart > SAME_PLAN:
-        undecided.append(f"the search, run again, ends at another plan, {again.apart:.2g} of its largest number away")
+        undecided.append(
+            f"the search, run again, ends at a plan that differs by {again.apart:.2g} of its largest number"
+        )
     differing = [d for item in compared for d in item.differing]
     rounds_otherwise = again.apart > 0 or any(d.allowed for d in differing)
     rounded = []
     if 0 < again.apart <= SAME_PLAN:
-        rounded.append(f"{PLAN}: that of the search, run again, is {again.apart:.2g} of its largest number away")
+        rounded.append(f"{PLAN}: the plan of the search, run again, differs by {again.apart:.2g} of its largest number")
     for d in differing:
         if is_below(d.key, again.missing) and d.file.endswith(SealedRecord.FILE):
             continue

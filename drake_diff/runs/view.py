@@ -98,7 +98,7 @@ class RunComparison:
         return not self.refused
 
     def __str__(self) -> str:
-        counts = f"versions: {len(self.versions)}; metrics: {len(self.metrics)}; not compared: {len(self.refused)}"
+        counts = f"versions: {len(self.versions)}, metrics: {len(self.metrics)}, not compared: {len(self.refused)}"
         return f"configuration: {len(self.configuration)} entries differ; {counts}"
 
 
@@ -348,7 +348,9 @@ def _replay(folders: Sequence[Path], names: Sequence[str], models: str | Path | 
         write_replay(page, _together(*scenes), title=f"{names[0]} and {names[1]}")
         view = page.read_text(encoding="utf-8")
     first, second = names
-    seen = f"The plans of both runs, {first} in its own colours and {second} in orange. The one that ends first waits"
+    seen = (
+        f"The plans of both runs, {first} in its own colours and {second} in orange; the shorter plan stays at its end"
+    )
     return view, seen
 
 

@@ -85,7 +85,7 @@ def write_robustness(result: Robustness, folder: Path, run: str | Path | None) -
     """Write what `save_robustness` does into `folder`, which `written_whole` gave."""
     task, name = result.task, name_of(folder)
     source = None if run is None else RunEvidence(path=str(run), record_sha256=load_plan_record(run).record_sha256)
-    sentence = "the trials are still being written, or that was killed or broke off"
+    sentence = "the trials are still being written, or writing them was killed or failed"
     _record(name, task.model, "incomplete", sentence).begin(folder)
     record = _record(
         name,
@@ -159,7 +159,7 @@ def _page_facts(folder: Path, record: PlanRecord) -> dict[str, Any]:
     section: Any = record.robustness
     worst = weakest_of(section.perturbations).worst
     trial: Any = read_fields(folder / worst / TRIAL)
-    reason = trial["reason"] or "it succeeds, and of all trials it ends furthest from the goal"
+    reason = trial["reason"] or "it succeeds, but it ends furthest from the goal of all trials"
     much = sized(trial["perturbation"], trial["level"])
     return {
         "record": json.loads(canonical(record.model_dump(mode="json"))),  # in the order in which it is written

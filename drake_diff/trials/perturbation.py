@@ -64,7 +64,7 @@ def perturbation_for(name: str, model: Model | None = None) -> Perturbation:
     if name not in PERTURBATIONS:
         raise UnknownNameError("perturbation", got=name, known=PERTURBATIONS)
     if model is not None and not PERTURBATIONS[name].applies_to(model):
-        raise InputError("perturbation", got=name, expected=f"one that applies to {model.name}")
+        raise InputError("perturbation", got=name, expected=f"a perturbation that applies to {model.name}")
     return PERTURBATIONS[name]
 
 
@@ -108,7 +108,7 @@ def parameters_of(model: Model, quantity: str) -> dict[str, Array]:
 def _scaled(quantity: str) -> Callable[[Setup, float, Random], Setup]:
     def apply(setup: Setup, level: float, random: Random) -> Setup:
         if level >= 1:
-            raise InputError(f"level of {quantity}", got=level, expected="less than 1: it is a part of the value")
+            raise InputError(f"level of {quantity}", got=level, expected="a part of the value, less than 1")
         values = {
             name: setup.parameters.get(name, value) * (1 + random.uniform(-level, level))
             for name, value in parameters_of(setup.model, quantity).items()
@@ -122,7 +122,7 @@ def _initial_state(setup: Setup, level: float, random: Random) -> Setup:
     space = tangent_space(setup.model)
     x0 = space.plus(setup.x0, level * random.standard_normal(space.size))
     if not np.all(np.isfinite(x0)):
-        raise InputError("level of initial_state", got=level, expected="one small enough to keep every start finite")
+        raise InputError("level of initial_state", got=level, expected="a level at which every start is finite")
     return replace(setup, x0=x0)
 
 

@@ -255,7 +255,11 @@ def sentence_of(nominal: Nominal, perturbations: Sequence[PerturbationEvidence],
         (error, most), total = raised.most_common(1)[0], sum(raised.values())
         sentences += [f"In {total} of them the controller itself failed, in {most} with {error}."]
     within = f"Gradients predict how far the last state moves within a factor of {AGREE:g} in"
-    sentences += [f"{within} {sum(known)} of {len(known)} cells." if known else "Gradients predict none of it."]
+    sentences += [
+        f"{within} {sum(known)} of {len(known)} cells."
+        if known
+        else "Gradients predict no displacement of the last state."
+    ]
     return " ".join(sentences)
 
 

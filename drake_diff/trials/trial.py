@@ -139,8 +139,8 @@ class Task:
             got = f"{type(error).__name__}: {error}"
             raise InputError("controller", got=got, expected="a function that makes a controller") from error
         if not callable(controller):
-            got = f"one that makes {type(controller).__name__}"
-            raise InputError("controller", got=got, expected="u = controller(x, t)")
+            got = f"a function that makes {type(controller).__name__}"
+            raise InputError("controller", got=got, expected="a function that makes u = controller(x, t)")
         return controller
 
     def followed_by(self, setup: Setup, seed: int) -> str:

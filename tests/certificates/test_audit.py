@@ -187,7 +187,11 @@ CASES = {
     "no quaternion": (not_placed, "no_step", "error", "quaternion"),
     "weight above a limit": (
         lambda: (block(limit=9.0).model(), [0.0, 3.0]),
-        *("saturated_effort", "warning", "to hold x at rest takes 9.81 (without contact), beyond the limit 9"),
+        *(
+            "saturated_effort",
+            "warning",
+            "an effort of 9.81 would hold x at rest (without contact), but the limit is 9",
+        ),
     ),
     "weight below a limit": (lambda: (block(limit=10.0).model(), None), "saturated_effort", None, ""),
     "PD control": (lambda: (block(gains=(20.0, 3.0), start=0.25).model(), None), "pd_gains", "info", "(0.25, 0)"),
@@ -197,7 +201,7 @@ for other in (HalfSpace(), TABLE, BALL):
     CASES |= {
         f"touch of {type(other).__name__} {gap:g}": (
             lambda other=other, gap=gap: over(BALL, other, 0.1 + gap),
-            *("touching", None if gap else "warning", "" if gap else "one side"),
+            *("touching", None if gap else "warning", "" if gap else "one-sided"),
         )
         for gap in (0.0, -1e-6, 1e-6)
     }
@@ -234,7 +238,7 @@ def test_a_box_above_a_tilted_half_space_is_refused_without_touching():
     assert (found.severity, found.subject) == ("error", "body - world")
     assert "body/body_shape (Box)" in found.message
     assert "(HalfSpace)" in found.message
-    assert "throws without touching" in found.message
+    assert "throws without contact" in found.message
     assert "The AutoDiffXd step throws at x over such shapes: Penetration queries" in found.message
     for route in ("corner_spheres", "hydroelastic", "differences", "CollisionFilterDeclaration"):
         assert route in found.remedy
@@ -305,7 +309,7 @@ def test_pd_gains_whose_target_the_diagram_feeds_are_told():
     source = plant.builder.AddSystem(ConstantVectorSource([0.1, 0.0]))
     plant.builder.Connect(source.get_output_port(), plant.plant.get_desired_state_input_port(instance))
     found = only(audit(dd.model_from_diagram(plant.builder.Build())), "pd_gains")
-    assert "your diagram feeds the desired state port" in found.message
+    assert "your diagram connects to the desired state port" in found.message
 
 
 def test_an_identity_frame_is_told_and_another_is_not():
@@ -366,10 +370,10 @@ def test_a_round_shape_has_nothing_to_align_with_on_a_half_space():
 def test_an_effort_at_its_limit_is_an_error():
     model = block(limit=20.0).model()
     assert "saturated_effort" not in codes(audit(model, u=[19.99]))
-    for u, slope in ((20.0, "that of the inside, and 0 outside"), (-25.0, "exactly 0")):
+    for u, slope in ((20.0, "one-sided: 0 beyond the limit"), (-25.0, "exactly 0")):
         found = only(audit(model, u=[u]), "saturated_effort")
         assert (found.severity, found.subject) == ("error", "motor")
-        assert f"limit 20 (u is {u:g}): there the derivative by u is {slope}" in found.message
+        assert f"limit 20 (u is {u:g}), where the derivative by u is {slope}" in found.message
     assert np.all(dd.differentiate_step(model, model.default_state, [-25.0]).B == 0)
     inside = dd.differentiate_step(model, model.default_state, [19.0]).B
     np.testing.assert_array_equal(dd.differentiate_step(model, model.default_state, [20.0]).B, inside)
@@ -393,7 +397,7 @@ def test_a_refused_gradient_is_an_error():
     actuators(model.autodiff.plant)[0].set_controller_gains(PdControllerGains(p=1e-12, d=0.0))
     found = only(audit(model, [0.1, 0.0]), "gradient_refused")
     assert found.severity == "error"
-    assert "the AutoDiffXd step is not the double step: lift" in found.message
+    assert "the AutoDiffXd step differs from the double step: lift" in found.message
 
 
 def test_a_gradient_beyond_any_plausible_size_is_an_error(load, monkeypatch):
@@ -441,7 +445,7 @@ def test_a_modulus_from_the_scene_graphs_config_is_named():
     plant.shape(plant.plant.world_body(), Box(1, 1, 0.2), given("rigid"))
     found = only(audit(plant.model(), [1.0, 0.0]), "default_decides")
     assert found.subject == "ball/ball (Sphere)"
-    assert "decides: hydroelastic_modulus 1e+07 Pa" in found.message
+    assert "defaults apply: hydroelastic_modulus 1e+07 Pa" in found.message
 
 
 # 9. and 10. Constraints, limits, touch

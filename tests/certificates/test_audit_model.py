@@ -148,17 +148,24 @@ FILES = {
 }
 # The code, the severity, the file and options in which it is found, words of it, and what mends it.
 TRAPS = [
-    ("no_actuator", "warning", "no_actuator", {}, "hinge.*none of its 1 joints", {"actuators": "all"}),
-    ("massless_root", "error", "massless_root", {}, r"base\): it has no mass and floats", {"base": "weld"}),
-    ("massless_joint", "error", "massless_joint", {}, r"wrist\): nothing that they move", {"fix_joints": ["wrist"]}),
+    ("no_actuator", "warning", "no_actuator", {}, "hinge.*no actuator for any of the 1 joints", {"actuators": "all"}),
+    ("massless_root", "error", "massless_root", {}, r"base\): it floats and has no mass", {"base": "weld"}),
+    ("massless_joint", "error", "massless_joint", {}, r"wrist\): the bodies that they move", {"fix_joints": ["wrist"]}),
     ("meshes_skipped", "info", "meshes_skipped", {}, "1 .*meshes skipped", None),
     ("collision_gone", "warning", "collision_gone", {}, r"upper\): no collision shape", {"contact": False}),
-    ("falls", "warning", "falls", {}, r"there is nothing fixed", {"ground": True}),
-    ("falls", "warning", "falls 2", {"ground": True}, "as it has no collision shapes", {"base": "weld"}),
-    ("invented_inertia", "error", "invented_inertia", {}, "mass -1 kg goes with no inertia; Drake takes 1 kg", None),
-    ("invented_inertia", "warning", "invented_inertia 2", {}, "no body can have the file's inertia", None),
+    ("falls", "warning", "falls", {}, r"the world has no ground or fixed shape", {"ground": True}),
+    ("falls", "warning", "falls 2", {"ground": True}, "it has no collision shapes", {"base": "weld"}),
+    (
+        "invented_inertia",
+        "error",
+        "invented_inertia",
+        {},
+        "no inertia fits the file's mass of -1 kg; Drake uses a ball of water of 1 kg",
+        None,
+    ),
+    ("invented_inertia", "warning", "invented_inertia 2", {}, "the file's inertia is impossible for a body", None),
     ("invented_inertia", "warning", "invented_inertia 3", {}, "gives no mass", None),
-    ("invented_inertia", "warning", "invented_inertia 4", {}, "gives no inertia, so that it is the format's own", None),
+    ("invented_inertia", "warning", "invented_inertia 4", {}, "gives no inertia, so that the format's default", None),
     (
         "unread_compliance",
         "warning",
@@ -175,7 +182,7 @@ TRAPS = [
         "lagged read hunt_crossley",
         {"contact_approximation": "sap"},
     ),
-    ("ignored", "warning", "ignored", {}, r"friction\): 1 times in the file", None),
+    ("ignored", "warning", "ignored", {}, r"friction\): Drake does not read it \(1 times in the file\)", None),
     ("ignored", "info", "ignored 2", {}, "safety_controller", None),
     ("zero_limit", "error", "zero_limit", {}, "the velocity limit is 0", {"actuators": ["hinge"]}),
     ("zero_limit", "error", "zero_limit 2", {}, "limits are both 0", {"actuators": ["hinge"]}),
@@ -192,8 +199,8 @@ TRAPS = [
     ("zero_limit", "error", "zero_limit 4", {}, "give it limits in the file", None),
     ("collision_gone", "warning", "collision_gone 2", {}, r"upper\): no collision shape", {"meshes": "spheres"}),
     ("meshes_skipped", "warning", "collision_gone 2", {}, "1 collision meshes skipped", {"meshes": "spheres"}),
-    ("falls", "warning", "falls 3", {}, r"nothing of it can touch", {"meshes": "spheres", "ground": True}),
-    ("massless_root", "error", "massless_root 2", {"base": "weld"}, r"ghost\): it has no mass and floats", None),
+    ("falls", "warning", "falls 3", {}, r"it has no collision shapes", {"meshes": "spheres", "ground": True}),
+    ("massless_root", "error", "massless_root 2", {"base": "weld"}, r"ghost\): it floats and has no mass", None),
     (
         "saturated_effort",
         "error",
@@ -202,7 +209,7 @@ TRAPS = [
         r"hinge\): Drake leaves out actuators",
         {"actuators": ["hinge"]},
     ),
-    ("mimic_joint", "warning", "mimic_joint", {}, r"wrist\): joints follow others", {"mimic": "reduce"}),
+    ("mimic_joint", "warning", "mimic_joint", {}, r"wrist\): mimic joints that stay in the state", {"mimic": "reduce"}),
     (
         "pair_refused",
         "error",
@@ -248,8 +255,8 @@ TRAPS = [
         {"actuators": ["j"]},
     ),
     ("left_out", "warning", "left_out 2", {}, r"pull \(motor of no joint, line 1\)", None),
-    ("switched_off", "warning", "switched_off", {}, r"contact\): the file switches it off", {"contact": False}),
-    ("never_apart", "warning", "never_apart", {}, r"a - b\): they overlap", {"contact": "separable"}),
+    ("switched_off", "warning", "switched_off", {}, r"contact\): the file disables it", {"contact": False}),
+    ("never_apart", "warning", "never_apart", {}, r"a - b\): the links overlap", {"contact": "separable"}),
 ]
 
 

@@ -32,7 +32,7 @@ def test_the_jacobian_of_a_formula_passes_and_each_entry_a_percent_off_does_not(
     for i, j in np.ndindex(WEIGHT.shape):
         wrong = WEIGHT.copy()
         wrong[i, j] *= 1.0101
-        assert "another one" in doubt(bent, wrong), (i, j)
+        assert "disagrees with" in doubt(bent, wrong), (i, j)
 
 
 def test_what_would_have_been_noticed_is_noticed():
@@ -81,7 +81,7 @@ def test_what_has_no_slope_at_the_point_is_in_doubt(f, slope):
 
 def test_a_column_of_zeros_is_zero():
     assert doubt(lambda x: x[:, :1], [[1.0, 0.0]]) == ""
-    assert "no effect" in doubt(lambda x: x[:, :1] + 1e-9 * x[:, 1:], [[1.0, 0.0]])
+    assert "a column that is 0" in doubt(lambda x: x[:, :1] + 1e-9 * x[:, 1:], [[1.0, 0.0]])
 
 
 def test_a_wide_bend_and_a_far_corner_are_no_doubt():

@@ -92,7 +92,7 @@ def test_where_there_is_no_continuous_motion_it_is_said_why(tmp_path):
     held.write_text(text.replace("<robot ", '<robot xmlns:drake="http://drake.mit.edu" '))
     model = dd.load_model(held, time_step=0.01)
     certificate = dd.certify_rollout(model, [0.5, 0.3], np.zeros((30, 1)), height, refine=True).require()
-    assert "PD controllers have none" in certificate.no_truth
+    assert "PD controllers are not supported in continuous time" in certificate.no_truth
     assert certificate.refinements[0].converged.all()  # nothing touches: no tooth can be taken for a slope
 
 
@@ -179,7 +179,7 @@ def test_a_model_with_one_time_step_is_compared_with_the_truth_or_refused():
 
 
 def test_the_time_step_is_not_refined_and_a_parameter_at_once(load):
-    with pytest.raises(InputError, match="refine=True changes the time step"):
+    with pytest.raises(InputError, match="refine=True changes"):
         dd.certify_rollout(
             load("pendulum.urdf"), [0.1, 0], [[0.0]], height, refine=True, parameters=("model.time_step",)
         )

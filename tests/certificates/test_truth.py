@@ -89,7 +89,7 @@ def test_the_difference_of_the_laws_is_measured_apart_from_the_error_of_the_step
     for i, slope in enumerate(truth.slopes):
         assert slope.value == pytest.approx(slopes[0][i], rel=1e-3)
         assert slope.by_other_law == pytest.approx(slopes[1][i] - slopes[0][i], rel=1e-2, abs=1e-3)
-    assert "difference of the laws, to Hunt-Crossley of Drake's continuous plant: the loss changes by" in str(truth)
+    assert "difference to Hunt-Crossley, the contact law of Drake's continuous plant: the loss changes by" in str(truth)
 
 
 @pytest.mark.parametrize("approximation", slow_after(1, ["sap", "lagged"]))
@@ -130,7 +130,7 @@ def test_a_graze_has_no_slope_and_that_is_its_own_answer(dropped):
     certificate = dd.certify_rollout(model, start, None, lambda x: x[1], num_steps=20, method="continuous", seconds=60)
     assert certificate.verdict == "discontinuous", str(certificate)
     assert [slope.exists for slope in certificate.truth.slopes] == [False, False]
-    assert "it has a corner here" in str(certificate)
+    assert "the loss has a kink here" in str(certificate)
 
 
 @pytest.mark.slow
@@ -176,7 +176,7 @@ def test_a_slope_exists_where_the_narrow_ones_agree_and_the_wide_one_as_on_a_cur
     assert judged(over(-4.6, 2.0, 0.9, -8.1), still, 0.0).exists is False
     corner = judged(over(1.0, 1.0, 1.0, widths=three, corners=(0.5, 0.5)), still, 0.0)
     assert corner.exists is False
-    assert corner.reason == "it has a corner here, 1.25 ahead and 0.75 behind"
+    assert corner.reason == "the loss has a kink here: slope 1.25 ahead, 0.75 behind"
     # An error of the loss of 1e-5 is one of 0.1 over 1e-4: nothing is known, unless it is far from settled.
     noise = np.full(3, 1e-5)
     assert judged(over(1.0, 1.0, 1.0, widths=three), noise, 1e-3).exists is None
@@ -198,5 +198,5 @@ def test_contact_that_the_steps_soften_is_named_by_as_much_as_it_sinks_in(stiffn
         assert softer == pytest.approx(1.0, rel=1e-3)
         assert told is None
     else:
-        assert "times softer than it is stated: near-rigid at h = 0.01 s" in told
+        assert "times softer than specified: near-rigid at h = 0.01 s" in told
         assert float(told.split(" times")[0].split()[-1]) == pytest.approx(softer, rel=1e-2)

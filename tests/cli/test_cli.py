@@ -161,8 +161,8 @@ def test_ctrl_c_ends_the_run_with_the_best_motion_so_far(tmp_path):
 @each_row(
     "place, told",
     [
-        ("import numpy as np", "while its problem was set up, before the search began"),
-        ("def problem():", "while its problem was set up, before the search began"),
+        ("import numpy as np", "during the setup of its problem, before the search began"),
+        ("def problem():", "during the setup of its problem, before the search began"),
         ("the search", "interrupted before the search began: there is no plan"),
     ],
 )

@@ -188,7 +188,7 @@ def test_a_derivative_of_the_outside_exactly_at_a_limit_is_found(monkeypatch, sc
     wrong = certify_inside(model, x, u)
     assert dd.differentiate_step(model, x, u).method == "analytic"
     assert wrong.verdict == "disagree"
-    assert "at which the derivative is another one" in wrong.told
+    assert "at which the derivative differs" in wrong.told
     assert {entry.column for entry in wrong.entries if entry.verdict == "disagree"} == {
         model.input_names[0],
         model.input_names[2],

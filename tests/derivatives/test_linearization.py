@@ -209,7 +209,7 @@ def test_a_controller_at_its_limit_is_no_smooth_step():
     _, _, methods = equal(model, xs, us, expected=("analytic", "implicit"))
     assert methods[0] == "analytic"
     hardly_ever_free = springs_and_motors(limit=1e-3, kp=(20.0, 5.0, 8.0))
-    assert "in all but 0 controllers are at their limits" in analytic_of(hardly_ever_free).reason
+    assert "controllers reach their limits at all but 0" in analytic_of(hardly_ever_free).reason
 
 
 def test_x_next_that_is_wrong_is_found(load):
@@ -269,7 +269,7 @@ def test_other_parameters_are_never_answered_by_the_models_own(load):
 def test_derivatives_by_parameters_keep_their_source(load):
     d = dd.differentiate_step(load("pendulum.urdf"), [0.7, -1.2], [0.3], parameters=("hinge.damping",))
     assert d.method in ("implicit", "autodiff")
-    assert "not analytic: derivatives by parameters other than of contact are asked for" in d.reason
+    assert "not analytic: derivatives by parameters other than those of contact are requested" in d.reason
     assert d.C.shape == (2, 1)
 
 

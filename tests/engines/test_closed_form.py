@@ -73,7 +73,7 @@ def test_a_textbooks_equations_stand_beside_drake_and_mujoco(model):
 
 
 WRONG = {  # what is wrong: parameters, the only part that is different, how it is told
-    "the sign of gravity": ({"g": -9.81}, "forces at rest", "of hinge, .* -1 times what it is to be"),
+    "the sign of gravity": ({"g": -9.81}, "forces at rest", "of hinge, .* -1 times the expected value"),
     "gravity of another place": ({"g": 9.7902}, "forces at rest", "0.997982 times"),
     "no velocity products": ({"coriolis": 0.0}, "velocity products", "of slide, .*e?-?[0-9]+ times"),
     "half of the velocity products": ({"coriolis": 0.5}, "velocity products", "of slide, .* 0.5 times"),
@@ -98,7 +98,7 @@ def test_damping_that_is_off_by_one_percent_is_found_and_named(damped):
     assert found(damped, mine(damped, pendulum, parameters=PENDULUM)).verdict == "same"
     wrong = found(damped, mine(damped, pendulum, parameters={**PENDULUM, "b": 0.101}))
     assert (wrong.verdict, [line.quantity for line in wrong.broken]) == ("other model", ["damping forces"])
-    assert "1.01 times what it is to be" in wrong.sentence
+    assert "1.01 times the expected value" in wrong.sentence
 
 
 def test_a_wrong_mass_is_another_model(model):

@@ -144,4 +144,4 @@ def test_contacts_without_room_are_in_the_status():
 
     engine.pipeline.contacts = small
     engine.step(rest, [])
-    assert "room for 0" in engine.status
+    assert "buffer holds 0" in engine.status

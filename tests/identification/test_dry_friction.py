@@ -56,7 +56,7 @@ def test_a_block_that_sticks_and_slips_has_its_friction(write_urdf):
     for seed in range(3):
         e = dd.identify(model, measured(xs, us, seed=seed), ["slide.coulomb_friction"])
         assert e.explained, e.reason
-        assert "dry friction that holds" in e.motion
+        assert "Coulomb friction that sticks" in e.motion
         low, high = e.intervals["slide.coulomb_friction"]
         assert high - low < 0.005 * FRICTION
         off.append((e.values["slide.coulomb_friction"] - FRICTION) / ((high - low) / (2 * 1.96)))

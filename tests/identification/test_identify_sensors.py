@@ -139,6 +139,6 @@ def test_what_makes_no_sense_is_refused(load):
     refused(InputError, "BODY.position_x", "pole.speed_x")
     refused(UnknownNameError, "body of sensor", "pool.gyro_x")
     refused(UnknownNameError, "joint with a force", "pole.force")
-    refused(UnknownNameError, "sensor of which there are columns", "pole.gyro_x", sensors={"imu": ("pole", [0, 0, 0])})
+    refused(UnknownNameError, "sensor with columns", "pole.gyro_x", sensors={"imu": ("pole", [0, 0, 0])})
     refused(InputError, "x, y, z", "imu.gyro_x", sensors={"imu": ("pole", [0, 0])})
     refused(ModelError, "continuous", "pole.gyro_x", motion="steps")

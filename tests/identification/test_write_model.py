@@ -146,8 +146,8 @@ def test_a_recording_makes_a_file_that_has_what_was_found(load, tmp_path):
 @each_row(
     "name, words",
     [
-        ("shoulder.coulomb_friction", "no dry friction"),
-        ("motor.strength", "how strong an input is"),
+        ("shoulder.coulomb_friction", "no Coulomb friction"),
+        ("motor.strength", "no scale factor of inputs"),
         ("shoulder_q.bias", "property of the recording"),
         ("gravity.gravity", "option of load_model"),
         ("arm.friction", "URDF has no place for it"),
@@ -169,7 +169,7 @@ def test_other_kinds_of_files_are_refused(arm, load, tmp_path):
         write_model(found, tmp_path / "right.sdf")
     with pytest.raises(InputError, match="does not exist"):
         write_model(found, arm.source)
-    with pytest.raises(InputError, match=r"what dd\.identify returned"):
+    with pytest.raises(InputError, match=r"the result of dd\.identify"):
         write_model(replace(found, asked=None), tmp_path / "right.urdf")
 
 

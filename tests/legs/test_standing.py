@@ -111,7 +111,7 @@ def test_the_centre_of_mass_has_to_be_over_the_feet(on_feet):
         ({"load": "0.9 0 0", "trunk": 60.0}, "no forces"),  # beyond the feet, wherever they are put on 0.4 m of leg
         ({"effort": 0.5}, "no forces"),  # a fourth of 14 kg on a bent knee takes some N m
         ({"foot": False}, "has no shape|end in a shape"),
-        ({"bottom": 0.6}, "not the end of a limb"),  # it lies on its belly
+        ({"bottom": 0.6}, "not at the end of a limb"),  # it lies on its belly
     ],
 )
 def test_what_cannot_stand_is_refused_with_the_reason(change, why, on_feet):

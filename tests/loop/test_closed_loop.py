@@ -278,7 +278,7 @@ def test_a_late_answer_is_not_used_and_the_last_command_is_held(cart):
     assert found.late == 3
     assert [status for status in found.controller_status if status != "ok"] == ["late"] * 3
     assert [(event.kind, round(event.t / H)) for event in found.events] == [("late", 3), ("late", 4), ("late", 7)]
-    took = r"the controller took 0\.[3-9]\d* s, expected at most 0\.15 s: the last command is held"
+    took = r"the controller took 0\.[3-9]\d* s, expected at most 0\.15 s: the last command stays in effect"
     assert all(re.fullmatch(took, event.message) for event in found.events)
 
 

@@ -179,7 +179,7 @@ def test_where_links_are_is_refused_where_the_tree_is_another(monkeypatch):
     monkeypatch.setattr(module, "read_links", one_axis_turned_around)
     found = forward_kinematics(model)
     assert isinstance(found, Refusal)
-    assert "not where Drake has them" in str(found)
+    assert "differs from Drake's" in str(found)
 
 
 def inside(pieces, points):
@@ -243,7 +243,7 @@ def test_a_robot_without_readable_shapes_is_a_skeleton_and_says_so():
     model = without_shapes()
     cover = cover_of(model, forward_kinematics(model))
     assert {p.source for p in cover.pieces} == {"skeleton"}
-    assert "no shape that could be read" in cover.doubts[0]
+    assert "no readable shape" in cover.doubts[0]
     assert "upper, lower" in cover.doubts[0]
 
 
@@ -440,6 +440,6 @@ def test_a_joint_without_a_formula_is_refused_by_its_name():
     screw = lambda name, a, b: ScrewJoint(name, a, b, axis=[0, 0, 1.0], screw_pitch=0.1, damping=0.0)  # noqa: E731
     model = chain(RevoluteJoint, screw)
     with pytest.raises(
-        ModelError, match="obstacles: joint joint 1 is a screw joint, and where that leads is not written out"
+        ModelError, match="obstacles: joint joint 1 is a screw joint, which forward kinematics does not support"
     ):
         dd.SphereObstacle([0, 0, 0], 0.1).bind(model)

@@ -195,7 +195,7 @@ def test_a_place_beside_an_offset_is_refused(load, part):
     dd.Problem(model, **fields, parameters=["lower.mass"], **both)
     with pytest.raises(
         InputError,
-        match=r"parameters: expected only such as the functions of dd.quantities do not depend on, got offset",
+        match=r"parameters: expected parameters that do not change the functions of dd.quantities, got offset",
     ):
         dd.Problem(model, **fields, parameters=["lower.mass", "elbow.offset"], **both)
     assert tip(np.zeros(4))[2] == -1.3  # and works again

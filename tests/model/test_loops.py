@@ -250,7 +250,7 @@ def test_loops_are_closed_from_a_posture_nearby(tmp_path):
     model = load(parallelogram(tmp_path))
     x = dd.model.assembled(model, [0.5, 0.0, 0.0, 1.0, 2.0, 3.0], keep=["a_q"])
     np.testing.assert_allclose(x, [0.5, -0.5, 0.5, 1.0, 2.0, 3.0], atol=1e-7)
-    with pytest.raises(ModelError, match=r"loops cannot be closed from there, where points are 0\.\d+ m apart"):
+    with pytest.raises(ModelError, match=r"loops cannot be closed from this posture: points stay 0\.\d+ m apart"):
         dd.model.assembled(model, [0.5, 0.0, 0.0, 0, 0, 0], keep=["a_q", "b_q", "c_q"])
     with pytest.raises(UnknownNameError, match="position to keep"):
         dd.model.assembled(model, x, keep=["crank"])
@@ -290,7 +290,10 @@ def test_points_at_the_origins_of_their_bodies_can_be_held(tmp_path):
 @each_row(
     "equality, words",
     [
-        ('<connect body1="bar" body2="nobody" anchor="0 0 0"/>', "expected bodies of loop that are held .* got nobody"),
+        (
+            '<connect body1="bar" body2="nobody" anchor="0 0 0"/>',
+            "expected a body of loop to connect, got the unknown name nobody",
+        ),
         ('<weld site1="end" site2="tip"/>', "line 1: expected a <connect> of two sites"),
         ('<connect site1="inner" site2="tip"/>', "line 1: expected sites of bodies or frames with a name"),
     ],
@@ -421,7 +424,7 @@ def test_a_servo_of_a_tendon_drives_the_joint_that_the_others_follow(tmp_path):
     (tmp_path / "robot.xml").write_text(GRIPPER)
     model = load(tmp_path / "robot.xml", time_step=0.002, mimic="reduce")
     assert "Actuators of tendons drive" in str(model.notes)
-    assert "<general> actuators read as" in str(model.notes)
+    assert "<general> actuators became motors and servos" in str(model.notes)
     terms = model.contract.inputs[0]
     assert (terms.name, terms.unit, terms.lower) == ("fingers", "rad", 0.0)
     assert terms.upper == pytest.approx(255 * 0.3137255 / 100)

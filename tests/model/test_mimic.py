@@ -258,7 +258,7 @@ def test_an_engine_of_its_own_takes_the_same_step(tmp_path, name):
 def test_other_engines_and_exports_say_why_not(tmp_path):
     model = load(sliders(tmp_path))
     for name in ("mujoco", "numpy", "pybullet"):
-        with pytest.raises(ModelError, match='drake, pinocchio, casadi do, or mimic="fix"'):
+        with pytest.raises(ModelError, match='use drake, pinocchio, casadi, or mimic="fix"'):
             dd.engines.load_engine(name, model)
     with pytest.raises(ModelError, match="mimic joints are reduced"):
         describe(model)

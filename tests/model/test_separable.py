@@ -69,7 +69,7 @@ def test_faces_that_slide_on_each_other_are_found_too(load):
 def test_the_filter_is_asked_for_told_and_leaves_every_other_contact(load):
     model = load(contact="separable")
     assert [note for note in model.notes if "pass" in note] == [
-        "One pair of shapes passes through each other, as they overlap wherever the joints are: first - last."
+        "One pair of shapes passes through each other, as they overlap at all joint positions: first - last."
     ]
     apart, touching = np.zeros(model.nx), np.zeros(model.nx)
     apart[0] = 2.0

@@ -214,7 +214,7 @@ def test_servos_of_mjcf_exert_what_they_do_in_mujoco(tmp_path, seed):
 @pytest.mark.parametrize(
     ("actuator", "says"),
     [
-        ('<position name="p" joint="j0" kp="5" forcerange="-1 3"/>', "line 1: .* as hard to both sides"),
+        ('<position name="p" joint="j0" kp="5" forcerange="-1 3"/>', "line 1: .* symmetric limits"),
         ('<position name="p" joint="j0" kp="5" timeconst="0.1"/>', None),
     ],
 )

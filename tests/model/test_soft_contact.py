@@ -96,7 +96,7 @@ def test_a_floating_ball_leaves_the_ground_along_its_height(load):
 
 
 def test_what_cannot_be_softened_is_refused(load):
-    with pytest.raises(InputError, match="at least one pair"):
+    with pytest.raises(InputError, match="at least one collision pair"):
         dd.model.softened(load("pendulum.urdf"), SOFT)
     with pytest.raises(InputError, match="a SoftContact"):
         dd.model.softened(load("two_spheres.sdf"), 0.1)

@@ -93,7 +93,7 @@ def test_what_drake_keeps_in_the_plant_is_not_set_while_another_thread_uses_the_
         user = pool.submit(use)
         assert begun.wait(10)
         with pytest.raises(
-            ModelError, match=r"another thread \(ThreadPool\S+\) uses this model: none may set model.gravity"
+            ModelError, match=r"another thread \(ThreadPool\S+\) uses this model: no thread can set model.gravity"
         ):
             dd.step(model, x, [0.0], parameters=parameters)
         go_on.set()
@@ -117,7 +117,7 @@ def test_one_threads_context_is_refused_in_another(load):
     model = load("pendulum.urdf")
     twin, x, u = model.double, np.zeros(2), np.zeros(1)
     assert elsewhere(lambda: advance(model.double, x, u)) == pytest.approx(advance(twin, x, u), abs=0)
-    with pytest.raises(ModelError, match="made in one thread is used in another"):
+    with pytest.raises(ModelError, match="of one thread is used in another thread"):
         elsewhere(lambda: advance(twin, x, u))
 
 

@@ -235,7 +235,7 @@ def test_a_diagram_has_one_length_of_a_step():
     problem = dd.Problem(block(), x0=[0, 0], x_goal=[1, 0], num_steps=5, horizon=(0.5, 1.0), running_cost=EFFORT)
     for method in ("shooting", "ilqr"):
         with pytest.raises(
-            InputError, match=r"steps of a diagram, which are of one length: method=.collocation. takes"
+            InputError, match=r"no horizon with a diagram, as its steps have a fixed length: method=.collocation. takes"
         ):
             dd.solve(problem, method=method)
 

@@ -76,7 +76,7 @@ KINDS = {
         ("frame", {"frame": 3}, InputError, "a name"),
         ("frame", {"tolerance": 0.0}, InputError, "above 0"),
         ("frame", {"knots": 0.5}, InputError, "whole numbers"),
-        ("frame", {"knots": 3, "weight": 1.0}, InputError, "the last one, -1, or None"),
+        ("frame", {"knots": 3, "weight": 1.0}, InputError, "-1 for the last knot, or None"),
         ("frame", {"weight": -1.0}, InputError, "above 0"),
         ("frame", {"rotation": [0, 0, 0, 0.5]}, InputError, "norm"),
         ("frame", {"rotation": np.eye(2)}, ShapeError, "rotation"),
@@ -117,7 +117,7 @@ def test_an_unknown_name_lists_those_that_exist(arm, goal, words):
         (dd.FrameGoal("lower", [0.1, 0.2, -0.5]), "entry 1 is 0 wherever"),  # it swings in x and z
         (dd.FrameGoal("lower", [0.1, 0, -0.5], knots=21), "from -21 to 20"),
         (dd.KeepLevel("upper", tolerance=0.2), "upper level is 0.3 rad off"),  # x0 leans by 0.3 rad
-        (dd.JointGoal({"elbow": 1.0, "elbow_q": 1.0}), "they are the same"),
+        (dd.JointGoal({"elbow": 1.0, "elbow_q": 1.0}), "both are the same coordinate"),
     ],
 )
 def test_a_problem_refuses_goals_that_its_model_cannot_have(arm, goals, words):
@@ -127,7 +127,7 @@ def test_a_problem_refuses_goals_that_its_model_cannot_have(arm, goals, words):
 
 def test_plain_dynamics_have_no_goals():
     block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
-    with pytest.raises(InputError, match="none for plain dynamics"):
+    with pytest.raises(InputError, match="no goals with plain dynamics"):
         dd.Problem(block, x0=[0, 0], num_steps=4, horizon=1.0, goals=dd.JointGoal({"x0": 1.0}))
 
 

@@ -164,7 +164,7 @@ def test_what_no_guess_solves_says_how_many_were_tried():
     problem = block(bounds=dd.Bounds(u_lower=[-3.9], u_upper=[3.9]))
     solution = dd.solve(problem)
     assert solution.status is dd.Status.INFEASIBLE
-    assert "from none of 9 first guesses was a plan found" in repr(solution)
+    assert "no plan was found from 9 first guesses" in repr(solution)
     assert len(solution.options["chain"]) == 9
     given = dd.solve(problem, initial_guess=(solution.xs, solution.us))  # what is given is what is tried
     assert len(given.options["chain"]) == 1

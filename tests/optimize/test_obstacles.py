@@ -324,7 +324,7 @@ def test_a_problem_warns_of_links_that_are_kept_clear_as_a_skeleton(tmp_path):
     path.write_text(re.sub("<(visual|collision)>.*?</(visual|collision)>", "", text, flags=re.DOTALL))
     model = dd.load_model(path, time_step=0.05)
     fields = {"x0": [-1.0, 0.1, 0, 0], "num_steps": 10, "running_cost": SMOOTH}
-    with pytest.warns(ModelWarning, match=r"upper, lower: no shape that could be read, kept clear as capsules"):
+    with pytest.warns(ModelWarning, match=r"upper, lower: no readable shape, represented by capsules"):
         dd.Problem(model, goals=[BALL], **fields)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -218,7 +218,7 @@ def test_what_cannot_be_is_told_as_infeasible():
     solution = dd.solve(dd.optimize.PhasedProblem([problem.phases[0], up], resets=problem.resets), max_iterations=60)
     assert solution.status in (dd.Status.INFEASIBLE, dd.Status.ITERATION_LIMIT)
     assert len(solution.options["chain"]) == 9
-    assert "from none of 9 first guesses" in repr(solution)
+    assert "no plan was found from 9 first guesses" in repr(solution)
 
 
 def test_coarse_meshes_are_refined():

@@ -164,7 +164,7 @@ def test_an_end_outside_of_the_set_is_refused():
     "make, told",
     [
         (lambda: TerminalSet([np.pi, 0], level=-1), "above 0"),
-        (lambda: swung_up(goals=[TerminalSet([np.pi, 0], level=1e6)]), "within which limits are kept"),
+        (lambda: swung_up(goals=[TerminalSet([np.pi, 0], level=1e6)]), "the largest level within the limits"),
         (lambda: swung_up(goals=[TerminalSet([1.5, 0])]), "hold"),
         (lambda: swung_up(goals=[TerminalSet([np.pi, 0, 0])]), "shape"),
         (lambda: swung_up(goals=[TerminalSet([np.pi, 0])], limit=1e-300), "hold"),

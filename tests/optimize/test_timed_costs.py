@@ -132,7 +132,11 @@ def test_a_run_that_follows_a_reference_verifies(write_urdf, tmp_path):
 @pytest.mark.parametrize(
     ("cost", "options", "message"),
     [
-        (lambda x, u, t: t * u[0] ** 2, {"horizon": (0.5, 2.0)}, "expected one that does not: the horizon is free"),
+        (
+            lambda x, u, t: t * u[0] ** 2,
+            {"horizon": (0.5, 2.0)},
+            "expected a running_cost that is constant in time, as the horizon is free",
+        ),
         ([], {}, "running_cost: expected costs, got an empty list"),
         (lambda x, u, t: t * float(u[0]) ** 2, {}, "lost its derivatives"),
     ],

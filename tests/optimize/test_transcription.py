@@ -494,7 +494,7 @@ def test_bad_dynamics_are_named(options, message):
         ({"initial_guess": (np.zeros((3, 2)), np.zeros((3, 1)))}, r"initial_guess xs: expected shape \(6, 2\)"),
         ({"initial_guess": (np.zeros((6, 2)), np.zeros((5, 1)), -1.0)}, r"initial_guess horizon \[s\]"),
         ({"running_cost": "effort"}, "running_cost: expected a function or a QuadraticCost, got str"),
-        ({"parameters": ("mass",)}, "parameters: expected none: these dynamics have no parameters"),
+        ({"parameters": ("mass",)}, "parameters: expected no parameters with these dynamics"),
         ({"trajectory_cost": lambda xs, us: xs[0, 0]}, "trajectory_cost: expected .* got given"),
         ({"running_cost": np.nan}, "running_cost"),
         ({"running_cost": lambda x, u: x}, "running_cost <lambda> .* expected shape"),

@@ -332,7 +332,7 @@ def test_an_exception_is_a_row_and_exit_status_1(write, tmp_path):
         ({"a": np.bool_(True), "b": np.arange(2), "c": (1, {"d": math.nan})}, {"a": True, "b": [0, 1],
          "c": [1, {"d": None}]}),
         (3, {"error": "InputError: row: expected a mapping of names to values, got int"}),
-        ({"level": 1}, {"error": "InputError: row: expected names that are not the trial's own, got 'level'"}),
+        ({"level": 1}, {"error": "InputError: row: expected names other than the fields of a trial, got 'level'"}),
         ({"a": 1j}, {"error": "InputError: row: expected numbers, words, lists and mappings, got complex 1j"}),
     ],
 )  # fmt: skip
@@ -471,7 +471,7 @@ def test_a_panel_whose_files_do_not_follow_from_its_trials_is_broken(write, tmp_
     broken(lambda d: sealed_again(d / in_trials, **better), "table.csv: it does not come out")
     broken(lambda d: sealed_again(d / in_trials, **better), "is not that of table.csv", of=in_trials)
     platform = {**one["trial"]["conditions"], "platform": "another"}
-    broken(lambda d: sealed_again(d / in_trials, conditions=platform), "of another panel|not what the panel writes")
+    broken(lambda d: sealed_again(d / in_trials, conditions=platform), "to another panel|not what the panel writes")
     broken(lambda d: sealed_again(d / in_trials, conditions=platform), "its result or its panel", of=in_trials)
     broken(lambda d: sealed_again(d / in_trials, name="another"), "is not what the panel writes")
     other = {**one["trial"]["inputs"], "seed": 1}

@@ -215,5 +215,5 @@ def test_a_robot_that_can_go_nowhere_is_refused_and_not_planned_for(tmp_path):
     path = robot(
         tmp_path, *posts, link("arm", at="0.502 0 0", shape=ball), joint("shoulder", "world", "arm", limit=limit)
     )
-    with pytest.raises(ModelError, match="no posture to go to"):
+    with pytest.raises(ModelError, match="no goal posture"):
         plan(path, out=tmp_path / "out")

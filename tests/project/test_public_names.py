@@ -143,7 +143,7 @@ print(len(found) == len(names) and all(value is getattr(drake_diff, name) for na
 
 
 def test_a_name_that_is_none_is_refused():
-    with pytest.raises(AttributeError, match="no attribute stepp; did you mean drake_diff.step"):
+    with pytest.raises(AttributeError, match=r"no attribute stepp; did you mean drake_diff\.step"):
         drake_diff.stepp  # noqa: B018
     with pytest.raises(ImportError, match="cannot import name 'stepp'"):
         exec("from drake_diff import stepp")

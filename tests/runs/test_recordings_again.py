@@ -120,7 +120,7 @@ def test_a_row_of_a_recording_that_lies_is_refused(copy):
     assert verify_own(copy).verdict == "intact"
     numpy = record.engines[1].model_copy(update={"cause": row.cause})
     record.model_copy(update={"engines": [record.engines[0], numpy, row]}).write(copy)
-    assert "numpy has a cause, and is not one recording in the directory" in str(verify_own(copy))
+    assert "numpy has a cause, but is not exactly one recording in the directory" in str(verify_own(copy))
 
 
 def test_a_cause_that_lies_is_refused(copy):

@@ -142,7 +142,7 @@ def test_others_files_are_refused_and_stay(run, solutions, monkeypatch):
         (edited, "which holds"),
         (own_page, "'report.html'"),
         (file, "no directory"),
-        (here, "where this process works"),
+        (here, "the working directory"),
     ):
         target = Path(shutil.copytree(run, run.parent / change.__name__))
         change(target)
@@ -384,7 +384,7 @@ def test_what_cannot_be_recovered_is_said(run, solutions, tmp_path):
         recover(run)
     open_ = run.parent / "run.partial-1-0123abcd"
     begin(open_, solutions[1].problem)
-    with pytest.raises(InputError, match="no run is replaced"):
+    with pytest.raises(InputError, match="recover replaces no run"):
         recover(open_)
     with pytest.raises(ArtifactError, match="no plan of a solve in it"):
         recover(open_, tmp_path / "out")

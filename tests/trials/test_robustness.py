@@ -180,7 +180,7 @@ def test_perturbations_do_not_disturb_each_other(setup):
         ({"mass": 1.0}, InputError, "level of mass"),
         ({"latency": 1.5}, InputError, "level of latency"),
         ({"time_step": 2.5}, InputError, "level of time_step"),
-        ({"friction": 0.1}, InputError, "one that applies to cart"),
+        ({"friction": 0.1}, InputError, "a perturbation that applies to cart"),
     ],
 )
 def test_bad_levels_are_refused(setup, levels, error, message):
@@ -192,7 +192,7 @@ def test_bad_levels_are_refused(setup, levels, error, message):
     "perturbations, options, message",
     [
         (["wind"], {}, "actuator_delay"),
-        (["friction"], {}, "one that applies to cart"),
+        (["friction"], {}, "a perturbation that applies to cart"),
         ({"mass": []}, {}, "levels of mass"),
         ({"mass": [np.inf]}, {}, "levels of mass"),
         (["mass"], {"trials": 0}, "trials: expected a whole number"),

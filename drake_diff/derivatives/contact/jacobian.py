@@ -90,7 +90,7 @@ def _read(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
     if contact.model != "point":
         unknown = f"the contact model is {contact.model}, not point"
     elif not pairs.ids:
-        unknown = "nothing of it may touch"
+        unknown = "none of its geometries may collide"
     topology = topology_of(description)
     labels = {body.index(): label for label, body in labelled(bodies(model.plant)).items()}
     names = [labels.get(body.index(), "world") for body in pairs.bodies]

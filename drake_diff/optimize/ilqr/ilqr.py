@@ -84,7 +84,7 @@ _Solve = Callable[[LinearQuadratic, float], AffinePolicy | None]
 def check_problem(problem: Problem) -> None:
     """Refuse what iLQR here cannot keep, naming what can."""
     for subject in _unkept(problem):
-        raise InputError(subject, got="given", expected='none for method="ilqr"; method="shooting" takes it')
+        raise InputError(subject, got="given", expected='method="shooting", as method="ilqr" does not support it')
 
 
 def takes(problem: Problem) -> bool:

@@ -50,12 +50,12 @@ def where_it_jumps(problem: Problem, xs: Array) -> str:
         try:
             gaps = distances(problem.model.double)
         except ModelError as error:  # Drake knows no distance of some pair
-            return f", and where bodies just touch is not known: {error}"
+            return f", and Drake cannot tell which bodies just touch: {error}"
         for (a, b), distance in gaps.items():
             if abs(distance) < JUST_TOUCHING:
                 return (
                     f", with {a} and {b} just touching at knot {k}: the step jumps there, and a minimum at a jump "
-                    "has no gradient to tell it by"
+                    "cannot be verified by a gradient"
                 )
     return ""
 
@@ -134,7 +134,7 @@ def _beginnings_or_none(problem: Problem, xs: Array, report: Report | None) -> t
         return beginnings(problem, xs)
     except ModelError as error:  # Drake knows no distance of some pair
         if report:
-            report.say(f"nothing can be held: {error}")
+            report.say(f"no contact can be kept: {error}")
         return ()
 
 

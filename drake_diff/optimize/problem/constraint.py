@@ -131,7 +131,7 @@ class Constraint:
         if not callable(self.function):
             raise InputError("Constraint.function", got=type(self.function).__name__, expected=FORM)
         if self.lower is None and self.upper is None:
-            raise InputError("Constraint", got="no lower and no upper", expected="one of them, or both")
+            raise InputError("Constraint", got="no lower and no upper", expected="lower, upper, or both")
         lower, upper = -np.inf if self.lower is None else self.lower, np.inf if self.upper is None else self.upper
         lower = array_with_gaps("Constraint.lower", np.atleast_1d(lower), ("m",))
         upper = array_with_gaps("Constraint.upper", np.atleast_1d(upper), ("m",))
@@ -142,7 +142,7 @@ class Constraint:
         bad = np.isnan(lower) | np.isnan(upper) | (lower > upper) | (lower == np.inf) | (upper == -np.inf)
         if bad.any():
             got = f"[{lower[bad][0]:g}, {upper[bad][0]:g}]"
-            raise InputError(f"Constraint {self.label}", got=got, expected="lower at most upper")
+            raise InputError(f"Constraint {self.label}", got=got, expected="a lower bound of at most the upper bound")
         object.__setattr__(self, "lower", frozen(lower))
         object.__setattr__(self, "upper", frozen(upper))
 
@@ -298,7 +298,7 @@ def resolve_bounds(
         lower, upper = resolved[f"{kind}_lower"], resolved[f"{kind}_upper"]
         for i in np.flatnonzero((lower > upper) | (lower == np.inf) | (upper == -np.inf))[:1]:
             got = f"[{lower[i]:g}, {upper[i]:g}]"
-            raise InputError(f"bounds of {names[i]}", got=got, expected="lower at most upper")
+            raise InputError(f"bounds of {names[i]}", got=got, expected="a lower bound of at most the upper bound")
     return Bounds(**resolved)
 
 

@@ -280,7 +280,7 @@ class TrackingCost(TimedCost):
         xs = finite_array("TrackingCost xs", xs, (len(times), "nx"))
         us = None if us is None else finite_array("TrackingCost us", us, (len(times), "nu"))
         if self.Q is None and self.R is None:
-            raise InputError("TrackingCost", got="neither Q nor R", expected="a weight")
+            raise InputError("TrackingCost", got="neither Q nor R", expected="the weight Q, R, or both")
         form = QuadraticCost(Q=self.Q, R=self.R)
         for name, value in (("reference", (times, xs, us)), ("Q", form.Q), ("R", form.R), ("_form", form)):
             object.__setattr__(self, name, value)
@@ -395,7 +395,9 @@ def _table(reference: Any) -> tuple[Any, Any, Any]:
     ):
         start, end = reference[0].start_time(), reference[0].end_time()
         if not (np.isfinite(end - start) and end > start):
-            raise InputError("TrackingCost", got=f"from {start:g} to {end:g} s", expected="a beginning and an end")
+            raise InputError(
+                "TrackingCost", got=f"from {start:g} to {end:g} s", expected="a reference of finite duration above 0"
+            )
         times = np.linspace(start, end, SAMPLES)
         samples = [
             trajectory.vector_values(np.clip(times, trajectory.start_time(), trajectory.end_time())).T

@@ -288,7 +288,7 @@ class RateLimit(Couples):
         known = self._known(system)
         if not isinstance(self.limit, dict):
             if not len(known):
-                raise InputError(kind, got="one limit", expected="limits by name: plain dynamics have no velocities")
+                raise InputError(kind, got="one limit", expected="limits by name, as plain dynamics have no velocities")
             places = sorted(set(known.values()))
             return np.array(places), np.full(len(places), self.limit)
         limits = by_place(kind, known, self.limit)

@@ -152,7 +152,7 @@ class Dynamics:
         )
         if hasattr(f, "linearize"):
             if self.parameters.names and not given:
-                raise InputError("parameters", got="given", expected="a function f(x, u, p) that they are of")
+                raise InputError("parameters", got="given", expected="a function f(x, u, p) that uses them")
             self.form = f
             return
         inputs, f = self.nu, user_function("dynamics", f, (self.nx,))
@@ -188,7 +188,7 @@ class Dynamics:
         if not names:
             return self.of_no_parameters if parameters.names else self
         if not parameters.names:
-            expected = "none: these dynamics have no parameters, as Dynamics(f, ..., parameters={name: value}) has"
+            expected = "no parameters with these dynamics; see Dynamics(f, ..., parameters={name: value})"
             raise InputError("parameters", got=", ".join(map(str, names)), expected=expected)
         for name in names:
             if name not in parameters.names:
@@ -377,7 +377,7 @@ def plant_dynamics(model: Model, parameters: Any = ()) -> Dynamics:
     vector = select(model, parameters)
     for parameter in vector.parameters:
         if parameter.kind in CONTACT_KINDS:
-            expected = "one that moves the model without contact, which collocation leaves out"
+            expected = "a parameter of motion without contact, as collocation leaves contact out"
             raise InputError("parameters", got=parameter.name, expected=expected)
     return Dynamics(
         PlantKnots(model, vector),
@@ -476,7 +476,9 @@ def by_place(subject: str, known: Mapping[str, int], given: Mapping[str, Any]) -
             raise UnknownNameError(subject, got=name, known=known)
         if known[name] in values:
             other = next(n for n in given if known[n] == known[name])
-            raise InputError(subject, got=f"{other} and {name}", expected="each coordinate once: they are the same")
+            raise InputError(
+                subject, got=f"{other} and {name}", expected="one of the two names, as both are the same coordinate"
+            )
         values[known[name]] = value
     return values
 
@@ -517,7 +519,7 @@ def bounds_of(system: Model | Dynamics, given: Any) -> Any:
             raise UnknownNameError("bounds", got=name, known=[*places, *inputs])
         if not (isinstance(pair, (tuple, list)) and len(pair) == 2):
             raise InputError(
-                f"bounds of {name}", got=repr(pair)[:80], expected="(lower, upper), None where there is none"
+                f"bounds of {name}", got=repr(pair)[:80], expected="(lower, upper), with None for no bound"
             )
         kind, index = ("x", places[name]) if name in places else ("u", inputs[name])
         for side, value in zip(SIDES, pair, strict=True):

@@ -254,7 +254,7 @@ class Impact:
     def broken_rules(self, x: Array) -> list[str]:
         """What of the impact at `x` (nx,) the world does not do: a gap that is open, a pull, a slide."""
         faults = [
-            f"{self.contacts.rows[i]} is {gap:.3g} m apart"
+            f"{self.contacts.rows[i]} has a gap of {gap:.3g} m"
             for i, gap in zip(self.gap_rows, self.gaps(x), strict=True)
             if not abs(gap) <= STAYS_CLOSED
         ]
@@ -266,7 +266,7 @@ class Impact:
             if values[z] < -STAYS_CLOSED:
                 faults.append(f"the ground pulls at {name} by {-values[z]:.3g} N s")
             elif slide > most + STAYS_CLOSED:
-                faults.append(f"{name} slides: {slide:.3g} N s along the ground, friction holds {most:.3g}")
+                faults.append(f"{name} slides: {slide:.3g} N s along the ground, friction allows {most:.3g} N s")
         return faults
 
     def saltation(self, x: Array, rates: Array, rates_after: Array) -> Array:

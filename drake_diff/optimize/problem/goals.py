@@ -132,7 +132,7 @@ class Goal(Described):
             if f.name in CHECKS and not (value is None and f.default is None):
                 self._set(**{f.name: CHECKS[f.name](f"{kind}.{f.name}", value)})
         if self.weight is not None and self.knots not in (None, LAST):
-            expected = "the last one, -1, or None: all"
+            expected = "-1 for the last knot, or None for all knots"
             raise InputError(f"{kind}.knots with a weight", got=list(self.knots), expected=expected)
         self._check()
 
@@ -223,7 +223,7 @@ class FrameGoal(Goal):
 
     def _check(self) -> None:
         if self.rotation is None and self.position in (None, FREE):
-            raise InputError("FrameGoal", got="no position and no rotation", expected="one of them, or both")
+            raise InputError("FrameGoal", got="no position and no rotation", expected="a position, a rotation, or both")
 
     def targets(self, model: Model) -> Iterator[Target]:
         if self.position is not None:
@@ -272,7 +272,7 @@ class FrameVelocityGoal(Goal):
 
     def _check(self) -> None:
         if self.velocity == self.angular_velocity == FREE:
-            raise InputError("FrameVelocityGoal", got="nothing but free entries", expected="a velocity")
+            raise InputError("FrameVelocityGoal", got="free entries only", expected="a velocity")
 
     def targets(self, model: Model) -> Iterator[Target]:
         if self.velocity != FREE:
@@ -471,7 +471,9 @@ class Dwell(Goal):
         last, h = self.end % (count + 1), problem.start_horizon / count
         first = last - math.ceil(self.seconds / h - ROUNDED)
         if first < 0:
-            raise InputError("Dwell.seconds [s]", got=self.seconds, expected=f"at most {last * h:g}, from knot 0 on")
+            raise InputError(
+                "Dwell.seconds [s]", got=self.seconds, expected=f"at most {last * h:g}, the time since knot 0"
+            )
         return tuple(range(first, last + 1))
 
     def marks(self) -> Any:

@@ -110,7 +110,7 @@ class ClearanceConstraint(GoalConstraint):
             raise InputError(
                 subject,
                 got=str(self.check_at(x, subject, self.between)),
-                expected="clear of it: a plan has to be there",
+                expected="a state clear of the obstacle, as each plan passes through it",
             )
 
 

@@ -125,7 +125,7 @@ class PhasedProblem(PicklesItsFields, ShowsItsRepr):
 
     def _check_horizon(self) -> tuple[float, float]:
         if self.is_map:
-            raise InputError("horizon", got="given", expected="none for DiscreteMaps, whose time counts steps")
+            raise InputError("horizon", got="given", expected="no horizon for DiscreteMaps, whose time counts steps")
         given = self.horizon if isinstance(self.horizon, (tuple, list)) else (self.horizon, self.horizon)
         if len(given) != 2:
             raise InputError("horizon", got=repr(self.horizon), expected="a number of seconds, or (lower, upper)")
@@ -133,7 +133,7 @@ class PhasedProblem(PicklesItsFields, ShowsItsRepr):
         least, most = (sum(side) for side in zip(*(duration_of(phase) for phase in self.phases), strict=True))
         if not (lower <= upper and lower <= most and upper >= least):
             got = f"[{lower:g}, {upper:g}], of phases that take {least:g} to {most:g} s"
-            raise InputError("horizon", got=got, expected="lower at most upper, and within reach")
+            raise InputError("horizon", got=got, expected="lower at most upper, and a duration that the phases allow")
         return lower, upper
 
 
@@ -150,7 +150,7 @@ class Switch:
         function = reset
         if reset is None:
             if earlier.nx != other.nx:
-                expected = f"a matrix or function, as one has {earlier.nx} states and the other {other.nx}"
+                expected = f"a matrix or function from {earlier.nx} states to {other.nx} states"
                 raise InputError(self.label, got="None", expected=expected)
             self.matrix = frozen(np.eye(earlier.nx))
         elif not callable(reset):
@@ -213,10 +213,14 @@ def _check_phase(name: str, phase: Problem, is_map: bool) -> None:
     if phase.is_map != is_map:
         raise InputError(name, got="a map among motions in time", expected="phases in time, or DiscreteMaps alone")
     if phase.parameters.parameters or phase.trajectory_cost is not None:
-        raise InputError(f"{name}: parameters, trajectory_cost", got="given", expected="none in a phase")
+        raise InputError(
+            f"{name}: parameters, trajectory_cost",
+            got="given",
+            expected="no parameters and no trajectory_cost in a phase",
+        )
     if not phase.optimizes_controls:
         raise InputError(f"{name}: optimize", got=list(phase.optimize), expected='"controls" among them')
     free = phase.horizon is not None and phase.horizon[0] < phase.horizon[1]
     if free and isinstance(phase.running_cost, TimedCost):
-        expected = "one that does not: its horizon is free"
+        expected = "a running_cost that is constant in time, as the horizon is free"
         raise InputError(f"{name}: running_cost", got="one that changes in time", expected=expected)

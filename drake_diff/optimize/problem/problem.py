@@ -209,7 +209,9 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         self._set("goals", self._check_goals())
         self._check_kept()
         if self.horizon is not None and self.is_map:
-            raise InputError("horizon", got="given", expected="none for a DiscreteMap, whose time counts its steps")
+            raise InputError(
+                "horizon", got="given", expected="no horizon for a DiscreteMap, whose time counts its steps"
+            )
         if self.horizon is not None:
             self._set("horizon", _check_horizon(self.horizon))
         elif not self.has_model and not self.is_map:
@@ -638,12 +640,20 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         if self.optimizes_parameters and not vector.parameters:
             raise InputError("parameters", got="none", expected='at least one name, as "parameters" is in optimize')
         if TIME_STEP in {p.name for p in vector.parameters}:
-            raise InputError("parameters", got=TIME_STEP, expected="others: the horizon is num_steps * model.time_step")
+            raise InputError(
+                "parameters",
+                got=TIME_STEP,
+                expected="parameters other than the time step, as the horizon is num_steps * model.time_step",
+            )
         for name in given:
             if name not in {p.name for p in vector.parameters}:
                 raise UnknownNameError("parameter_bounds", got=name, known=[p.name for p in vector.parameters])
             if name.endswith(".inertia"):
-                raise InputError(f"parameter_bounds of {name}", got="bounds", expected="none: it stays possible anyway")
+                raise InputError(
+                    f"parameter_bounds of {name}",
+                    got="bounds",
+                    expected="no bounds, as an inertia stays physically possible",
+                )
         check_inside("parameters", vector.values, *self.bounds_of_parameters(), vector.names)
 
     def _check_mask(self) -> Array:
@@ -686,7 +696,11 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             if not 0 < tolerance[i] < np.inf:
                 raise InputError(f"{subject}, {self.state_names[i]}", got=tolerance[i], expected="a positive number")
             if np.isnan(self.goal[i]):
-                raise InputError(f"{subject}, {self.state_names[i]}", got=tolerance[i], expected="none without a goal")
+                raise InputError(
+                    f"{subject}, {self.state_names[i]}",
+                    got=tolerance[i],
+                    expected="no tolerance of an entry without a goal",
+                )
         return tolerance
 
     def _check_waypoints(self) -> dict[int, Array]:
@@ -735,12 +749,16 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             return
         excess, _ = bound.excess(lower, np.zeros((len(lower), self.nu)), np.arange(len(lower)))
         if not excess <= SAME_STATE:
-            raise InputError(f"coupling {bound.label}", got=f"states that break it by {excess:.3g}", expected="0")
+            raise InputError(
+                f"coupling {bound.label}",
+                got=f"states that violate it by {excess:.3g}",
+                expected="states that satisfy it",
+            )
 
     def _check_goals(self) -> tuple[Goal, ...]:
         given = several("goals", self.goals, Goal, "a goal such as FrameGoal, or several")
         if given and not self.has_model:
-            raise InputError("goals", got="given", expected="none for plain dynamics: a goal is a model's")
+            raise InputError("goals", got="given", expected="no goals with plain dynamics, as goals need a model")
         for doubt in doubts_of(given, self.model, self.x0) if given else ():
             warnings.warn(doubt, ModelWarning, stacklevel=4)
         return given
@@ -769,7 +787,9 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             apart = np.maximum(constraint.lower - fixed, fixed - constraint.upper)
             for i in np.flatnonzero(apart > NO_SLOPE)[:1]:
                 got = f"{constraint.wanted[i]:.6g}, but its entry {i} is {fixed[i]:.6g} wherever {self.name} goes"
-                raise InputError(f"goal {constraint.label}", got=got, expected="what some joint can change")
+                raise InputError(
+                    f"goal {constraint.label}", got=got, expected="a target of an entry that a joint can change"
+                )
 
     def _fixed_values(self, constraint: GoalConstraint) -> Array:
         """(m,) the values of a goal's rows that no coordinate changes at any of some states, NaN of all others."""
@@ -826,7 +846,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         """Call it once, with AutoDiffXd."""
         if not self.optimizes_parameters:
             raise InputError(
-                "parameter_cost", got="given", expected='"parameters" in optimize: nothing changes it else'
+                "parameter_cost", got="given", expected='"parameters" in optimize, as the cost is constant otherwise'
             )
         try:
             differentiate_final_cost(cost, np.array(self.parameters.values))
@@ -840,9 +860,11 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         if self.motion == STEPS:
             return
         if not self.has_model:
-            raise InputError("motion", got=repr(self.motion), expected=f'"{STEPS}" for plain dynamics: a model has it')
+            raise InputError(
+                "motion", got=repr(self.motion), expected=f'"{STEPS}" for plain dynamics, as other motions need a model'
+            )
         if self.horizon is not None:
-            expected = "none: a motion in continuous time lasts num_steps * model.time_step"
+            expected = "no horizon, as a motion in continuous time lasts num_steps * model.time_step"
             raise InputError("horizon", got="given", expected=expected)
         with self.intervals(self.parameters):
             pass  # what has none says why

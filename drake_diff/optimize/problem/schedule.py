@@ -204,7 +204,7 @@ class ContactSchedule(Goal):
         worst = standing[np.argmax(over[standing])]
         if over[worst] > self.touch or np.min(over[standing]) >= 0:
             got = f"{self.feet[worst]} {1e3 * over[worst]:.3g} mm over the ground"
-            expected = "feet that press into it where they stand: see ContactSchedule.standing"
+            expected = "standing feet that press into the ground; see ContactSchedule.standing"
             raise InputError("ContactSchedule: x0", got=got, expected=expected)
 
     def follow(self, model: Model, guess: tuple[Array, Array]) -> dict[str, Any]:

@@ -182,21 +182,25 @@ def _make_region(asked: TerminalSet, model: Model, bounds: Bounds) -> Region:
     """The region of `asked`, by formula and then by sampling; InputError where there is none."""
     x_goal = finite_array("TerminalSet.x_goal", asked.x_goal, (model.nx,))
     if tangent_space(model).quaternions:
-        raise ModelError("TerminalSet: the state has quaternions, and the set is one of states that can be subtracted")
+        raise ModelError("TerminalSet: expected a state without quaternions, as the set needs differences of states")
     if np.any((x_goal <= bounds.x_lower) | (x_goal >= bounds.x_upper)):
         raise InputError("TerminalSet.x_goal", got=x_goal.tolist(), expected="a state within its bounds, not on one")
     neutral = model.neutral_input(x_goal)
     d = differentiate_step(model, x_goal, neutral)
     u_goal = neutral + np.asarray(np.linalg.lstsq(d.B, x_goal - d.x_next, rcond=None)[0])
     if np.any((u_goal <= bounds.u_lower) | (u_goal >= bounds.u_upper)):
-        got = f"a state that takes u = {u_goal.round(4).tolist()}"
-        raise InputError("TerminalSet.x_goal", got=got, expected="one that inputs within their limits hold")
+        got = f"a state that is held by u = {u_goal.round(4).tolist()}"
+        raise InputError("TerminalSet.x_goal", got=got, expected="a fixed point of inputs within their limits")
     Q = np.eye(model.nx) if asked.Q is None else finite_array("TerminalSet.Q", asked.Q, (model.nx, model.nx))
     R = np.eye(model.nu) if asked.R is None else finite_array("TerminalSet.R", asked.R, (model.nu, model.nu))
     regulator = LQR(model, x_goal, u_goal, Q, R)
     K, S = np.asarray(regulator.gain), np.asarray(regulator.cost_to_go)
     if np.min(np.linalg.eigvalsh(S)) <= 0:
-        raise InputError("TerminalSet.Q", got="weights that see not all of the state", expected="a cost-to-go above 0")
+        raise InputError(
+            "TerminalSet.Q",
+            got="weights with a cost-to-go of 0",
+            expected="weights with a positive definite cost-to-go",
+        )
     most = linear_level(K, S, x_goal, u_goal, bounds, model.nq)
     d = differentiate_step(model, x_goal, u_goal)
     slowest = float(np.max(np.abs(np.linalg.eigvals(d.A - d.B @ K))))
@@ -204,7 +208,7 @@ def _make_region(asked: TerminalSet, model: Model, bounds: Bounds) -> Region:
 
     level = most if asked.level is None else asked.level
     if level > most:
-        expected = f"at most {most:.4g}, within which limits are kept"
+        expected = f"at most {most:.4g}, the largest level within the limits"
         raise InputError("TerminalSet.level", got=f"{level:g}", expected=expected)
     region = Region(x_goal, u_goal, K, S, level, most, asked.samples, model.time_step, steps, bounds)
     return _sampled(model, region, asked)
@@ -219,7 +223,7 @@ def _sampled(model: Model, region: Region, asked: TerminalSet) -> Region:
             in_a_row += 1
             continue
         value = float(region.value(x))
-        got = f"a state at {value:.2g} of it that does not converge, {x.round(4).tolist()}"
+        got = f"a state at {value:.2g} of the level that does not converge, {x.round(4).tolist()}"
         level = min(LOWERED * level, WITHIN * value * level) if in_a_row < TRIED else WITHIN * level
         if asked.level is not None or level < 1e-12 * first:
             expected = f"a level up to {first:.3g} from which all random states converge"

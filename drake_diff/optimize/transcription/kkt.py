@@ -34,7 +34,7 @@ NEAREST = 1e-5  # of max(1, |p|): a corner that is nearer is one of the plan
 ROUNDED = 1e-7  # of the largest derivative of a kind: less is none
 SINGULAR, REFINEMENTS = 1e-10, 4  # on the diagonal, of rows that say the same, and how often its error is taken out
 DIFFERENCE = 1e-5  # of max(1, |p|): of derivatives by a parameter of the model, which are exact by the state
-FLAT = "the plan has no derivative: some change of it costs nothing, so that it is not the only optimum"
+FLAT = "the plan has no derivative: it is not the only optimum, as some change of it leaves the cost equal"
 Mask = NDArray[np.bool_]
 
 

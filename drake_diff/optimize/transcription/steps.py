@@ -83,7 +83,10 @@ def solve_shooting(
         report.row(result.iterations[0], lambda: program.iterates(guess))
     if program.refusals:
         count = f"{program.refusals} point{'s' * (program.refusals > 1)}"
-        remark = f"; backed off from {count} that could not be stepped or differentiated, the last: {program.refusal}"
+        remark = (
+            f"; the line search avoided {count} that could not be stepped or differentiated, the last: "
+            f"{program.refusal}"
+        )
         refused = result.outcome is Outcome.FAILED
         outcome = Outcome.NO_GRADIENT if refused else result.outcome
         result = replace(result, message=result.message + remark, outcome=outcome)
