@@ -28,7 +28,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-LISTED = 12  # names of a list that a message writes out
+LISTED = 24  # names of a list that a message writes out
 
 
 class DrakeDiffError(Exception):

@@ -21,8 +21,8 @@ def attach_stub(package: str, file: str) -> tuple[Callable[[str], Any], Callable
         if name == "__version__" and "." not in package:
             return import_module("importlib.metadata").version(package)
         if not name.startswith("__") and name not in names():
-            found = _similar_names(package, Path(file).parent, name, names())
-            guess = f"; did you mean {found}?" if found else ""
+            similar = _similar_names(package, Path(file).parent, name, names())
+            guess = f"; did you mean {similar}?" if similar else ""
             raise AttributeError(f"module {package} has no attribute {name}{guess}", name=name)
         with ONE_AT_A_TIME:
             return load(name)

@@ -67,7 +67,7 @@ def audit(model: Model, x: ArrayLike | None = None, u: ArrayLike | None = None) 
     Example:
         >>> model = dd.load_model("models/cart_pole.urdf", time_step=0.01)
         >>> dd.audit(model, [0, 0, 0, 0], [50.0])[0]
-        error saturated_effort (force): its effort is at the limit 20 (u is 50): there the derivative by u is exactly 0
+        error saturated_effort (force): its effort is at the limit 20 (u is 50), where the derivative by u is exactly 0
           -> stay inside the limit (the bounds of a Problem do), or raise it in the file
     """
     x = model.default_state if x is None else x

@@ -164,7 +164,7 @@ def compare_runs(a: str | Path, b: str | Path) -> RunComparison:
         >>> from drake_diff.runs import compare_runs
         >>> run = "artifacts/pendulum_swing_up"
         >>> print(compare_runs(run, run))
-        configuration: 0 entries differ; versions: 0; metrics: 0; not compared: 0
+        configuration: 0 entries differ; versions: 0, metrics: 0, not compared: 0
     """
     first, second = load_plan_record(a), load_plan_record(b)
     ours = {m.name: m for m in (*first.metrics, *first.invariants)}

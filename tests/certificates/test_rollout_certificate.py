@@ -339,7 +339,7 @@ def test_a_policy_is_asked_along_each_state_and_parameter(load):
     def of_a_parameter(x, t, p):
         return np.array([-p @ x + rounded(p, 0.01)[2]])
 
-    for function, words in ((of_a_state, "parts of slide_v "), (of_a_parameter, "parts of its parameter 2 ")):
+    for function, words in ((of_a_state, "parts of slide_v"), (of_a_parameter, "parts of its parameter 2,")):
         policy = ParametricPolicy(function, GAINS)
         g = dd.differentiate_rollout(model, x0, None, end, policy=policy, num_steps=3)
         assert words in stairs_of_policy(policy, g, tangent_space(model), model.time_step)

@@ -105,7 +105,7 @@ def test_a_problem_that_cannot_be_solved_exits_with_1_and_a_complete_artifact(tm
         (("num_steps=40", "num_steps=0"), "num_steps"),
         (("x0=[0, 0]", "x0=[0, 0, 0]"), "expected shape (2,)"),
         (("x0=[0, 0]", "x0=[0, float('nan')]"), "finite"),
-        (("[-30.0]", "[31.0]"), "lower at most upper"),
+        (("[-30.0]", "[31.0]"), "a lower bound of at most the upper bound"),
         (("time_step=0.02", "time_step=-0.02"), "time_step"),
         (("pendulum.urdf", "nothing.urdf"), "a file that exists"),
         (("'shooting'", "'magic'"), "one of auto, collocation"),

@@ -448,7 +448,9 @@ def test_pose_and_twist_say_their_frame(tmp_path, frame):
     np.testing.assert_allclose(read_recording(path, model).xs, xs, atol=1e-14)
     unknown = lambda t, x: (*twists(t, x)[:2], "camera", *twists(t, x)[3:])  # noqa: E731
     _, _, path = ball_bag(tmp_path / "camera", [poses, unknown])
-    with pytest.raises(InputError, match=r"frame_id of TwistStamped: expected 'world'.*got 'camera'"):
+    with pytest.raises(
+        InputError, match=r"frame_id of TwistStamped: expected the frame of the pose, 'world'.*got 'camera'"
+    ):
         read_recording(path, model)
 
 

@@ -403,7 +403,7 @@ def test_a_stiction_tolerance_that_is_not_the_usual_one_is_refused():
 
 @each_row("kind", ["distance", "ball", "weld"])
 def test_a_constraint_that_is_no_coupler_is_refused(kind):
-    assert "a constraint acts" in why_not(constrained(kind), [0.3, 0.05, 0.2, -0.1], [0.4])
+    assert "acts that is not a coupler" in why_not(constrained(kind), [0.3, 0.05, 0.2, -0.1], [0.4])
 
 
 def test_what_is_not_known_is_named():

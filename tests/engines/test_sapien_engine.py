@@ -163,7 +163,7 @@ def test_more_groups_than_physx_has_are_refused():
     from drake_diff.mechanics.description import PairContract
 
     chain = tuple(PairContract((f"shape {i}", f"shape {i + 1}"), 0.5, None) for i in range(40))
-    with pytest.raises(ModelError, match="32 groups"):
+    with pytest.raises(ModelError, match="32 collision groups"):
         groups_by_shape(chain)
     groups = groups_by_shape(chain[:20])
     for i in range(21):

@@ -229,7 +229,7 @@ def test_bad_input_is_named(load, tmp_path):
     model = load("pendulum.urdf")
     with pytest.raises(UnknownNameError, match="gazebo"):
         export_model(model, tmp_path / "out", target="unity")
-    with pytest.raises(InputError, match="does not exist"):
+    with pytest.raises(InputError, match="expected a new directory"):
         export_model(model, tmp_path, target="sdf")
     with pytest.raises(InputError, match="states"):
         export_model(model, tmp_path / "out", target="sdf", states=0)

@@ -66,6 +66,6 @@ def test_what_a_mirror_does_not_change_is_told_as_it_is(load):
     us = 3 * np.sin(0.05 * np.arange(100))[:, None]
     w = said(model, recorded(model, [1.0], us), -us)
     assert {w.names, *w.alternatives} == {
-        (f"column {name} has the other sign",) for name in (model.position_names[0], model.input_names[0])
+        (f"column {name} has the opposite sign",) for name in (model.position_names[0], model.input_names[0])
     }
     assert w.sentence.endswith("the recording cannot tell.")

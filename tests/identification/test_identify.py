@@ -268,6 +268,6 @@ def test_what_makes_no_sense_is_refused(pendulum, load):
     assert "no position" in refused(pendulum, nothing, ["pole.mass"])
     assert "motion" in refused(pendulum, log, ["pole.mass"], motion="discrete")
     uneven = dd.Recording("lab", "1", log.times**1.1, log.xs, log.us)
-    assert "the same" in refused(pendulum, uneven, ["pole.mass"], motion="steps")
+    assert "a constant period" in refused(pendulum, uneven, ["pole.mass"], motion="steps")
     short = dd.Recording("lab", "1", log.times[:4], log.xs[:4], log.us[:3])
     assert "8 or more" in refused(pendulum, short, ["pole.mass"])

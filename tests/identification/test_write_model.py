@@ -167,7 +167,7 @@ def test_other_kinds_of_files_are_refused(arm, load, tmp_path):
     found = saying(arm, {"arm.mass": 3.0})
     with pytest.raises(InputError, match=r"a \.urdf file"):
         write_model(found, tmp_path / "right.sdf")
-    with pytest.raises(InputError, match="does not exist"):
+    with pytest.raises(InputError, match="expected a new file"):
         write_model(found, arm.source)
     with pytest.raises(InputError, match=r"the result of dd\.identify"):
         write_model(replace(found, asked=None), tmp_path / "right.urdf")

@@ -280,7 +280,7 @@ def test_a_column_of_a_parameter_that_is_wrong_is_refused(wrong, monkeypatch):
 def test_what_collocation_cannot_move_is_named():
     model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.01)
     name = next(p.name for p in dd.list_parameters(model) if p.name.endswith(".friction"))
-    with pytest.raises(InputError, match=rf"parameters: expected one that moves the model without contact.*{name}"):
+    with pytest.raises(InputError, match=rf"parameters: expected a parameter of motion without contact.*{name}"):
         dd.optimize.plant_dynamics(model, (name,))
     asked = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 5, "optimize": BOTH}
     with pytest.raises(dd.exceptions.ModelError, match="PD-controlled"):

@@ -46,8 +46,8 @@ def test_knots_that_are_none_are_refused(knots):
     "fields, match",
     [
         ({}, "no lower and no upper"),
-        ({"lower": 2, "upper": 1}, "lower at most upper"),
-        ({"lower": np.nan}, "lower at most upper"),
+        ({"lower": 2, "upper": 1}, "a lower bound of at most the upper bound"),
+        ({"lower": np.nan}, "a lower bound of at most the upper bound"),
         ({"lower": [0, 0], "upper": [1, 1, 1]}, "shape"),
         ({"lower": "low"}, "numbers"),
     ],

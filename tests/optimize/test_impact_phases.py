@@ -184,7 +184,7 @@ def test_a_plan_whose_impact_comes_at_another_time_is_refused(thrown, seed):
     phases[0] = replace(phases[0], xs=xs)
     again = rejudged(thrown, phases=tuple(phases))
     assert again.status is dd.Status.CONVERGED_NOT_VERIFIED
-    assert "m apart" in repr(again)
+    assert "has a gap of" in repr(again)
 
 
 def test_what_is_no_impact_is_refused_early(landed):

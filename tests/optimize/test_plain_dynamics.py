@@ -175,7 +175,7 @@ def test_where_a_finer_mesh_fails_the_last_motion_is_kept(monkeypatch, refine):
         if outcome is Outcome.INFEASIBLE:
             assert solution.status is dd.Status.CONVERGED_NOT_VERIFIED
             assert "intervals no motion was found" in repr(solution)
-            assert "that on 4 is kept" in repr(solution)
+            assert "the motion on 4 is kept" in repr(solution)
         else:  # without the limit it would have gone further, which is what `verify` does
             assert solution.status is dd.Status[outcome.name]
 

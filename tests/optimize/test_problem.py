@@ -75,7 +75,10 @@ def test_a_nan_goal_is_free(load):
         ({"num_steps": -3}, "num_steps"),
         ({"num_steps": 2.5}, "num_steps"),
         ({"num_steps": True}, "num_steps"),
-        ({"bounds": dd.Bounds(u_lower=[5.0], u_upper=[-5.0])}, r"bounds of force: expected lower at most upper"),
+        (
+            {"bounds": dd.Bounds(u_lower=[5.0], u_upper=[-5.0])},
+            r"bounds of force: expected a lower bound of at most the upper bound",
+        ),
         ({"bounds": dd.Bounds(u_lower=[30.0])}, r"bounds of force: .*got \[30, 20\]"),
         ({"bounds": dd.Bounds(x_lower=[0.0])}, "x_lower: expected shape"),
         ({"optimize": ()}, "optimize"),

@@ -96,7 +96,7 @@ def test_what_has_no_sensitivity_is_refused(write_urdf):
     for given, by, match in (
         (problem, "x0", "solution: expected a Solution"),
         (dd.solve(problem, method="ilqr"), (), 'expected "x0", "goal", or names of parameters'),
-        (dd.solve(block(3.9)), "x0", "expected one that is a success"),
+        (dd.solve(block(3.9)), "x0", "expected a successful solution"),
         (
             dd.solve(problem, method="collocation", options=Options(scheme="drake")),
             "x0",

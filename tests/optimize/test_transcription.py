@@ -464,7 +464,10 @@ def test_dynamics_without_derivatives_are_refused():
         ({"nx": 0}, "nx: expected a whole number"),
         ({"nu": 1.5}, "nu: expected a whole number"),
         ({"x_lower": [0]}, r"x_lower: expected shape \(2,\)"),
-        ({"u_lower": [2], "u_upper": [1]}, r"bounds of u0: expected lower at most upper, got \[2, 1\]"),
+        (
+            {"u_lower": [2], "u_upper": [1]},
+            r"bounds of u0: expected a lower bound of at most the upper bound, got \[2, 1\]",
+        ),
         ({"state_names": ["a"]}, "state_names: expected 2 names"),
     ],
 )
@@ -485,7 +488,7 @@ def test_bad_dynamics_are_named(options, message):
         ({"num_steps": 0}, "num_steps: expected a whole number"),
         ({"horizon": None}, r"horizon: expected a number of seconds, or \(lower, upper\), got none"),
         ({"horizon": 0}, r"horizon \[s\]: expected a finite number above 0"),
-        ({"horizon": (2, 1)}, "horizon: expected lower at most upper"),
+        ({"horizon": (2, 1)}, "horizon: expected a lower bound of at most the upper bound"),
         ({"horizon": (1, np.inf)}, r"horizon \[s\]: expected a finite number above 0"),
         ({"horizon": (1, 2, 3)}, "horizon: expected a number of seconds"),
         ({"scheme": "radau"}, "scheme: expected one of drake, hermite_simpson, trapezoid, got 'radau'"),

@@ -146,7 +146,7 @@ def test_a_finger_without_mass_is_fixed(tmp_path, follows):
 
 def test_a_robot_of_joints_without_a_way_to_go_is_refused(tmp_path):
     limit = 'lower="0.5" upper="0.5" effort="50" velocity="3"'
-    with pytest.raises(ModelError, match="same lower and upper limit"):
+    with pytest.raises(ModelError, match="equal lower and upper limits"):
         load_robot(robot(tmp_path, link("arm"), joint("shoulder", "world", "arm", limit=limit)), 0)
 
 

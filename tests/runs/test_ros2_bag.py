@@ -114,7 +114,7 @@ def test_rosbags_reads_the_whole_bag_with_its_metadata(bag):
 
 
 def test_what_exists_is_not_written_over_and_what_is_no_run_is_refused(run, bag, tmp_path):
-    with pytest.raises(InputError, match="OUT: expected a directory that does not exist"):
+    with pytest.raises(InputError, match="OUT: expected a new directory"):
         export_ros2(run, bag)
     with pytest.raises(ArtifactError, match=r"trace\.mcap"):
         export_ros2(tmp_path, tmp_path / "bag")

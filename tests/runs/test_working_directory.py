@@ -98,7 +98,7 @@ def test_numba_loads_nothing_from_where_the_directory_says(here):
     (folder / ".numba_config.yaml").write_text(f"cache_dir: {sprung}\n")
     done = drake_diff("certify", str(MODELS / "pendulum.urdf"))
     assert done.returncode == 2
-    assert ".numba_config.yaml: expected none" in done.stderr
+    assert ".numba_config.yaml: expected no such file" in done.stderr
     assert not sprung.exists()
 
 

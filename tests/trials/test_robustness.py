@@ -199,7 +199,7 @@ def test_bad_levels_are_refused(setup, levels, error, message):
         (["mass"], {"seed": -1}, "seed: expected a whole number"),
         (["mass"], {"controller": "prayer"}, "tvlqr"),
         (["mass"], {"controller": lambda plan, model, xs, us: {}["gains"]}, "controller: .*got KeyError: 'gains'"),
-        (["mass"], {"controller": lambda plan, model, xs, us: None}, "controller: .*got one that makes None"),
+        (["mass"], {"controller": lambda plan, model, xs, us: None}, "controller: .*got a function that makes None"),
     ],
 )
 def test_bad_arguments_of_robustness_are_refused(cart, perturbations, options, message):
