@@ -42,7 +42,7 @@ def test_exchanged_and_mirrored_columns_and_degrees_are_named(swung):
         (xs[:, [1, 0, 2, 3]], us, f"columns {q[0]} and {q[1]} are exchanged"),
         (xs[:, [1, 0, 3, 2]], us, f"columns {q[0]} and {q[1]} and {v[0]} and {v[1]} are exchanged"),
         (xs, us[:, ::-1], f"columns {u[0]} and {u[1]} are exchanged"),
-        (xs * other, us, f"columns {q[1]} and {v[1]} have the other sign"),
+        (xs * other, us, f"columns {q[1]} and {v[1]} have the opposite sign"),
         (xs * degrees, us, f"columns {q[0]} and {q[1]} have degrees, not radians"),
     ):
         w = said(model, mistaken, inputs)

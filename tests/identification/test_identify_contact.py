@@ -136,7 +136,7 @@ def test_identify_goes_through_impacts_and_says_whether_they_are_explained(ball)
     assert 0.6 < right.error_after < 1.4
     wrong = fit((0.25, 0.1))  # what is predicted is another ball
     assert not wrong.explained
-    assert "held out" in wrong.reason
+    assert "held-out samples" in wrong.reason
     with pytest.raises(InputError, match="priors and bounds"):
         fit((0.25, 0.25), bounds={"ball.friction": (0, 1)})
 

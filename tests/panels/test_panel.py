@@ -291,7 +291,7 @@ def test_another_panels_directory_is_refused_and_so_is_one_of_its_trials(write, 
         run_panel(write("cheap"), out=tmp_path / "other", workers=1)
     foreign = min((tmp_path / "other" / "trials").iterdir())
     shutil.copy(foreign, tmp_path / "out" / "trials")
-    with pytest.raises(ArtifactError, match=f"{foreign.name}: it is of another panel"):
+    with pytest.raises(ArtifactError, match=f"{foreign.name}: it belongs to another panel"):
         run_panel(write("cheap"), out=tmp_path / "out", workers=1)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes").touch()

@@ -70,7 +70,7 @@ def ask(function, monkeypatch, seconds=20.0, **arguments):
     [
         (end, False, "SIGABRT"),
         (touch_nothing, False, "SIGSEGV"),
-        (take_memory, True, "more than 1 GiB"),
+        (take_memory, True, "exceeded its memory limit of 1 GiB"),
         (answer_much, False, "67108864 bytes"),
         (leave, False, "enough"),
     ],
