@@ -29,10 +29,10 @@ AGREE = 1e-9  # of the largest acceleration: chains of a few bodies in double pr
 STATES = 4
 # Notes of what was done so that the plant is as the file says, or of what no acceleration without contact depends on.
 BENIGN = re.compile(
-    r"attribute '(timestep|integrator|solver|cone)'|Effort limits at the joint|Gains k|<general> actuators read"
+    r"attribute '(timestep|integrator|solver|cone)'|Effort limits at the joint|Gains k|<general> actuators became"
     r"|has no name|Default classes|became forces on bodies|became bodies|tag 'site'|springs? added|Springs"
     r"|Masses are those|Armature of joints|No gravity, as|<velocity> servos|actuators? added|springs of joints"
-    r"|several joints|collision shapes taken away|attribute 'actuatorfrcrange'"
+    r"|several joints|collision shapes removed|attribute 'actuatorfrcrange'"
     r"|tag '(light|visual|sensor|statistic|keyframe|custom|size|contact|texture|material|camera)'|camera element"
     r"|texture|[Tt]orsional|attribute '(user|rgba|group|condim|margin|solref|solimp|solreflimit|solimplimit)'"
     r"|loops are closed|Actuators of tendons|collision mesh|condim|Joints without a name"
