@@ -99,7 +99,7 @@ def measure(seed, count):
             found["legitimate"] += 1
             found["refused"] += solution.status is dd.Status.NO_GRADIENT
             found["constant"] += case == "constant"
-            found["told"] += case == "constant" and "which nothing that may change can move" in solution.message
+            found["told"] += case == "constant" and "which no variable can move" in solution.message
     figures = [
         Figure("plans that touch nothing, said to be converged", found["false"], found["still"], 0.0, False),
         Figure("plans that touch nothing, the body named", found["named"], found["still"], 0.95, True),
