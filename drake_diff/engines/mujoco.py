@@ -47,9 +47,7 @@ class MujocoEngine(PlantEngine):
     def __init__(self, model: Model, *, path: str | Path | None = None, time_step: float | None = None):
         super().__init__(model)
         if path is not None and time_step is not None:
-            raise InputError(
-                "time_step [s]", got=time_step, expected="no time step with an MJCF of your own, which sets it"
-            )
+            raise InputError("time_step [s]", got=time_step, expected="no time step, as the given MJCF file sets it")
         self.time_step = model.time_step if time_step is None else positive_float("time_step [s]", time_step)
         self.mjcf, self.model = mujoco_model(self.description, self.time_step, path)
         self.data = mujoco.MjData(self.model)

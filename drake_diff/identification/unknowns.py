@@ -278,7 +278,7 @@ def _bounds_of(name: str, given: Any, lower: float) -> tuple[float, float]:
         raise InputError(subject, got=given, expected="a prior instead, as an inertia takes no bounds")
     if not max(low, lower) < high:
         raise InputError(
-            subject, got=given, expected=f"a lower bound below the upper one, and an upper one above {lower:g}"
+            subject, got=given, expected=f"a lower bound below the upper bound, and an upper bound above {lower:g}"
         )
     return max(low, lower), high
 

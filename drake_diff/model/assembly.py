@@ -21,10 +21,11 @@ LONGEST = 0.5  # [rad or m] of a step: farther ones miss the posture nearby
 
 
 def gap(model: Model, q: ArrayLike) -> tuple[float, float]:
-    """[m] how far the points of a pair are apart in posture q (nq,) at most, and a length to compare that with.
+    """[m] how far the points of a loop are apart in posture q (nq,) at most, and a length to compare that with.
 
-    The length is the largest distance of a point from the origin of its body, or the extent of the origins of the
-    bodies that are held and of those that carry them, whatever unit the robot is modelled in.
+    The length is the largest distance of a loop's first point from the origin of its body, or the extent of the origins
+    of the bodies that are held and of those that carry them. The other points of a loop only give its axes. They count
+    by the angle between them and the first point, times this length, so that the ratio has no unit.
     """
     held = model.file_facts.held_points
     set_state(model.double, np.concatenate([finite_array("q", q, (model.nq,)), np.zeros(model.nv)]))
@@ -34,8 +35,17 @@ def gap(model: Model, q: ArrayLike) -> tuple[float, float]:
     bodies |= {int(j.parent_body().index()) for j in carried} - {int(model.plant.world_body().index())}
     poses = [model.plant.EvalBodyPoseInWorld(model.double.context, model.plant.get_body(BodyIndex(i))) for i in bodies]
     extent = float(np.linalg.norm(np.ptp([pose.translation() for pose in poses], axis=0))) if poses else 0.0
-    size = max([extent, *(float(np.linalg.norm(point)) for pair in held for point in pair.points)]) or APART
-    return max((float(np.linalg.norm(difference)) for difference in differences), default=0.0), size
+    first: dict[tuple[int, ...], int] = {}
+    for i, pair in enumerate(held):
+        first.setdefault(tuple(map(int, pair.bodies)), i)
+    origins = [first[tuple(map(int, pair.bodies))] for pair in held]
+    lengths = [np.linalg.norm(point) for i in first.values() for point in held[i].points]
+    size, gaps = float(max([extent, *lengths], default=0.0)) or APART, [0.0]
+    for i, origin in enumerate(origins):
+        way = np.linalg.norm(np.subtract(held[i].points[0], held[origin].points[0]))
+        off = np.linalg.norm(differences[i] - differences[origin])
+        gaps.append(float(np.linalg.norm(differences[origin]) if i == origin or way == 0 else size * off / way))
+    return max(gaps), size
 
 
 def check_closed(model: Model, subject: str, x: Array) -> None:

@@ -160,7 +160,7 @@ def close_loops(plant: MultibodyPlant, loops: Sequence[HeldBodies], held: list[H
     names: list[str] = []
     for loop in loops:
         body, other = (
-            _stand_in_for_the_world(plant, loop.instance) if name == WORLD else _body(plant, loop.instance, name)
+            _welded_to_the_world(plant, loop.instance) if name == WORLD else _body(plant, loop.instance, name)
             for name in (loop.body, loop.other)
         )
         if other.index() in {welded.index() for welded in plant.GetBodiesWeldedTo(body)}:
@@ -191,7 +191,7 @@ def _body(plant: MultibodyPlant, instance: str, name: str) -> Any:
     raise ModelError(f"expected a body of {instance} to connect, got the unknown name {name}")
 
 
-def _stand_in_for_the_world(plant: MultibodyPlant, instance: str) -> Any:
+def _welded_to_the_world(plant: MultibodyPlant, instance: str) -> Any:
     """A body without mass that is welded to the world, as Drake crashes on constraints of the world itself."""
     name, index = f"{WORLD}_of_loops", plant.GetModelInstanceByName(instance)
     if not plant.HasBodyNamed(name, index):

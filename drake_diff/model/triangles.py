@@ -161,7 +161,7 @@ def _read_msh(path: Path) -> Triangles:
     corners = np.frombuffer(data, dtype="<f4", count=3 * vertices, offset=16).reshape(-1, 3).astype(float)
     indices = np.frombuffer(data, dtype="<i4", count=3 * faces, offset=begin).reshape(-1, 3).astype(np.int64)
     if np.any(indices < 0) or np.any(indices >= vertices) or not np.all(np.isfinite(corners)):
-        raise ModelError(f"{path}: expected faces with indices of the mesh's own, finite vertices")
+        raise ModelError(f"{path}: expected faces whose indices are those of finite vertices of the mesh")
     return _joined(corners, indices, None)
 
 

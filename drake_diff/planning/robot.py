@@ -262,7 +262,7 @@ def _standing(read: _Draft, seed: int) -> Robot | Refusal:
     draft.repairs.append(f"it stands on {_few(foot.name for foot in stance[0].feet)}, {ground}")
     if besides:
         pairs = _few(map(" and ".join, sorted(besides)))
-        draft.repairs.append(f"{pairs} overlap where it stands, which the search ignores")
+        draft.repairs.append(f"{pairs} overlap in the initial posture, which the search ignores")
     return Robot(model, shapes, q, lower, upper, tuple(draft.repairs), False, besides, stance)
 
 

@@ -1,6 +1,7 @@
 """Loops: points of two bodies that <connect>, <weld> or a joint of SDF holds together."""
 
 import dataclasses
+import re
 import warnings
 
 import numpy as np
@@ -43,6 +44,16 @@ SDF_LINK = (
     '<link name="{}"><pose>{} 0 0 0</pose><inertial><pose>0.1 0 0.1 0 0 0</pose><mass>0.4</mass><inertia>'
     "<ixx>0.01</ixx><iyy>0.01</iyy><izz>0.01</izz></inertia></inertial></link>"
 )
+
+
+def scaled(text, scale):
+    """The poses of an SDF file in another unit of length."""
+
+    def pose(match):
+        numbers = [float(word) * (scale if i < 3 else 1.0) for i, word in enumerate(match[2].split())]
+        return f"<pose{match[1]}>{' '.join(map(str, numbers))}</pose>"
+
+    return re.sub(r"<pose([^>]*)>([^<]*)</pose>", pose, text)
 
 
 def sdf(tmp_path, kind="revolute", effort="0", expressed=""):
@@ -463,6 +474,19 @@ def test_bodies_that_move_together_need_no_constraint(tmp_path):
     model = load(parallelogram(tmp_path, equality, more))
     assert len(model.file_facts.held_points) == 1
     assert np.all(np.isfinite(dd.step(model, model.default_state, [0.1])))
+
+
+@pytest.mark.parametrize("kind", ["ball", "revolute", "fixed"])
+def test_how_far_a_loop_is_open_does_not_depend_on_the_unit_of_length(tmp_path, kind):
+    """The points that give the axes of a joint are 0.1 m away, also where the mechanism has half a millimetre."""
+    path, ratios = sdf(tmp_path, kind), []
+    text = path.read_text()
+    for scale in (1.0, 1e-3, 1e3):
+        path.write_text(scaled(text, scale))
+        distance, size = gap(load(path), [0.02, 0.0, 0.0])
+        ratios.append(distance / size)
+    assert ratios == pytest.approx([ratios[0]] * 3, rel=1e-6)  # rounding of points that are far away
+    assert ratios[0] > 0.001
 
 
 @pytest.mark.parametrize(("step", "success"), [(0.05, False), (0.0125, True)])
