@@ -39,12 +39,12 @@ def gap(model: Model, q: ArrayLike) -> tuple[float, float]:
     for i, pair in enumerate(held):
         first.setdefault(tuple(map(int, pair.bodies)), i)
     origins = [first[tuple(map(int, pair.bodies))] for pair in held]
-    lengths = [np.linalg.norm(point) for i in first.values() for point in held[i].points]
-    size, gaps = float(max([extent, *lengths], default=0.0)) or APART, [0.0]
+    lengths = [float(np.linalg.norm(point)) for i in first.values() for point in held[i].points]
+    size, gaps = max([extent, *lengths], default=0.0) or APART, [0.0]
     for i, origin in enumerate(origins):
-        way = np.linalg.norm(np.subtract(held[i].points[0], held[origin].points[0]))
-        off = np.linalg.norm(differences[i] - differences[origin])
-        gaps.append(float(np.linalg.norm(differences[origin]) if i == origin or way == 0 else size * off / way))
+        way = float(np.linalg.norm(np.subtract(held[i].points[0], held[origin].points[0])))
+        off = float(np.linalg.norm(differences[i] - differences[origin]))
+        gaps.append(size * off / way if way > 0 else float(np.linalg.norm(differences[i])))
     return max(gaps), size
 
 
