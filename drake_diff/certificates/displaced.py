@@ -421,8 +421,12 @@ class _PolicyProbe:
 
     def _staircase(self, k: int, way: Array, name: str, lengths: Sequence[float] = LENGTHS) -> str:
         jump = _stairs(self._along(k, way), self._least(k), lengths)
-        where = f"jumps in {jump[2]} of {ASK.cells} parts of {name}, " if jump else ""
-        return f"the policy is a staircase: {self._jump_text(k, way, jump[:2], where)} at {jump[0]:.3g}" if jump else ""
+        if not jump:
+            return ""
+        return (
+            f"the policy is a staircase: {self._jump_text(k, way, jump[:2])} "
+            f"in {jump[2]} of {ASK.cells} parts of {name}, first at {jump[0]:.3g}"
+        )
 
     def _switch(self, k: int, way: Array, name: str) -> str:
         least = max(self._least(k), ASK.rounded * float(np.abs(self.g.us).max()))
@@ -432,10 +436,10 @@ class _PolicyProbe:
                 return f"the policy jumps: {self._jump_text(k, way, jumps[0])} on the way from this state {name}"
         return ""
 
-    def _jump_text(self, k: int, way: Array, jump: Jump, where: str = "") -> str:
+    def _jump_text(self, k: int, way: Array, jump: Jump) -> str:
         change = self._u(k, way, jump[1]) - self._u(k, way, jump[0])
         i = int(np.argmax(np.abs(change)))
-        return f"at t = {k * self.time_step:g} s, {where}u[{i}] by {change[i]:.3g}"
+        return f"at t = {k * self.time_step:g} s u[{i}] changes by {change[i]:.3g}"
 
     def _least(self, k: int) -> float:
         return ASK.single * float(np.abs(self.g.us[k]).sum())
