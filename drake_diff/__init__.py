@@ -1,4 +1,4 @@
-"""Trajectory optimization on Drake with gradients that are checked before they are used."""
+"""Trajectory optimization on Drake with gradients that are verified before use."""
 
 from drake_diff._base import attach_stub as _attach_stub
 

@@ -1,20 +1,20 @@
-"""Every error that drake_diff raises on purpose.
+"""The errors that drake_diff raises deliberately.
 
 DrakeDiffError
-├── InputError (ValueError)        what was passed in cannot be right: expected, got
+├── InputError (ValueError)        an invalid argument; the message states what was expected and what was given
 │   ├── ShapeError                 an array of the wrong shape
-│   ├── NonFiniteError             NaN or infinity where a number is needed
-│   └── UnknownNameError           a joint, parameter, solver, ... that does not exist; lists those that do
+│   ├── NonFiniteError             NaN or infinity where a finite number is needed
+│   └── UnknownNameError           an unknown joint, parameter, solver, ...; the message lists the known names
 ├── ModelError                     a file or diagram that cannot be used as a robot model
 ├── GradientError                  a derivative that must not be used
 ├── CertificateError               a certificate whose verdict is not "agree", or a check before an export
-├── SimulationError                Drake could not take a step
-├── MissingDependencyError         an optional engine or solver that is not there; says what to install
-├── NotOfferedError                something that an engine does not compute
+├── SimulationError                Drake failed to take a step
+├── MissingDependencyError         an optional engine or solver is not installed; the message says what to install
+├── NotOfferedError                a quantity that an engine does not compute
 ├── ArtifactError                  a run directory or log that is missing, incomplete or damaged
-└── WriteError (OSError)           the disk is full, or does not let a file be written; says what is kept where
+└── WriteError (OSError)           a file could not be written; the message says where partial results are
 
-ModelWarning (UserWarning)         what was left out of a model that is used all the same
+ModelWarning (UserWarning)         parts of a model file were ignored
 
 Example:
     >>> dd.step(dd.load_model("models/pendulum.urdf", time_step=0.01), [0.0], [0.0])
@@ -28,25 +28,25 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-LISTED = 24  # names of a list that a message writes out
+LISTED = 24  # maximum number of names in a message
 
 
 class DrakeDiffError(Exception):
-    """The root of the tree. All pickle: a pool of processes whose worker raises one that does not waits for ever."""
+    """The base class. All errors can be pickled: a process pool hangs if a worker raises one that cannot be pickled."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _again, (type(self), self.args), {name: _picklable(value) for name, value in vars(self).items()}
 
 
 def _again(kind: type[DrakeDiffError], args: tuple[Any, ...]) -> DrakeDiffError:
-    """An error with its message; `__init__` would make the message from what it was given."""
+    """Recreate an error from its message without calling `__init__`, which takes other arguments."""
     error = kind.__new__(kind, *args)
     error.args = args
     return error
 
 
 def _picklable(value: Any) -> Any:
-    """`value`, or its repr where it cannot be pickled, and read again."""
+    """Return `value`, or its repr if it cannot be pickled and unpickled."""
     try:
         pickle.loads(pickle.dumps(value))
     except Exception:
@@ -55,7 +55,7 @@ def _picklable(value: Any) -> Any:
 
 
 class InputError(DrakeDiffError, ValueError):
-    """Bad input, found before anything ran; `subject`, `expected` and `got` are in the message and kept."""
+    """An invalid argument, found before any computation; `subject`, `expected` and `got` are attributes."""
 
     def __init__(self, subject: str, *, got: Any, expected: str):
         super().__init__(f"{subject}: expected {expected}, got {got}")
@@ -78,7 +78,7 @@ class NonFiniteError(InputError):
 
 
 class UnknownNameError(InputError):
-    """A name that does not exist; the message lists the most similar of those that do, and the best guess."""
+    """An unknown name; the message lists the most similar known names and suggests the best match."""
 
     def __init__(self, subject: str, *, got: object, known: Iterable[str]):
         names = sorted(map(str, known))
@@ -94,7 +94,7 @@ class ModelError(DrakeDiffError):
 
 
 class GradientError(DrakeDiffError):
-    """A derivative that must not be used: it is not finite, or its value is not the simulator's."""
+    """A derivative that must not be used: it is not finite, or its value differs from the simulator's."""
 
 
 class CertificateError(DrakeDiffError):
@@ -102,15 +102,15 @@ class CertificateError(DrakeDiffError):
 
 
 class SimulationError(DrakeDiffError):
-    """Drake could not take a step."""
+    """Drake failed to take a step."""
 
 
 class MissingDependencyError(DrakeDiffError):
-    """An optional engine or solver that is not there."""
+    """An optional engine or solver is not installed."""
 
 
 class NotOfferedError(DrakeDiffError):
-    """Something that an engine does not compute: a gradient, a mass matrix, an energy."""
+    """A quantity that an engine does not compute, such as a gradient, a mass matrix or an energy."""
 
 
 class ArtifactError(DrakeDiffError):
@@ -118,14 +118,14 @@ class ArtifactError(DrakeDiffError):
 
 
 class WriteError(DrakeDiffError, OSError):
-    """The disk is full, or does not let a file be written; `kept` is the folder of what was written of a run."""
+    """A file could not be written, for example on a full disk; `kept` is the folder with the partial run."""
 
     kept: Path | None = None
 
 
 class ModelWarning(UserWarning):
-    """Something of a model file was left out; the model is used all the same."""
+    """Part of a model file was ignored, and the model was loaded without it."""
 
 
 class GradientWarning(UserWarning):
-    """A derivative at a point that says nothing of what is a little away from it."""
+    """A derivative that does not describe the function even a small distance away from the point."""

@@ -1,4 +1,4 @@
-"""What every layer uses: checked numbers, clocks, files; and names that load their module when first used."""
+"""Utilities for every layer: checked numbers, clocks, files, and lazily loaded names."""
 
 import re
 from collections.abc import Callable
@@ -10,11 +10,11 @@ from typing import Any
 
 import lazy_loader
 
-ONE_AT_A_TIME = RLock()  # NumPy and pydrake import in circles, which fails where two threads enter one at once
+ONE_AT_A_TIME = RLock()  # the circular imports of NumPy and pydrake fail if two threads import at once
 
 
 def attach_stub(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """`__getattr__`, `__dir__` and `__all__` of `package`: the names that the stub beside `file` imports."""
+    """Return `__getattr__`, `__dir__` and `__all__` of `package` for the names in the stub next to `file`."""
     load, names, everything = lazy_loader.attach_stub(package, file)
 
     def load_alone(name: str) -> Any:
@@ -31,7 +31,7 @@ def attach_stub(package: str, file: str) -> tuple[Callable[[str], Any], Callable
 
 
 def _similar_names(package: str, folder: Path, name: str, names: list[str]) -> str:
-    """The public names of a package and of those in it that `name` may mean, "a or b", "" where there are none."""
+    """Return names in a package and its subpackages that resemble `name`, as "a or b", or "" if there are none."""
     known = {other: f"{package}.{other}" for other in names}
     for stub in folder.glob("*/__init__.pyi"):
         inner = re.findall(r" as (\w+)$", stub.read_text(), re.MULTILINE)

@@ -1,7 +1,7 @@
-"""AutoDiffXd in and out of NumPy, the chain rule for what we differentiate ourselves, and gradients by autograd.
+"""Conversion between AutoDiffXd and NumPy, the chain rule for known derivatives, and gradients by autograd.
 
-A loss of a motion has as many variables as the motion has numbers. AutoDiffXd carries a derivative by each of them with
-every number, so that its time grows with the square of the motion's length; autograd goes once forward and once back.
+A loss of a motion depends on every number of the motion. AutoDiffXd stores all the derivatives in each number, so its
+time grows with the square of the motion's length. autograd needs only one forward and one reverse pass.
 """
 
 import inspect
@@ -21,26 +21,26 @@ from drake_diff._base.arrays import FLOAT, NUMBERS, Array
 from drake_diff._base.clock import TimeIsUpError
 from drake_diff.exceptions import DrakeDiffError, GradientError, InputError, ShapeError
 
-# AutoDiffXd carries a whole row of derivatives with every number; this many at a time keeps memory flat.
+# AutoDiffXd stores a row of derivatives in every number; this block size keeps the memory constant.
 DIRECTIONS = 128
 ORDINARY = "ordinary arithmetic and NumPy functions, without float()"
 Shape = tuple[int | str, ...]
 
 
 class UntraceableError(Exception):
-    """A function does something that autograd cannot follow."""
+    """A function performs an operation that autograd cannot differentiate."""
 
 
 def named(subject: str, function: Any) -> str:
-    """What a user's function is, its name, and the file and line where it is known."""
-    inner = inspect.unwrap(getattr(function, "func", function))  # of a partial, or of what was made of it
+    """Return `subject` and the name of a user's function, with its file and line if they are known."""
+    inner = inspect.unwrap(getattr(function, "func", function))  # unwrap partials and wrappers
     code = getattr(inner, "__code__", None) or getattr(inner.__call__, "__code__", None)
     where = f" ({Path(code.co_filename).name}:{code.co_firstlineno})" if code else ""
     return f"{subject} {getattr(inner, '__name__', type(inner).__name__)}{where}"
 
 
 def noted(subject: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """What a user's function returns that may end us by an error of its own, which gets a note with its name."""
+    """Call a user's function and return its result; an exception that it raises gets a note with its name."""
     try:
         return function(*arguments)
     except Exception as error:
@@ -49,9 +49,9 @@ def noted(subject: str, function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def called(subject: str, function: Callable[..., Any], *arguments: Any, shape: Shape | None = None) -> Any:
-    """What a user's function gives for plain numbers; any number or array of numbers where `shape` is None.
+    """Call a user's function with plain numbers and check its result; `shape` None allows a number or any array.
 
-    InputError where it raises or gives no numbers, ShapeError where they are others, both with the function's name.
+    Raises InputError if it raises or its result is not numeric, and ShapeError if the shape is wrong. Both name it.
     """
     try:
         result = function(*arguments)
@@ -61,10 +61,10 @@ def called(subject: str, function: Callable[..., Any], *arguments: Any, shape: S
         got = f"{type(error).__name__}: {error!s:.200}"
         raise InputError(named(subject, function), got=got, expected=_in_words(shape)) from error
     if type(result) is float or (type(result) is np.ndarray and result.dtype is FLOAT and result.shape == shape):
-        return result  # as a rule
+        return result  # the usual case
     try:
         array = np.asarray(result)
-    except ValueError:  # rows of several lengths
+    except ValueError:  # rows of different lengths
         array = np.array(None)
     entries = array.flat if array.dtype.kind == "O" else ()
     if array.dtype.kind not in NUMBERS and not (entries and all(isinstance(e, (Real, AutoDiffXd)) for e in entries)):
@@ -81,7 +81,7 @@ def _in_words(shape: Shape | None) -> str:
 
 
 def carrying(subject: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """What a user's function gives for AutoDiffXd; GradientError, with the function's name, where it raises."""
+    """Call a user's function with AutoDiffXd arguments; raise GradientError with its name if it raises."""
     try:
         return function(*arguments)
     except (DrakeDiffError, TimeIsUpError):
@@ -92,9 +92,9 @@ def carrying(subject: str, function: Callable[..., Any], *arguments: Any) -> Any
 
 
 class UserFunction:
-    """A user's function of arrays that is `called` with plain numbers and `carrying` with AutoDiffXd.
+    """A user's function of arrays, called by `called` for plain numbers and by `carrying` for AutoDiffXd.
 
-    Its first argument has `ndim` dimensions; whatever else is tried with it, symbols or many points, is as it was.
+    Its first argument has `ndim` dimensions. Other arguments, such as symbols or batches, are passed on unchanged.
     """
 
     def __init__(self, subject: str, function: Any, shape: Shape | None, ndim: int):
@@ -115,7 +115,7 @@ class UserFunction:
 
 
 def user_function(subject: str, function: Any, shape: Shape | None = (), ndim: int = 1) -> Any:
-    """A user's function as a `UserFunction`; what this package made, and what is no function, as it is."""
+    """Wrap a user's function in `UserFunction`; return functions of this package and other objects unchanged."""
     ours = isinstance(function, UserFunction) or type(function).__module__.startswith("drake_diff.")
     if ours or not callable(function) or hasattr(function, "linearize"):
         return function
@@ -123,10 +123,10 @@ def user_function(subject: str, function: Any, shape: Shape | None = (), ndim: i
 
 
 def gradient_of(f: Callable[[Any], Any], z: Array) -> tuple[float, Array]:
-    """(value, gradient (n,)) of the scalar `f` at `z` (n,) by AutoDiffXd.
+    """Return (value, gradient (n,)) of the scalar function `f` at `z` (n,) by AutoDiffXd.
 
-    Raises GradientError where the result carries no derivative (float() was taken, or a constant returned) or
-    is not finite.
+    Raises GradientError if the result has no derivatives (because of float() or a constant result) or is not
+    finite.
     """
     gradient = np.zeros(len(z))
     value = 0.0
@@ -134,7 +134,7 @@ def gradient_of(f: Callable[[Any], Any], z: Array) -> tuple[float, Array]:
         active = slice(start, min(start + DIRECTIONS, len(z)))
         variables = np.array([AutoDiffXd(entry) for entry in z])
         variables[active] = InitializeAutoDiff(z[active]).ravel()
-        with np.errstate(all="ignore"):  # what is not finite is refused below, whole
+        with np.errstate(all="ignore"):  # results that are not finite are refused below
             result = np.asarray(carrying("function", f, variables)).ravel()
         if result.shape != (1,):
             raise InputError("loss", got=f"{len(result)} values", expected="one scalar")
@@ -151,13 +151,13 @@ def gradient_of(f: Callable[[Any], Any], z: Array) -> tuple[float, Array]:
 
 
 def gradient_rows(values: Any, width: int) -> Array:
-    """(m, width): the derivatives of `values` (m,), which Drake leaves empty where they are all constants."""
+    """Return the derivatives (m, width) of `values` (m,); Drake leaves them empty if all values are constant."""
     gradient = ExtractGradient(values.reshape(-1, 1))
     return np.asarray(gradient) if gradient.shape[1] else np.zeros((len(values), width))
 
 
 def plain(values: Any) -> Array:
-    """The values alone of an array of floats or AutoDiffXd, of any shape."""
+    """Return the values of an array of floats or AutoDiffXd of any shape, without derivatives."""
     array = np.asarray(values)
     if array.dtype != object:
         return array.astype(float)
@@ -165,23 +165,23 @@ def plain(values: Any) -> Array:
 
 
 def _seed(z: Any) -> Array | None:
-    """(n, m) the derivatives that `z` (n,) carries; None where they are the identity, as solvers seed it."""
-    seeds = (entry.derivatives() for entry in z)  # one at a time: all of them are a matrix of n^2 numbers
+    """Return the derivatives (n, m) in `z` (n,), or None if they are the identity, as solvers seed them."""
+    seeds = (entry.derivatives() for entry in z)  # lazy, since all derivatives together are a matrix of n^2 numbers
     is_unit = (len(row) == len(z) and row[i] == 1.0 and np.count_nonzero(row) == 1 for i, row in enumerate(seeds))
     return None if all(is_unit) else np.asarray(ExtractGradient(z.reshape(-1, 1)))
 
 
 def chain(value: float, gradient: Array, z: Any) -> AutoDiffXd:
-    """The AutoDiffXd of a scalar of `z` (n,) whose value and gradient (n,) by z are known."""
+    """Return the AutoDiffXd of a scalar function of `z` (n,) from its value and its gradient (n,) with respect to z."""
     seed = _seed(z)
     return AutoDiffXd(value, gradient if seed is None else gradient @ seed)
 
 
 def chain_rows(values: Array, jacobian: Array, z: Any) -> Any:
-    """(m,) AutoDiffXd of a function of `z` (n,) whose values (m,) and Jacobian (m, n) by z are known.
+    """Return AutoDiffXd (m,) of a function of `z` (n,) from its values (m,) and its Jacobian (m, n) in z.
 
-    Solvers seed z with the identity, and the product with it is left out: for it BLAS starts threads, which on a busy
-    machine costs more than all the rest.
+    Solvers seed z with the identity. The product with the identity is skipped, because BLAS would start threads for it,
+    which on a busy machine takes longer than the rest of the function.
     """
     seed = _seed(z)
     gradient = jacobian if seed is None else jacobian @ seed
@@ -189,10 +189,10 @@ def chain_rows(values: Array, jacobian: Array, z: Any) -> Any:
 
 
 class TracedArray(ArrayBox):  # type: ignore[misc]  # autograd has no types
-    """autograd's array, on which functions of `numpy` act as those of `autograd.numpy` do.
+    """An autograd array on which functions of `numpy` act like those of `autograd.numpy`.
 
-    autograd passes on NumPy's elementwise functions; this adds the others, and refuses assignments, after which the
-    result would be that of another function.
+    autograd already handles NumPy's elementwise functions. This class adds the other functions. It refuses assignments,
+    because autograd would then differentiate a different function.
     """
 
     __slots__ = ()
@@ -203,11 +203,11 @@ class TracedArray(ArrayBox):  # type: ignore[misc]  # autograd has no types
         return NotImplemented if known is None else known(*args, **options)
 
     def dot(self, other: Any) -> Any:
-        """As `numpy.dot`."""
+        """Return the product, as `numpy.dot` does."""
         return autograd.numpy.dot(self, other)
 
     def copy(self) -> Any:
-        """Itself, as nothing can be assigned to it."""
+        """Return the array itself, since it is immutable."""
         return self
 
     def _refuse(self, *_: Any) -> NoReturn:
@@ -221,14 +221,14 @@ for _kind in [kind for kind, box in ArrayBox.type_mappings.items() if box is Arr
 
 
 def traced_gradient(f: Callable[..., Any], arrays: Sequence[Array]) -> tuple[float, list[Array]]:
-    """The scalar f(*arrays) and its gradient by each of the arrays.
+    """Return the scalar f(*arrays) and its gradients with respect to each array.
 
-    Raises UntraceableError, or what autograd, NumPy or `f` itself raises, where autograd cannot follow `f`.
+    Raises UntraceableError, or an error of autograd, NumPy or `f`, if autograd cannot differentiate `f`.
     """
 
     def traced(*variables: Any) -> Any:
         result = f(*variables)
-        if isinstance(result, np.ndarray):  # of one traced number
+        if isinstance(result, np.ndarray):  # a 0-d array with one traced number
             result = result.item()
         if not isinstance(result, TracedArray):
             raise UntraceableError("the result does not depend on the differentiated arguments")

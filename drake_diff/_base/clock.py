@@ -1,6 +1,6 @@
-"""Until when what runs here may go on: a limit, or a signal, that holds in whatever is called, however deep.
+"""Time limits and signals that interrupt nested computations.
 
-Ctrl-C, SIGTERM and SIGHUP alike: a search notes them and ends with its best plan, all else is interrupted.
+A search that receives Ctrl-C, SIGTERM or SIGHUP ends with its best plan. Other computations are interrupted.
 """
 
 import os
@@ -16,36 +16,36 @@ from traceback import walk_stack
 from types import FrameType
 from typing import Any
 
-LONGEST_PIECE = 0.4  # of what the pieces before it took, as CasADi's take on chains of 20, 50 and 100 joints
-DEADLINE: ContextVar[float | None] = ContextVar("DEADLINE", default=None)  # of `now`
+LONGEST_PIECE = 0.4  # of the time of the pieces before it, measured for CasADi on chains of 20, 50 and 100 joints
+DEADLINE: ContextVar[float | None] = ContextVar("DEADLINE", default=None)  # a time of `now`
 STOP: ContextVar[threading.Event | None] = ContextVar("STOP", default=None)
 _uncounted = 0.0  # [s]
 INTERRUPTIONS: list[int] = []  # the signals that `interrupt` handled
 
 
 def uncounted(seconds: float = 0.0) -> float:
-    """[s] that no limit counts, in all: what Numba compiled, once on a machine. `seconds` are added to it."""
+    """Return the total time [s] that no limit counts (Numba compilation) after adding `seconds` to it."""
     global _uncounted
     _uncounted += seconds
     return _uncounted
 
 
 def now() -> float:
-    """[s] of the clock that limits go by: the monotonic one, which stands still while Numba compiles."""
+    """Return the time [s] of the monotonic clock without the time that Numba spent compiling; limits use this clock."""
     return time.monotonic() - _uncounted
 
 
 class TimeIsUpError(Exception):
-    """The time that was given is over; whoever gave it tells what was not done."""
+    """The time limit has passed; the code that set the limit reports the unfinished work."""
 
 
 class StoppedError(TimeIsUpError):
-    """A signal ends what runs here, as a limit would."""
+    """A signal ends the computation in the same way as a time limit."""
 
 
 @contextmanager
 def until(deadline: float) -> Iterator[None]:
-    """`check_time` raises after `deadline`, a time of `now()`, or that of a block around this one."""
+    """Make `check_time` raise after `deadline`, a time of `now()`, or after an earlier deadline of an outer block."""
     outer = DEADLINE.get()
     token = DEADLINE.set(deadline if outer is None else min(outer, deadline))
     try:
@@ -56,7 +56,7 @@ def until(deadline: float) -> Iterator[None]:
 
 @contextmanager
 def until_set(flag: threading.Event) -> Iterator[None]:
-    """`check_time` raises once `flag` is set, as a signal does, in the place of the flag of a block around this one."""
+    """Make `check_time` raise once `flag` is set, as a signal does; `flag` replaces the flag of an outer block."""
     token = STOP.set(flag)
     try:
         yield
@@ -65,7 +65,7 @@ def until_set(flag: threading.Event) -> Iterator[None]:
 
 
 def check_time(ahead: float = 0.0) -> None:
-    """Raise TimeIsUpError where the time is over, or will be before what comes next, that takes `ahead` [s]."""
+    """Raise TimeIsUpError if the time is up, or will be up before the next operation, which takes `ahead` [s]."""
     stop, deadline = STOP.get(), DEADLINE.get()
     if stop is not None and stop.is_set():
         raise StoppedError("interrupted")
@@ -74,20 +74,20 @@ def check_time(ahead: float = 0.0) -> None:
 
 
 class Pace:
-    """Looks at the clock between pieces of work none of which can be interrupted, such as a call of CasADi."""
+    """A check of the clock between pieces of work that cannot be interrupted, such as calls of CasADi."""
 
     def __init__(self) -> None:
         self.start = now()
 
     def go_on(self) -> None:
-        """Raise TimeIsUpError where the next piece may end too late: see LONGEST_PIECE."""
+        """Raise TimeIsUpError if the next piece may end too late; see LONGEST_PIECE."""
         check_time(ahead=LONGEST_PIECE * (now() - self.start))
 
 
-INTERRUPTED = 130  # the exit status, as shells have it after Ctrl-C
+INTERRUPTED = 130  # the exit status of shells after Ctrl-C
 ALIKE = (signal.SIGTERM, signal.SIGHUP)
-AGAIN = 0.05  # [s] after which a signal that came amid an import is sent again
-# Called by C or by the garbage collector, which print what is raised in them and go on.
+AGAIN = 0.05  # [s] delay before a signal that arrives during an import is sent again
+# C code or the garbage collector calls these functions; both print an exception and continue.
 PRINTS_WHAT_IS_RAISED = {
     *("__del__", "on_disposal", "_object_compiled_hook", "_object_getbuffer_hook"),
     *("_raw_object_cache_notify", "_raw_object_cache_getbuffer"),
@@ -95,9 +95,9 @@ PRINTS_WHAT_IS_RAISED = {
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
-    """A handler that does what Python does at Ctrl-C, once no extension is being imported.
+    """Raise KeyboardInterrupt for a signal, as Python does at Ctrl-C, or later if an extension is being imported.
 
-    Extensions in C++ print what is raised while they are imported and go on, or abort.
+    An exception during the import of a C++ extension is printed and ignored, or aborts the process.
     """
     INTERRUPTIONS.append(number)
     _hush(number)
@@ -110,15 +110,15 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _is_imported_in(frame: FrameType) -> bool:
-    """Whether an extension is being imported, or the innermost function is of the import system."""
+    """Return whether an extension is being imported, or the innermost frame belongs to the import system."""
     loaders = (isinstance(caller.f_locals.get("self"), ExtensionFileLoader) for caller, _ in walk_stack(frame))
     return frame.f_globals.get("__name__") == "importlib._bootstrap" or any(loaders)
 
 
 class _Flag(threading.Event):
-    """A handler that notes that a signal came; where `check_time` would end what runs, it ends a compilation at once.
+    """A signal handler that sets a flag for `check_time`, and interrupts a Numba compilation immediately.
 
-    Numba compiles for seconds, once on a machine, and looks at no flag; what is half compiled is thrown away.
+    Numba compiles for seconds, once per machine, and checks no flag. A partial compilation is discarded.
     """
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
@@ -144,8 +144,8 @@ def _handled(handler: Any, numbers: Iterable[int]) -> Iterator[None]:
 
 
 def interrupt_alike() -> None:
-    """From here on `interrupt` handles Ctrl-C, and SIGTERM and SIGHUP where they would have ended the process."""
-    INTERRUPTIONS.clear()  # of an earlier command in this process, such as a notebook or a suite of tests
+    """Make `interrupt` handle Ctrl-C, and also SIGTERM and SIGHUP if they have their default handlers."""
+    INTERRUPTIONS.clear()  # signals of an earlier command in this process, such as a notebook or a test suite
     for number in (signal.SIGINT, *ALIKE):
         if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
             signal.signal(number, interrupt)
@@ -153,9 +153,9 @@ def interrupt_alike() -> None:
 
 @contextmanager
 def noted_interrupts() -> Iterator[threading.Event]:
-    """An event that these signals set, in the main thread, until the block ends; that of a block around it, if any.
+    """Yield an event that these signals set until the block ends, or the event of an outer block; main thread only.
 
-    What a user's own handler does, and what is ignored, as after nohup, stays so for SIGTERM and SIGHUP.
+    For SIGTERM and SIGHUP, a user's own handler and an ignored signal (as after nohup) stay unchanged.
     """
     flag, outer = _Flag(), signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread():
@@ -170,7 +170,7 @@ def noted_interrupts() -> Iterator[threading.Event]:
 
 @contextmanager
 def held_interrupts() -> Iterator[None]:
-    """What comes while the block runs does what it does when that has ended: what is short and must be whole."""
+    """Delay signals until the block ends, for short operations that must not be interrupted."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -185,16 +185,16 @@ def held_interrupts() -> Iterator[None]:
 
 
 def _hush(number: int) -> None:
-    """A terminal that has hung up takes no more words: they go nowhere, where else each would be an error."""
+    """Redirect the standard streams to os.devnull after SIGHUP, since writing to a closed terminal is an error."""
     if number != signal.SIGHUP:
         return
     for stream in (0, 1, 2):
-        if stat.S_ISCHR(os.fstat(stream).st_mode):  # isatty says no of one that has hung up
+        if stat.S_ISCHR(os.fstat(stream).st_mode):  # isatty returns False after a terminal hangs up
             discard(stream)
 
 
 def discard(descriptor: int) -> None:
-    """Let a file descriptor lead to os.devnull: what is written to it goes nowhere."""
+    """Redirect a file descriptor to os.devnull."""
     nowhere = os.open(os.devnull, os.O_RDWR)
     os.dup2(nowhere, descriptor)
     os.close(nowhere)

@@ -1,8 +1,8 @@
-"""Functions that Numba compiles when a machine first calls them; from then on the result is read from a cache.
+"""Functions that Numba compiles on the first call on a machine and afterwards loads from a cache.
 
-The cache is in `__pycache__` beside the module. Where that cannot be written, as in a read-only installation, it is the
-user's: the folder `NUMBA_CACHE_DIR`, or Numba's own in the home. Where there is none either, each process compiles.
-A compilation that takes long enough to be noticed is a line of the logger "drake_diff".
+The cache is in `__pycache__` next to the module. If that folder is not writable, as in a read-only installation, the
+cache is in `NUMBA_CACHE_DIR` or in Numba's folder in the home directory. If there is no writable folder, each process
+compiles. A compilation longer than `NOTICED` is logged to the logger "drake_diff".
 """
 
 import logging
@@ -25,7 +25,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(function: Function) -> Function:
-    """The function, of numbers and arrays alone, compiled; a division by zero gives what NumPy's does."""
+    """Compile a function of numbers and arrays; a division by zero gives the result of NumPy."""
     njit = import_numba().njit
     time_compilations()
     try:
@@ -37,7 +37,7 @@ def compiled(function: Function) -> Function:
 
 
 def ignore_unreadable_index(dispatcher: Any) -> None:
-    """Compile anew where the cache's index names a class of an older version: Numba would raise AttributeError."""
+    """Compile again if the cache's index names a class of an older version; Numba would raise AttributeError."""
     cached = dispatcher._cache._cache_file
     load_index = cached._load_index
 
@@ -51,14 +51,14 @@ def ignore_unreadable_index(dispatcher: Any) -> None:
 
 
 def inner(function: Function) -> Function:
-    """As `compiled`, of a function that compiled functions alone call: a shell for Python takes longest to compile."""
+    """Compile a function that only compiled functions call; skip the Python wrapper, whose compilation is slowest."""
     return cast(
         Function, import_numba().njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
     )
 
 
 def import_numba() -> Any:
-    """Numba, without the settings that it reads from the working directory: they say where it loads code from."""
+    """Import Numba without its settings file in the working directory, which may set where Numba loads code from."""
     if "numba" not in sys.modules:
         if os.path.lexists(NUMBA_SETTINGS):
             raise InputError(
@@ -68,7 +68,7 @@ def import_numba() -> Any:
             )
         from numba.core import config
 
-        config._config_fname = os.devnull  # it is read before each compilation
+        config._config_fname = os.devnull  # Numba reads the file before each compilation
     import numba
 
     return numba
@@ -76,7 +76,7 @@ def import_numba() -> Any:
 
 @cache
 def time_compilations() -> None:
-    """From now on no limit of time counts what Numba compiles, and the log says how long that takes."""
+    """Exclude Numba's compilation from all time limits from now on, and log its duration."""
     from numba.core import event
 
     class Timer(event.Listener):  # type: ignore[misc]  # Numba has no types
@@ -86,7 +86,7 @@ def time_compilations() -> None:
         def on_start(self, _: Any) -> None:
             if self.depth == 0:
                 self.start = time.monotonic()
-                self.alarm, _ = signal.setitimer(signal.ITIMER_REAL, 0)  # of a process with a limit, see `sandbox`
+                self.alarm, _ = signal.setitimer(signal.ITIMER_REAL, 0)  # a time limit of the process, see `sandbox`
             self.depth += 1
 
         def on_end(self, given: Any) -> None:
@@ -101,11 +101,11 @@ def time_compilations() -> None:
 
 
 def report_compilation(name: str, seconds: float) -> None:
-    """Log that a function was compiled, where that took long enough to be noticed."""
+    """Log the compilation of a function if it took longer than `NOTICED`."""
     if seconds >= NOTICED:
         LOGGER.warning("Numba compiled %s in %.1f s, once on this machine", name, seconds)
 
 
 def kernel(module: str) -> Any:
-    """A module of compiled functions, loaded when it is first needed."""
+    """Return a module of compiled functions, and import it on first use."""
     return sys.modules.get(module) or import_module(module)

@@ -1,4 +1,4 @@
-"""Difference quotients of any function: central, one-sided at many step sizes, and the best of a sweep."""
+"""Difference quotients of a function: central differences, one-sided differences at many steps, and the best step."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,18 +11,18 @@ Function = Callable[[Array], Array]
 Many = Callable[[Array], Array]  # displacements (K, n) -> values (K, m)
 Difference = Callable[[Array, Array], Array]
 
-RATIO_SQUARED = 10.0  # of neighbouring steps of a sweep: half a decade
+RATIO_SQUARED = 10.0  # squared ratio of neighbouring steps, which are half a decade apart
 SWEEP = tuple(10.0 ** (-k / 2) for k in range(4, 12))  # 1e-2 ... 3e-6
-ROUNDING = 1e-15  # of a value in double precision: a few units in the last place
+ROUNDING = 1e-15  # relative rounding error in double precision: a few units in the last place
 
 
 def central_differences(
     f: Function, size: int, step: float, *, at_zero: Array | None = None, minus: Difference = np.subtract
 ) -> Array:
-    """(m, n): (f(h e) - f(-h e)) / 2h of `f`: R^size -> R^m around 0, h being `step` and e each unit vector.
+    """Compute (f(h e) - f(-h e)) / 2h (m, n) of `f`: R^size -> R^m, with h = `step` and the unit vectors e.
 
-    `f` takes the displacement, so that the caller decides how it is added; `minus(a, b)` subtracts two values of `f`,
-    always from f(0), so that it may be a chart of a curved space there.
+    `f` takes a displacement, so the caller decides how to add it. `minus(a, b)` subtracts two values of `f`. Its second
+    argument is always f(0), so it may be a chart of a curved space at f(0).
     """
     centre = f(np.zeros(size)) if at_zero is None else at_zero
     columns = [(minus(f(step * e), centre) - minus(f(-step * e), centre)) / (2 * step) for e in np.eye(size)]
@@ -31,7 +31,7 @@ def central_differences(
 
 @dataclass(frozen=True)
 class Sweep:
-    """One-sided difference quotients (s, m, n) of several step sizes around `centre`, the value (m,) there."""
+    """One-sided difference quotients (s, m, n) for several step sizes, and the function's value `centre` (m,)."""
 
     centre: Array
     forward: Array
@@ -39,7 +39,7 @@ class Sweep:
 
 
 def sweep_of(f: Many, size: int, steps: Sequence[float], *, minus: Difference = np.subtract) -> Sweep:
-    """One-sided differences of `f`: (K, size) -> (K, m) around 0, from one call of `f` with all displacements."""
+    """Compute one-sided differences of `f`: (K, size) -> (K, m) around 0, in one call of `f` with all displacements."""
     h = np.array(steps)[:, None, None]
     sides = np.stack([h * np.eye(size), -h * np.eye(size)])  # (2, s, n, n)
     values = np.asarray(f(np.vstack([np.zeros((1, size)), sides.reshape(-1, size)])), dtype=float)
@@ -51,20 +51,20 @@ def sweep_of(f: Many, size: int, steps: Sequence[float], *, minus: Difference = 
 
 
 def one_by_one(f: Function) -> Many:
-    """`f` of a displacement as a function of many."""
+    """Turn a function `f` of one displacement into a function of many."""
     return lambda displacements: np.array([f(d) for d in displacements])
 
 
 def richardson(central: Array) -> Array:
-    """(s - 1, m, n) of central quotients (s, m, n) half a decade apart: with an error of order h^4, not h^2."""
+    """Extrapolate central quotients (s, m, n), half a decade apart, to (s - 1, m, n) with an error of O(h^4)."""
     return central[1:] + (central[1:] - central[:-1]) / (RATIO_SQUARED - 1)
 
 
 def plateau(f: Many, size: int) -> Array:
-    """(m, n) the derivative of `f` at 0, by the step sizes at which its difference quotients depend least on the step.
+    """Return the derivative (m, n) of `f` at 0 from the step sizes at which the quotients depend least on the step.
 
-    Each entry is judged on its own, as no one step suits all: a solver leaves small changes unsolved, and large ones
-    change the contact. It is the middle one of the three neighbouring Richardson values that lie closest together.
+    The step is chosen for each entry separately: a solver may ignore small changes, while large changes alter the
+    contact. The result is the middle one of the three neighbouring Richardson values that are closest to one another.
     """
     sweep = sweep_of(f, size, SWEEP)
     values = richardson((sweep.forward + sweep.backward) / 2)

@@ -1,10 +1,10 @@
-"""All that is written to a disk: files and folders, whole or not at all, moved into place, and locks.
+"""Disk access: atomic writes of files and folders, locks, and reading with limits.
 
-What is written is on the disk before it is moved: a power cut leaves the old or the new, as the death of the process.
-Where the disk refuses, a WriteError says what could not be done to which file. `record.directory` writes whole folders.
+Data is synchronized to the disk before it is moved into place. A power cut or the death of the process therefore leaves
+either the old or the new file. A failed write raises WriteError. `record.directory` writes whole folders.
 
-Files that a stranger made are read with limits: plain files alone, never through a link, and no more than a limit of
-bytes. What a file states as its size (an archive's index, an array's header) is checked before anything is unpacked.
+Untrusted files are read with limits: only regular files, no links, and at most a given number of bytes. The sizes that
+a file declares (an archive's index, an array's header) are checked before anything is unpacked.
 """
 
 import ctypes
@@ -31,13 +31,13 @@ import numpy as np
 from drake_diff._base.arrays import Array, frozen
 from drake_diff.exceptions import ArtifactError, WriteError
 
-AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux' renameat2, which Python's os has not
+AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux' renameat2, which is not in Python's os
 CANNOT_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.EXDEV, errno.EOPNOTSUPP)
 
 
 @contextmanager
 def doing(what: str, path: Path) -> Iterator[None]:
-    """A WriteError, "cannot {what} {path}", where the disk refuses."""
+    """Turn an OSError in the block into a WriteError, "cannot {what} {path}"."""
     try:
         yield
     except WriteError:
@@ -47,13 +47,13 @@ def doing(what: str, path: Path) -> Iterator[None]:
 
 
 class _WrittenThrough(BufferedIOBase):
-    """Hands every write to the operating system at once: what was written survives the death of the process."""
+    """A file whose writes go to the operating system at once, so that they survive the death of the process."""
 
     def __init__(self, path: Path):
         self.path, self.file = path, FileIO(path, "wb")
 
     def write(self, data: Any) -> int:
-        """Write all of `data`; the system may take less at a time."""
+        """Write all of `data`, in several calls if the system accepts less at a time."""
         whole = memoryview(data).cast("B")
         left = whole
         with doing("write", self.path):
@@ -62,24 +62,24 @@ class _WrittenThrough(BufferedIOBase):
         return len(whole)
 
     def tell(self) -> int:
-        """How many bytes were written."""
+        """Return the number of written bytes."""
         return self.file.tell()
 
     def fileno(self) -> int:
-        """The number that the system knows it by."""
+        """Return the file descriptor."""
         return self.file.fileno()
 
     def close(self) -> None:
-        """Nothing is left to write."""
+        """Close the file; there is no buffer to flush."""
         self.file.close()
         super().close()
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[BufferedIOBase]:
-    """A file to write to, beside `path` as `path`.partial, moved into place when all went well and removed when not.
+    """Yield a file `path`.partial to write to, which is moved to `path` on success and removed on failure.
 
-    A process that is killed leaves the partial file, with all that was written.
+    A process that is killed leaves the partial file with all that it wrote.
     """
     partial = path.with_name(path.name + ".partial")
     try:
@@ -91,19 +91,19 @@ def whole_file(path: Path) -> Iterator[BufferedIOBase]:
                 os.fsync(file.fileno())
         move(partial, path)
     except BaseException:
-        with suppress(OSError):  # what cannot be removed is named as partial
+        with suppress(OSError):  # a file that cannot be removed has .partial in its name
             partial.unlink(missing_ok=True)
         raise
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write `data` aside, onto the disk, and move it into place: `path` is never half written."""
+    """Write `data` to a temporary file and move it to `path`, so that `path` is never incomplete."""
     with whole_file(path) as file:
         file.write(data)
 
 
 def make_folder(path: Path) -> None:
-    """Make the folder `path`, and those that it is to be in."""
+    """Make the folder `path` and its missing parents."""
     with doing("make", path):
         for folder in (path, *path.parents):
             if folder.is_dir():
@@ -115,7 +115,7 @@ def make_folder(path: Path) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Put the names in the folder `path` onto the disk."""
+    """Synchronize the entries of the folder `path` to the disk."""
     with doing("write", path):
         number = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
         try:
@@ -125,13 +125,13 @@ def sync_folder(path: Path) -> None:
 
 
 def move(source: Path, target: Path) -> None:
-    """Give the file or folder `source` the name `target`: in place of the file, or the empty folder, that has it."""
+    """Rename the file or folder `source` to `target`, replacing a file or an empty folder of that name."""
     with doing("write", target):
         os.replace(source, target)
 
 
 def exchange(first: Path, other: Path) -> bool:
-    """Give each of two folders the other's name at once; False, and nothing is done, where the file system cannot."""
+    """Swap the names of two folders atomically, or return False if the file system does not support it."""
     function = _renameat2()
     with doing("write", other):
         if function is None:
@@ -146,7 +146,7 @@ def exchange(first: Path, other: Path) -> bool:
 
 @cache
 def _renameat2() -> Any:
-    """The function of the C library, None where it has none (macOS, musl before 1.2.6)."""
+    """Return the function of the C library, or None if it is missing (macOS, musl before 1.2.6)."""
     function = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if function is not None:
         function.argtypes = (ctypes.c_int, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_uint)
@@ -154,22 +154,22 @@ def _renameat2() -> Any:
 
 
 def take_mode(folder: Path, other: Path) -> None:
-    """Give `folder` the permissions of another."""
+    """Give `folder` the permissions of the folder `other`."""
     with doing("write", folder):
         folder.chmod(stat.S_IMODE(other.stat().st_mode))
 
 
 def remove_folder(path: Path) -> None:
-    """Remove the folder `path` with all that is in it."""
+    """Remove the folder `path` with its contents."""
     with doing("remove", path):
         shutil.rmtree(path)
 
 
 @contextmanager
 def locked(path: Path) -> Iterator[bool]:
-    """Whether the lock file `path` could be had, which nobody else has then until the block ends, or the process.
+    """Yield whether this process got the lock on the file `path`, which it holds until the block or the process ends.
 
-    However the process ends, nothing stays locked: a file that a killed one leaves is taken over by the next.
+    The end of a process always releases its lock. The next process takes over the file that a killed process left.
     """
     number = _open_locked(path)
     if number is None:
@@ -178,7 +178,7 @@ def locked(path: Path) -> Iterator[bool]:
     try:
         yield True
     finally:
-        with suppress(OSError):  # nobody waits for a lock, and a file that stays is no lock
+        with suppress(OSError):  # no process waits for a lock, and a remaining file does not lock
             os.unlink(path)
         os.close(number)
 
@@ -195,7 +195,7 @@ def _open_locked(path: Path) -> int | None:
                 os.close(number)
                 return None
             except FileNotFoundError:
-                pass  # who had it removed it between our open and our lock: once more, with a new one
+                pass  # the previous owner removed the file between our open and our lock, so try again
             except BaseException:
                 os.close(number)
                 raise
@@ -203,23 +203,23 @@ def _open_locked(path: Path) -> int | None:
 
 
 MIB, GIB = 2**20, 2**30
-MOST_TEXT = 32 * MIB  # of a record
-MOST_VALUES = 1_000_000  # in a record: as objects they take some 100 times their text
-DEEPEST = 64  # lists and objects of a record, one inside another: ours has 10
-MOST_ARRAYS = 256 * MIB  # of an .npz file, unpacked: a million steps of 30 numbers
+MOST_TEXT = 32 * MIB  # of a JSON record
+MOST_VALUES = 1_000_000  # in a record; as Python objects they take about 100 times the memory of their text
+DEEPEST = 64  # nesting depth of a record; the package's own records have 10
+MOST_ARRAYS = 256 * MIB  # of an unpacked .npz file: a million steps of 30 numbers
 MOST_MEMBERS = 100  # of an .npz file
 MOST_FILE = GIB  # of any file
-MOST_FILES = 10_000  # in a directory and those in it
-MOST_READ = 4 * GIB  # of all these together: holes in a file take no room, and as long to read as anything
+MOST_FILES = 10_000  # in a directory and its subdirectories
+MOST_READ = 4 * GIB  # of all these files together; a sparse file occupies no disk space but takes as long to read
 SURROGATE = re.compile("[\ud800-\udfff]")
 
 
 @contextmanager
 def plain_file(path: Path, most: int = MOST_FILE, *, links: bool = False) -> Iterator[io.BufferedReader]:
-    """The file at `path`, opened; ArtifactError where it is no plain file, larger than `most` bytes, or not readable.
+    """Open the file at `path`; raise ArtifactError if it is not a regular file, over `most` bytes, or unreadable.
 
-    A link is followed with `links` alone: where the user named the file, and not a record. A FIFO or a device is not
-    waited for.
+    Links are followed only with `links`, for a path that the user gave and not a record. FIFOs and devices never block
+    the call.
     """
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
     try:
@@ -231,7 +231,7 @@ def plain_file(path: Path, most: int = MOST_FILE, *, links: bool = False) -> Ite
         raise ArtifactError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     with os.fdopen(number, "rb") as file:
         state = os.fstat(number)
-        if not stat.S_ISREG(state.st_mode):  # exchanged since it was looked at
+        if not stat.S_ISREG(state.st_mode):  # replaced after the first check
             raise ArtifactError(f"{path}: expected a plain file, got {_kind(state.st_mode)}")
         if state.st_size > most:
             raise ArtifactError(f"{path}: expected at most {most} bytes, got {state.st_size}")
@@ -244,17 +244,17 @@ def _kind(mode: int) -> str:
 
 
 def read_plain(path: Path, most: int = MOST_FILE, *, links: bool = False) -> bytes:
-    """The bytes of a plain file; see `plain_file`."""
+    """Return the bytes of a regular file; see `plain_file`."""
     with plain_file(path, most, links=links) as file:
         size = os.fstat(file.fileno()).st_size
-        data = file.read(size + 1)  # Python takes the memory for all that it is asked for
+        data = file.read(size + 1)  # Python allocates the requested size
     if len(data) != size:
         raise ArtifactError(f"{path}: it was changed while it was read")
     return data
 
 
 def sha256_of(path: Path, most: int = MOST_FILE) -> tuple[int, str]:
-    """How many bytes a plain file has, and their hash; never more than a piece of it in memory."""
+    """Return the size in bytes and the hash of a regular file, which is read in pieces to limit memory."""
     digest, count = sha256(), 0
     with plain_file(path, most) as file:
         while piece := file.read(MIB):
@@ -266,9 +266,9 @@ def sha256_of(path: Path, most: int = MOST_FILE) -> tuple[int, str]:
 
 
 def files_in(folder: Path) -> dict[str, os.DirEntry[str]]:
-    """All that is below a folder and no folder, by its path in it; no link is followed.
+    """Return all entries below a folder that are not folders, by their paths in it, without following links.
 
-    ArtifactError where there are more than `MOST_FILES`, or a folder cannot be read.
+    Raises ArtifactError if there are more than `MOST_FILES`, or if a folder cannot be read.
     """
     entries_by_path: dict[str, os.DirEntry[str]] = {}
     waiting, seen = [(folder, "")], 0
@@ -290,7 +290,7 @@ def files_in(folder: Path) -> dict[str, os.DirEntry[str]]:
 
 
 def json_of(data: bytes) -> Any:
-    """The value of a JSON text in UTF-8; ValueError where it is none, or too large, too deep or no numbers in it."""
+    """Parse JSON text in UTF-8; raise ValueError if it is invalid, too large, too deep, or has non-finite numbers."""
     values = sum(data.count(mark) for mark in (b",", b"[", b"{"))
     if values > MOST_VALUES:
         raise ValueError(f"expected at most {MOST_VALUES} values, got more")
@@ -327,13 +327,13 @@ def _finite(text: str) -> float:
 
 
 def arrays_of(path: Path, most: int = MOST_ARRAYS) -> dict[str, Array]:
-    """The arrays of float64 in an .npz file, read-only, by name. ArtifactError where it is none, or unpacks to more.
+    """Return the float64 arrays of an .npz file, read-only, by name; raise ArtifactError if it is invalid or too large.
 
-    The archive's index and every array's header are read first, and nothing is unpacked that they do not allow.
+    The archive's index and every array's header are read first, and only the declared sizes are unpacked.
     """
     data = read_plain(path, most)
     try:
-        if data.count(b"PK\x01\x02") > MOST_MEMBERS:  # what zipfile makes of a million takes 1 GB
+        if data.count(b"PK\x01\x02") > MOST_MEMBERS:  # zipfile takes 1 GB of memory for a million members
             raise ValueError(f"expected at most {MOST_MEMBERS} arrays, got more")
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = archive.infolist()
@@ -345,7 +345,7 @@ def arrays_of(path: Path, most: int = MOST_ARRAYS) -> dict[str, Array]:
             return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
     except ArtifactError:
         raise
-    except Exception as error:  # zipfile and NumPy fail in many ways on what is no such file
+    except Exception as error:  # zipfile and NumPy raise many errors for invalid files
         raise ArtifactError(f"{path} is no file of arrays: {type(error).__name__}: {error}") from error
 
 
@@ -353,7 +353,7 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Array:
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # the others unpack without a limit
         raise ValueError(f"{member.filename}: its compression method is not one of NumPy's")
     with archive.open(member) as packed:
-        data = packed.read(member.file_size + 1)  # read() alone would unpack what the index does not tell
+        data = packed.read(member.file_size + 1)  # read() alone would unpack more than the index declares
     file = io.BytesIO(data)
     version = np.lib.format.read_magic(file)
     read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)

@@ -1,7 +1,7 @@
-"""Run a function in one child process with limits of time and memory: its crash or overrun is reported, not shared.
+"""Run a function in a child process with limits of time and memory, and report a crash or an exceeded limit.
 
-The child is a fresh Python process; arguments and value travel as JSON. It has the rights of the user who started it:
-see docs/verification.md for what that does not protect against.
+The child is a new Python process; arguments and results are passed as JSON. It has the rights of the user who started
+it. docs/verification.md lists the risks that remain.
 """
 
 import faulthandler
@@ -22,19 +22,19 @@ from typing import Any, NamedTuple
 from drake_diff.exceptions import ArtifactError, DrakeDiffError
 
 GIB = 2**30
-LARGEST_ANSWER = 64 * 2**20  # bytes, also of any other file that the child writes
-START_UP = 180.0  # [s] in which Python has imported Drake and Numba has compiled, on a busy machine too
-LAST_WORDS = 300  # characters of what a process wrote before it ended
+LARGEST_ANSWER = 64 * 2**20  # bytes, also for any other file that the child writes
+START_UP = 180.0  # [s] for importing Drake and compiling with Numba, even on a busy machine
+LAST_WORDS = 300  # maximum number of characters reported from the end of a process's output
 COMMAND = "from drake_diff._base.sandbox import serve; serve()"
 REQUEST, ANSWER, OUTPUT = "request.json", "answer.json", "output.txt"
-USED = "/proc/self/statm"  # in pages; the sixth number is that of data and stack
-NEARLY = 0.9  # of the memory that a process may have
-NO_MEMORY = 99  # the exit status of a child that got none
+USED = "/proc/self/statm"  # in pages; the sixth number is the size of data and stack
+NEARLY = 0.9  # of a process's memory limit
+NO_MEMORY = 99  # the exit status of a child whose memory allocation failed
 MOST_TAKEN = GIB  # bytes that reading one file may take
 
 
 class CallOutcome(NamedTuple):
-    """The value that a call returned, or the `error` why there is none, and whether that is a limit it reached."""
+    """The value that a call returned, or an `error` message, and whether the error is an exceeded limit."""
 
     value: Any = None
     error: str = ""
@@ -45,10 +45,10 @@ def call(function: str, arguments: Mapping[str, Any], seconds: float = 60.0, mem
     """Call `function`, "module:name", in a child process.
 
     Args:
-        function: The module is imported before the limits hold.
-        arguments: By keyword, as JSON has them.
-        seconds: How long the call may take, without what Numba compiles.
-        memory: How much memory the child may have, in GiB.
+        function: The name; its module is imported before the limits apply.
+        arguments: The keyword arguments, as JSON values.
+        seconds: The time limit of the call, not counting Numba's compilation.
+        memory: The memory limit of the child in GiB.
     """
     request = {"function": function, "arguments": dict(arguments), "seconds": seconds, "memory": int(memory * GIB)}
     environment = {
@@ -73,14 +73,14 @@ def call(function: str, arguments: Mapping[str, Any], seconds: float = 60.0, mem
             except subprocess.TimeoutExpired:
                 pass
             finally:
-                with suppress(OSError):  # the child, and whatever it started
+                with suppress(OSError):  # kill the child and the processes that it started
                     os.killpg(child.pid, signal.SIGKILL)
                 status = child.wait()
         return _outcome(folder, status, request)
 
 
 def _outcome(folder: Path, status: int, request: Mapping[str, Any]) -> CallOutcome:
-    """What came of a child that has ended with `status`."""
+    """Return the outcome of a child process that ended with `status`."""
     answer = folder / ANSWER
     if status == 0 and answer.is_file():
         return CallOutcome(*json.loads(answer.read_bytes()))
@@ -96,15 +96,15 @@ def _outcome(folder: Path, status: int, request: Mapping[str, Any]) -> CallOutco
 
 
 def serve() -> None:
-    """In the child: call the function of request.json under its limits, and write answer.json."""
+    """Call the function of request.json under its limits and write answer.json; runs in the child process."""
     request = json.loads(Path(REQUEST).read_text())
     module, _, name = request["function"].partition(":")
     function = getattr(import_module(module), name)
     _limit(resource.RLIMIT_DATA, request["memory"])
     _limit(resource.RLIMIT_CORE, 0)
     _limit(resource.RLIMIT_FSIZE, LARGEST_ANSWER)
-    signal.signal(signal.SIGXFSZ, signal.SIG_DFL)  # Python ignores it, and a write fails
-    signal.setitimer(signal.ITIMER_REAL, request["seconds"])  # ends the child, whatever it does, also without a parent
+    signal.signal(signal.SIGXFSZ, signal.SIG_DFL)  # Python ignores it by default, so that a write would only fail
+    signal.setitimer(signal.ITIMER_REAL, request["seconds"])  # ends the child in any state, even without its parent
     try:
         answer = CallOutcome(function(**request["arguments"]))
     except MemoryError:
@@ -128,10 +128,10 @@ def _last_line(output: bytes) -> str:
 
 
 def crash_of(action: Callable[[], object], seconds: float = 60.0, memory: float = 1.0) -> str:
-    """What ended a process forked from this one to call `action()`: a signal and last words, a limit; "" if nothing.
+    """Call `action()` in a forked process; return "" or the crash: a signal with the last output line, or a limit.
 
-    For a file of the user's own: it takes as long as `action()`, and some milliseconds. Only for a process without
-    threads of Python, as a command is. The limits are as those of `call`, the memory beside what this process has.
+    Use it for the user's own files: it adds only milliseconds to the time of `action()`. This process must have no
+    other Python threads. The limits are those of `call`, except that `memory` is in addition to this process's memory.
     """
     parent, child = os.getpid(), 0
     with tempfile.TemporaryFile() as output:
@@ -146,10 +146,10 @@ def crash_of(action: Callable[[], object], seconds: float = 60.0, memory: float 
                 _limit(resource.RLIMIT_DATA, _used() + int(memory * GIB))
                 signal.signal(signal.SIGALRM, signal.SIG_DFL)
                 signal.setitimer(signal.ITIMER_REAL, seconds)
-                faulthandler.disable()  # its words would be the last ones
+                faulthandler.disable()  # its output would hide the last line
                 action()
             status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) if child else 0
-        except BaseException as error:  # Ctrl-C; in the child, whatever `action` raises is for the caller to meet
+        except BaseException as error:  # Ctrl-C; errors of `action` in the child are ignored
             if child:
                 os.kill(child, signal.SIGKILL)
                 os.waitpid(child, 0)
@@ -171,7 +171,7 @@ def crash_of(action: Callable[[], object], seconds: float = 60.0, memory: float 
 
 @contextmanager
 def memory_at_most(bytes_: int) -> Iterator[None]:
-    """Let this process have at most so much of its own memory while the block runs; MemoryError where it needs more."""
+    """Limit the memory of this process while the block runs; an allocation beyond the limit raises MemoryError."""
     with _at_most(resource.RLIMIT_DATA, bytes_):
         yield
 
@@ -189,9 +189,9 @@ def _at_most(kind: int, most: int) -> Iterator[None]:
 
 @contextmanager
 def reading(path: Path, what: str) -> Iterator[None]:
-    """Parse a stranger's file with no more than `MOST_TAKEN` bytes of memory beside what is used, and of files.
+    """Parse an untrusted file in at most `MOST_TAKEN` bytes of additional memory, and of files.
 
-    ArtifactError, "{path} is not {what}", of whatever a parser raises, or where it needs more; our errors stay.
+    Raises ArtifactError, "{path} is not {what}", for any error of a parser, or beyond the limit. Our own errors pass.
     """
     try:
         with memory_at_most(_used() + MOST_TAKEN), _at_most(resource.RLIMIT_FSIZE, MOST_TAKEN):
@@ -200,17 +200,17 @@ def reading(path: Path, what: str) -> Iterator[None]:
         raise
     except MemoryError as error:
         raise ArtifactError(f"{path}: reading it takes more than {MOST_TAKEN / GIB:g} GiB of memory") from error
-    except Exception as error:  # parsers fail in many ways on what is damaged
+    except Exception as error:  # parsers raise many errors for damaged files
         raise ArtifactError(f"{path} is not {what}: {type(error).__name__}: {error!s:.300}") from error
 
 
 def _used() -> int:
-    """Bytes of data and stack that this process has; 0 where the system does not say."""
+    """Return the bytes of data and stack that this process uses, or 0 if the system does not report them."""
     return int(Path(USED).read_text().split()[5]) * resource.getpagesize() if os.path.exists(USED) else 0
 
 
 def check_memory() -> None:
-    """MemoryError where this process has used nearly all that it may have: libraries in C crash where they get none."""
+    """Raise MemoryError close to the memory limit of this process, because C libraries crash without memory."""
     most, _ = resource.getrlimit(resource.RLIMIT_DATA)
     if most != resource.RLIM_INFINITY and _used() > NEARLY * most:
         raise MemoryError

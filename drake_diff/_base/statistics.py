@@ -1,4 +1,4 @@
-"""Success rates with their uncertainty, and how far a level can go."""
+"""Success rates with confidence intervals, and the largest perturbation level with enough successes."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,11 +8,11 @@ import numpy as np
 from drake_diff.exceptions import InputError
 
 NORMAL_95 = 1.959963984540054  # the two-sided 95 % quantile of the normal distribution
-ENOUGH = 0.95  # of the trials that must succeed
+ENOUGH = 0.95  # required fraction of successful trials
 
 
 class Rate(NamedTuple):
-    """Successes of trials, and Wilson's 95 % interval of the probability."""
+    """The number of successful trials, and Wilson's 95 % interval of the success probability."""
 
     successes: int
     trials: int
@@ -25,7 +25,7 @@ class Rate(NamedTuple):
 
 
 def success_rate(successes: int, trials: int) -> Rate:
-    """Wilson's interval (1927): (p + z^2/2n -+ z sqrt(p (1 - p)/n + z^2/4n^2)) / (1 + z^2/n), z = 1.96, p = k/n."""
+    """Return Wilson's interval (1927): (p + z^2/2n -+ z sqrt(p(1-p)/n + z^2/4n^2)) / (1 + z^2/n), z = 1.96, p = k/n."""
     if not 0 <= successes <= trials or trials < 1:
         raise InputError(
             "successes",
@@ -34,14 +34,14 @@ def success_rate(successes: int, trials: int) -> Rate:
         )
     p, n, z = successes / trials, trials, NORMAL_95
     middle, half = p + z * z / (2 * n), z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    # Exactly 0 and 1 at the ends, where rounding would leave 1e-17.
+    # The ends are exactly 0 and 1, where rounding would leave 1e-17.
     lower = (middle - half) / (1 + z * z / n) if successes else 0.0
     upper = (middle + half) / (1 + z * z / n) if successes < trials else 1.0
     return Rate(successes, trials, float(lower), float(upper))
 
 
 def margin(levels: Sequence[float], rates: Sequence[Rate]) -> float:
-    """The largest level up to which, itself included, 95 % of the trials succeed; 0 where already the first fails."""
+    """Return the largest level up to which (inclusive) 95 % of the trials succeed, or 0 if the first level fails."""
     largest = 0.0
     for level, rate in sorted(zip(levels, rates, strict=True)):
         if rate.value < ENOUGH:

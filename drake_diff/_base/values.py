@@ -1,4 +1,4 @@
-"""Results: how they pickle, show in Jupyter, and say that what was asked for is not possible."""
+"""Base classes of results: pickling, display in Jupyter, and refusals."""
 
 import math
 import pickle
@@ -12,25 +12,25 @@ import cloudpickle
 from drake_diff.exceptions import DrakeDiffError, InputError
 
 Made = TypeVar("Made")
-INSIDE: ContextVar[bool] = ContextVar("INSIDE", default=False)  # something that is being pickled
+INSIDE: ContextVar[bool] = ContextVar("INSIDE", default=False)  # an object is being pickled
 
 
 class PicklesItsFields:
-    """A dataclass that pickles by its fields; what is computed when it is first asked for is computed again.
+    """A dataclass that is pickled by its fields; cached properties are computed again.
 
-    Functions go along whatever they are. Raises InputError where a field cannot, with its name.
+    Functions of any kind can be fields. Raises InputError with the name of a field that cannot be pickled.
     """
 
     def __reduce__(self) -> tuple[Any, ...]:
         values = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
-        if INSIDE.get():  # once for all, so that what two parts share is one thing afterwards too
+        if INSIDE.get():  # pickle all in one pass, so that shared parts stay shared
             return _empty, (type(self),), values
         token = INSIDE.set(True)
         try:
             return pickle.loads, (cloudpickle.dumps(self),)
         except DrakeDiffError:
             raise
-        except Exception as error:  # whatever a user's object raises
+        except Exception as error:  # a user's object may raise anything
             for name, value in values.items():
                 _check(f"{type(self).__name__}.{name}", value)
             raise InputError(type(self).__name__, got=f"{error}", expected="values that can be pickled") from error
@@ -55,7 +55,7 @@ def _check(name: str, value: Any) -> None:
 
 
 def plain_numbers(value: Any) -> Any:
-    """Lists and dicts for JSON, which has no infinity: None."""
+    """Convert to lists and dicts for JSON; infinity and NaN become None."""
     if isinstance(value, dict):
         return {key: plain_numbers(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -63,16 +63,16 @@ def plain_numbers(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-BETWEEN_WORDS = "white-space: pre-wrap; word-break: normal; overflow-wrap: anywhere"  # JupyterLab breaks inside them
+BETWEEN_WORDS = "white-space: pre-wrap; word-break: normal; overflow-wrap: anywhere"  # JupyterLab breaks inside words
 
 
 def preformatted(text: str) -> str:
-    """`text` as HTML, line by line as it is; what is too long for the page goes on in the next line."""
+    """Return `text` as HTML that keeps its lines; lines that are too long for the page wrap."""
     return f'<pre style="{BETWEEN_WORDS}">{escape(text)}</pre>'
 
 
 class ShowsItsRepr:
-    """Shows in Jupyter what `repr` gives."""
+    """A base class whose `repr` is displayed in Jupyter."""
 
     def _repr_html_(self) -> str:
         return preformatted(repr(self))
@@ -80,9 +80,9 @@ class ShowsItsRepr:
 
 @dataclass(frozen=True)
 class Refusal:
-    """Returned in place of a result that cannot be had; the caller takes another way and can say why.
+    """A refusal in place of a result; the caller can use another method and report the reason.
 
-    A function that may refuse returns `Result | Refusal`, and its caller asks `isinstance(found, Refusal)`.
+    A function that may refuse returns `Result | Refusal`, and its caller checks `isinstance(found, Refusal)`.
     """
 
     reason: str  # a sentence without its full stop: "joint elbow is of type planar"

@@ -1,7 +1,7 @@
 """A robot file or diagram as a discrete plant: its state, inputs, parameters, contract, and one step.
 
-`dd.load_model` and `dd.model_from_diagram` make a Model. Here stand the Contract that a model promises, `softened` and
-SoftContact for forces at a distance, and `quantities`, the functions of the state that costs and constraints need.
+`dd.load_model` and `dd.model_from_diagram` make a Model. This package has the Contract of a model, `softened` and
+SoftContact for forces at a distance, and `quantities`, the functions of the state for costs and constraints.
 
 Example:
     >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)

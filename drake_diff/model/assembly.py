@@ -1,4 +1,4 @@
-"""Postures in which loops are closed: the points of each pair are where the other's are."""
+"""Configurations with closed kinematic loops, in which the two points of each pair coincide."""
 
 from collections.abc import Collection
 
@@ -14,18 +14,18 @@ from drake_diff.model.plant import joints
 from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
 
-CLOSED = 1e-9  # of the distance of points from their bodies' origins
-OPEN = 1e-2  # of that distance: a step from there pulls the loop shut with a jerk
-MOST = 50  # steps of Newton's method; from what can be assembled it takes below ten
-LONGEST = 0.5  # [rad or m] of a step: farther ones miss the posture nearby
+CLOSED = 1e-9  # relative to the distance of the points from the origins of their bodies
+OPEN = 1e-2  # relative to the same distance; a step from there closes the loop with a jerk
+MOST = 50  # iterations of Newton's method, which needs fewer than ten if the loops can be closed
+LONGEST = 0.5  # [rad or m] step length; longer steps miss the nearby configuration
 
 
 def gap(model: Model, q: ArrayLike) -> tuple[float, float]:
-    """[m] how far the points of a loop are apart in posture q (nq,) at most, and a length to compare that with.
+    """Return the largest gap [m] of a loop in configuration q (nq,), and a length [m] to compare it with.
 
-    The length is the largest distance of a loop's first point from the origin of its body, or the extent of the origins
-    of the bodies that are held and of those that carry them. The other points of a loop only give its axes. They count
-    by the angle between them and the first point, times this length, so that the ratio has no unit.
+    The length is the largest distance between a loop's first point and the origin of its body, or the extent of the
+    origins of the loops' bodies and their parents. The other points of a loop only define its axes. Their gap is the
+    angle between them and the first point, times this length, so that the ratio does not depend on the unit.
     """
     held = model.file_facts.held_points
     set_state(model.double, np.concatenate([finite_array("q", q, (model.nq,)), np.zeros(model.nv)]))
@@ -49,7 +49,7 @@ def gap(model: Model, q: ArrayLike) -> tuple[float, float]:
 
 
 def check_closed(model: Model, subject: str, x: Array) -> None:
-    """InputError where x (nx,) leaves a loop of the model open."""
+    """Raise InputError if a loop of the model is open in the state x (nx,)."""
     distance, size = gap(model, x[: model.nq]) if model.file_facts.held_points else (0.0, 0.0)
     if distance > OPEN * size:
         expected = f"a closed loop, as dd.model.assembled(model, {subject}) makes it"
@@ -57,19 +57,19 @@ def check_closed(model: Model, subject: str, x: Array) -> None:
 
 
 def assembled(model: Model, x: ArrayLike, *, keep: Collection[str] = ()) -> Array:
-    """The state near `x` in which the loops of a model are closed, as <connect> of MJCF does, at the same velocities.
+    """Close the loops of a model near the state `x`, as <connect> in MJCF does, without changing the velocities.
 
     Args:
-        model: Any; one without loops has its state already.
-        x: (nx,) where to begin.
-        keep: The names of positions, as in `Model.state_names`, that stay as they are: those of motors, as a rule.
+        model: Any model; without loops, the result is `x`.
+        x: (nx,) The initial guess.
+        keep: The names of the positions, as in `Model.state_names`, that must not change, usually those of motors.
 
     Returns:
-        (nx,) by Newton's method; each step is the least change of positions, of bases that float only where it must be.
+        (nx,) The state from Newton's method. Each step is the least change, and floating bases move only if necessary.
 
     Raises:
-        UnknownNameError: One of `keep` is no position.
-        ModelError: The loops cannot be closed from there.
+        UnknownNameError: A name in `keep` is not the name of a position.
+        ModelError: The loops cannot be closed from this initial guess.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -91,7 +91,7 @@ def assembled(model: Model, x: ArrayLike, *, keep: Collection[str] = ()) -> Arra
 
 
 def closed(model: Model, q: Array, fixed: NDArray[np.bool_]) -> Array | None:
-    """The posture near q (nq,) in which loops are closed; what is `fixed` (nq,) stays. None where none was found."""
+    """Return a configuration near q (nq,) with closed loops and unchanged `fixed` (nq,) entries, or None."""
     if not model.file_facts.held_points:
         return q
     places, rates = single_coordinates(model)
@@ -104,7 +104,7 @@ def closed(model: Model, q: Array, fixed: NDArray[np.bool_]) -> Array | None:
 
 
 def _closed(model: Model, q: Array, free: NDArray[np.bool_]) -> Array | None:
-    """By velocities that are `free` (nv,)."""
+    """Close the loops by Newton's method along the velocities that are `free` (nv,)."""
     for _ in range(MOST):
         distance, size = gap(model, q)
         if distance <= CLOSED * size:
@@ -123,7 +123,7 @@ def _closed(model: Model, q: Array, free: NDArray[np.bool_]) -> Array | None:
 
 
 def single_coordinates(model: Model) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Where the positions and velocities of joints with one of each are in q and in v."""
+    """Return the indices in q and in v of the joints with one position and one velocity."""
     places = [model.places(joint) for joint in joints(model.plant)]
     pairs = [(q[0], v[0]) for q, v in places if len(q) == len(v) == 1]
     in_q, in_v = np.array(pairs, dtype=np.intp).reshape(-1, 2).T

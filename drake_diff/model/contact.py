@@ -1,7 +1,7 @@
-"""What touches: contact forces and modes of a step, and how deep geometries overlap in a state.
+"""Contact forces and contact modes of a step, and penetration depths of geometries in a state.
 
-`SoftContact` is a smooth force at a distance, so that what does not touch has a gradient too. It acts between every two
-geometries that may collide and is explicit in the state before the step, beside Drake's own contact.
+`SoftContact` is a smooth force at a distance, which gives a nonzero gradient to geometries that are not in contact.
+It acts between all geometry pairs that may collide, explicitly in the state before the step. Drake's contact also acts.
 """
 
 from __future__ import annotations
@@ -26,41 +26,41 @@ from drake_diff.model.twin import Twin
 
 @dataclass(frozen=True, eq=False)
 class ContactPoint:
-    """One point, or one hydroelastic patch at its centroid, where two bodies push each other; world frame.
+    """A contact point, or a hydroelastic patch represented by its centroid, between two bodies; in the world frame.
 
-    Where one of them is fixed to the world it is body b, so that the force is the one on what moves.
+    If one of the bodies is fixed to the world, it is body b, so that the force acts on the body that can move.
     """
 
     body_a: str
     body_b: str
     point: Array  # (3,) [m]
     normal: Array  # (3,) from b into a
-    force: Array  # (3,) [N], on a
+    force: Array  # (3,) [N], acting on a
     depth: float  # [m]; 0 for a patch, which has a pressure field instead
     slip_speed: float  # [m/s]
 
 
 Pair = tuple[str, str]  # two geometries, each as "body/geometry"
 SEPARATED, STICKING, SLIDING = "separated", "sticking", "sliding"
-# Of the friction that is possible, the part above which a pair slides. SAP sticks strictly inside the cone. The
-# others slip by v_t for a part v_t / sqrt(v_t^2 + v_s^2): at the stiction tolerance v_s it is 1 / sqrt(2).
+# A pair slides above this fraction of the maximum friction. SAP sticks strictly inside the cone. The other models slip
+# by v_t at the fraction v_t / sqrt(v_t^2 + v_s^2), which is 1 / sqrt(2) at the stiction tolerance v_s.
 SLIDING_PART = {"sap": 1 - 1e-3, "similar": 0.5**0.5, "lagged": 0.5**0.5}
 
 
 def contact_modes(model: Model, x: ArrayLike, u: ArrayLike | None = None) -> dict[Pair, str]:
-    """The contact mode of every pair of geometries that may collide, in the step at (`x`, `u`), by Drake's own forces.
+    """Return the contact mode of each geometry pair that may collide in the step at (`x`, `u`), from Drake's forces.
 
     Args:
         model: The model.
-        x: (nx,) the state before the step.
-        u: (nu,) the input; may be left out where there is none.
+        x: (nx,) The state before the step.
+        u: (nu,) The input; optional if the model has no inputs.
 
     Returns:
         By pair of names, each "body/geometry": "separated" without a normal force; "sticking" with friction inside its
         cone; "sliding" with friction at the cone (sap) or a slip above the stiction tolerance (similar and lagged).
 
     Raises:
-        ShapeError, NonFiniteError: x or u is wrong.
+        ShapeError, NonFiniteError: x or u is invalid.
         SimulationError: Drake cannot take the step.
 
     Example:
@@ -78,7 +78,7 @@ def contact_modes(model: Model, x: ArrayLike, u: ArrayLike | None = None) -> dic
 
 
 def active_modes(model: Model) -> dict[Pair, str]:
-    """The modes of the pairs that push each other in the step that `step.advance` took last on the double twin."""
+    """Return the modes of the pairs with contact forces in the last step of `step.advance` on the double twin."""
     modes: dict[Pair, str] = {}
     for a, b, force, info in contact_forces(model.double):
         normal = _normal(info)
@@ -86,7 +86,7 @@ def active_modes(model: Model) -> dict[Pair, str]:
         if push == 0:
             continue
         mu_a, mu_b = (proximity_property(model.double.inspector, geometry, "friction") or 0.0 for geometry in (a, b))
-        possible = 2 * mu_a * mu_b / (mu_a + mu_b) * push if mu_a + mu_b else 0.0  # Drake's rule for two frictions
+        possible = 2 * mu_a * mu_b / (mu_a + mu_b) * push if mu_a + mu_b else 0.0  # Drake's rule for two coefficients
         tangential = float(np.linalg.norm(force - (force @ normal) * normal))
         sliding_part = SLIDING_PART[model.contract.contact.approximation]
         modes[_pair(model, a, b)] = SLIDING if tangential >= sliding_part * possible else STICKING
@@ -94,7 +94,7 @@ def active_modes(model: Model) -> dict[Pair, str]:
 
 
 def contacts_of_the_step(model: Model) -> tuple[ContactPoint, ...]:
-    """The contacts of the step that `step.advance` took last on the double twin, by the force on what can move."""
+    """Return the contacts of the last step of `step.advance` on the double twin; forces act on the movable body."""
     contacts = []
     for a, b, force, info in contact_forces(model.double):
         normal, depth, slip = _normal(info), 0.0, 0.0
@@ -110,21 +110,21 @@ def contacts_of_the_step(model: Model) -> tuple[ContactPoint, ...]:
 
 
 def contact_forces(twin: Twin) -> Iterator[tuple[Any, Any, Any, Any]]:
-    """Of each contact in the twin's last step: the geometries a and b, the force on a (3,) [N], and Drake's own result.
+    """Yield for each contact in the twin's last step the geometries a, b, the force on a (3,) [N], and Drake's result.
 
-    The force holds floats or AutoDiffXd, as the twin does.
+    The force contains floats or AutoDiffXd, depending on the twin.
     """
     results = twin.plant.get_contact_results_output_port().Eval(twin.context)
     for i in range(results.num_point_pair_contacts()):
         info = results.point_pair_contact_info(i)
-        yield info.point_pair().id_A, info.point_pair().id_B, -info.contact_force(), info  # Drake's is on B
+        yield info.point_pair().id_A, info.point_pair().id_B, -info.contact_force(), info  # Drake's force acts on B
     for i in range(results.num_hydroelastic_contacts()):
         info = results.hydroelastic_contact_info(i)
         yield info.contact_surface().id_M(), info.contact_surface().id_N(), info.F_Ac_W().translational(), info
 
 
 def _normal(info: Any) -> Array:
-    """(3,) from b into a; of a patch the mean over its faces, by area."""
+    """Return the normal (3,) from b into a; for a patch, the mean over its faces weighted by area."""
     if not hasattr(info, "contact_surface"):
         return np.asarray(info.point_pair().nhat_BA_W)
     surface = info.contact_surface()
@@ -134,12 +134,12 @@ def _normal(info: Any) -> Array:
 
 
 def body_of(model: Model, geometry: Any) -> Any:
-    """The body that carries a geometry."""
+    """Return the body that carries a geometry."""
     return model.plant.GetBodyFromFrameId(model.double.inspector.GetFrameId(geometry))
 
 
 def _carrier(model: Model, geometry: Any) -> tuple[str, bool]:
-    """The name of that body, and whether it is fixed to the world: they stay, and each contact of each step asks."""
+    """Return the name of that body and whether it is fixed to the world, from a cache, as every contact needs them."""
     if geometry not in model.carriers:
         body = body_of(model, geometry)
         model.carriers[geometry] = body.name(), model.plant.IsAnchored(body)
@@ -153,17 +153,17 @@ def _pair(model: Model, a: Any, b: Any) -> Pair:
 
 
 def penetration(model: Model) -> float:
-    """The largest overlap [m] of two geometries that may collide, in the double context's state; 0 if none."""
+    """Return the largest overlap [m] of two geometries that may collide in the double context's state, or 0."""
     return float(max((pair.depth for pair in _penetrations(model)), default=0.0))
 
 
 def overlaps(model: Model) -> dict[Pair, float]:
-    """[m] how deep each two geometries that may collide and do overlap, in the double context's state."""
+    """Return the overlap depth [m] of each pair of overlapping geometries in the double context's state."""
     return {_pair(model, pair.id_A, pair.id_B): float(pair.depth) for pair in _penetrations(model)}
 
 
 def _penetrations(model: Model) -> list[Any]:
-    """Raises SimulationError where Drake cannot measure the shapes."""
+    """Return Drake's penetrations; raise SimulationError if Drake cannot measure the shapes."""
     port = model.plant.get_geometry_query_input_port()
     if not port.HasValue(model.double.context):
         return []
@@ -174,9 +174,9 @@ def _penetrations(model: Model) -> list[Any]:
 
 
 def deepest_overlap(model: Model) -> tuple[float, float, str]:
-    """(depth [m], thickness [m], name) of the overlap in the double context's state that is deepest for what overlaps.
+    """Return (depth [m], thickness [m], name) of the overlap in the double context's state with the largest ratio.
 
-    The thickness and the name are those of the thinner of the two geometries; (0, inf, "nothing") where none overlap.
+    The ratio is the depth over the thickness of the thinner geometry, which has the name; (0, inf, "nothing") if none.
     """
     deepest = 0.0, float("inf"), "nothing"
     for pair in _penetrations(model):
@@ -187,21 +187,21 @@ def deepest_overlap(model: Model) -> tuple[float, float, str]:
 
 
 def thinnest_geometry(model: Model) -> tuple[float, str]:
-    """(thickness [m], name) of the thinnest geometry that may collide; (inf, "nothing") where none has a size."""
+    """Return (thickness [m], name) of the thinnest geometry that may collide, (inf, "nothing") if none has a size."""
     inspector = model.double.inspector
     pairs = inspector.GetCollisionCandidates() if inspector else ()
     return min((_thickness(model, g) for pair in pairs for g in pair), default=(float("inf"), "nothing"))
 
 
 def _thickness(model: Model, geometry: Any) -> tuple[float, str]:
-    """(thickness [m], name) of a geometry; a half space has none."""
+    """Return (thickness [m], name) of a geometry; the thickness of a half space is inf."""
     box = model.double.inspector.GetObbInGeometryFrame(geometry)
     if box is None:
         return float("inf"), "nothing"
     return 2 * float(np.min(box.half_width())), str(model.double.inspector.GetName(geometry))
 
 
-# Nodes in [0, 1] of the integral for the potential, whose integrand is smooth there: 16 leave rounding only.
+# Quadrature nodes in [0, 1] for the potential; its integrand is smooth, so 16 nodes reach rounding error.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 
@@ -210,15 +210,15 @@ _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 class SoftContact:
     """A smooth repulsive force between geometries, sigma k log(1 + exp(-phi / sigma)) at the signed distance phi [m].
 
-    It falls by e with each `distance` of separation and tends to the spring k max(0, -phi) as `distance` tends to 0.
-    A stable step needs h^2 k below 4 times the mass that it moves. It has no friction and no dissipation.
+    It decreases by a factor e per `distance` of separation, and tends to the spring k max(0, -phi) as `distance` tends
+    to 0. A stable step requires h^2 k below 4 times the moving mass. There is no friction and no dissipation.
 
     Args:
         distance: sigma [m], above 0.
         stiffness: k [N/m], above 0.
 
     Raises:
-        InputError: One of them is not above 0.
+        InputError: An argument is not above 0.
 
     Source:
         Kurtz and Lin, "Inverse dynamics trajectory optimization for contact-implicit model predictive control", 2023.
@@ -237,13 +237,13 @@ class SoftContact:
         object.__setattr__(self, "stiffness", positive_float("SoftContact.stiffness [N/m]", self.stiffness))
 
     def normal_force(self, phi: Any) -> Any:
-        """[N] at the signed distance `phi` [m], a float or an AutoDiffXd."""
+        """Return the force [N] at the signed distance `phi` [m], a float or an AutoDiffXd."""
         a = phi / self.distance
-        tail = log(1.0 + exp(-a)) if a > 0 else -a + log(1.0 + exp(a))  # neither overflows
+        tail = log(1.0 + exp(-a)) if a > 0 else -a + log(1.0 + exp(a))  # neither branch overflows
         return self.distance * self.stiffness * tail
 
     def energy(self, phi: float) -> float:
-        """[J] the integral of the force from `phi` [m] to infinity."""
+        """Return the energy [J], the integral of the force from `phi` [m] to infinity."""
         a = abs(phi) / self.distance
         beyond = float(_WEIGHTS @ (np.log1p(np.exp(-a) * _NODES) / _NODES))
         if phi < 0:
@@ -251,7 +251,7 @@ class SoftContact:
         return self.distance**2 * self.stiffness * beyond
 
     def force(self, plant: Any, context: Any) -> Any:
-        """(nv,) the generalized force [N or N m] in the state of `context`, of either scalar type."""
+        """Return the generalized force (nv,) [N or N m] in the state of `context`, of either scalar type."""
         total = np.zeros(plant.num_velocities())
         for pair, bodies in _pairs(plant, context):
             total = total + self.normal_force(pair.distance) * _distance_rate(plant, context, pair, bodies)
@@ -262,22 +262,22 @@ class SoftContact:
 
 
 def softened(model: Model, contact: SoftContact) -> Model:
-    """`model` with a smooth force at a distance between all geometries that may collide, beside Drake's own contact.
+    """Return `model` with a smooth force at a distance between all geometries that may collide.
 
-    Its steps, rollouts, gradients and certificates are those of any model, at any time step. AutoDiffXd knows the
-    distance of a sphere from a sphere, a box and a half space; where another pair may collide, steps are differenced,
-    and say so.
+    The force is in addition to Drake's own contact. All functions of a model work, at any time step. AutoDiffXd has
+    the distance from a sphere to a sphere, a box and a half space. If another pair may collide, finite differences
+    differentiate the steps, and the method is reported.
 
     Args:
-        model: The model; it stays as it is.
+        model: The model; it does not change.
         contact: The force.
 
     Returns:
-        A Model.
+        The new Model.
 
     Raises:
-        InputError: Nothing may collide, or no force can be added.
-        ModelError: Drake knows no distance of some pair.
+        InputError: No geometries may collide, or forces cannot be added.
+        ModelError: Drake cannot compute the distance of a pair.
 
     Example:
         >>> model = dd.load_model("models/sphere_on_ground.sdf", time_step=0.01)
@@ -309,12 +309,12 @@ def softened(model: Model, contact: SoftContact) -> Model:
         facts=model.file_facts,
         shared=model.shared,
     )
-    contact.force(soft.plant, soft.double.context)  # refuses what has no distance
+    contact.force(soft.plant, soft.double.context)  # raises ModelError if a distance is not available
     return soft
 
 
 def distances(twin: Twin) -> dict[tuple[str, str], float]:
-    """The signed distance [m] of the geometries of every two bodies that may collide, in the context's state."""
+    """Return the smallest signed distance [m] of each two bodies that may collide, in the context's state."""
     by_pair: dict[tuple[str, str], float] = {}
     for pair, (a, b) in _pairs(twin.plant, twin.context):
         names = (a.name(), b.name())
@@ -324,16 +324,16 @@ def distances(twin: Twin) -> dict[tuple[str, str], float]:
 
 @dataclass(frozen=True, eq=False)
 class Separation:
-    """Two bodies that may collide, how far they are apart, and how they part."""
+    """Two bodies that may collide, their distance, its gradient, and the mobility of the pair."""
 
     bodies: tuple[str, str]
     distance: float  # [m], signed
     gradient: Array  # (nq,) of the distance
-    mobility: float  # [1/kg] how fast a unit impulse between the two makes them part
+    mobility: float  # [1/kg] separation speed per unit impulse between the two bodies
 
 
 def separations(twin: Twin) -> list[Separation]:
-    """Every pair of geometries that may collide, always in the same order, in the context's state."""
+    """Return all geometry pairs that may collide, always in the same order, in the context's state."""
     plant, context, rows, coupling = twin.plant, twin.context, [], twin.coupling
     mass = twin.mass_matrix()
     to_v = np.array([plant.MapQDotToVelocity(context, e) for e in np.eye(plant.num_positions())]).T
@@ -347,7 +347,7 @@ def separations(twin: Twin) -> list[Separation]:
 
 
 def _distance_rate(plant: Any, context: Any, pair: Any, bodies: tuple[Any, Any]) -> Any:
-    """(nv,) the derivative of the distance's rate by v: of the velocity at which the closest points part."""
+    """Return the derivative (nv,) of the distance's rate, the separation speed of the closest points, in v."""
     inspector = plant.get_geometry_query_input_port().Eval(context).inspector()
     world, by_v, jacobians = plant.world_frame(), JacobianWrtVariable.kV, []
     for body, geometry, p_GC in zip(bodies, (pair.id_A, pair.id_B), (pair.p_ACa, pair.p_BCb), strict=True):
@@ -359,7 +359,7 @@ def _distance_rate(plant: Any, context: Any, pair: Any, bodies: tuple[Any, Any])
 
 
 def _pairs(plant: Any, context: Any) -> list[tuple[Any, tuple[Any, Any]]]:
-    """Drake's signed distance, and the bodies, of every two geometries that may collide."""
+    """Return Drake's signed distance and the bodies for each two geometries that may collide."""
     port = plant.get_geometry_query_input_port()
     if not port.HasValue(context):
         return []

@@ -1,11 +1,11 @@
-"""Collision geometry that AutoDiffXd cannot step, and what is put in its place.
+"""Collision geometry that AutoDiffXd steps do not support, and its replacements.
 
-In point contact the AutoDiffXd step takes a sphere against a sphere, box, cylinder, capsule or half space and nothing
-else. One other pair whose bounding boxes meet is enough for the whole step to throw, so there are routes around such
-pairs, chosen before the plant is finalized.
+In point contact, the AutoDiffXd step supports only a sphere against a sphere, box, cylinder, capsule or half space.
+The whole step throws if the bounding boxes of any other pair overlap. A route around such pairs is chosen before the
+plant is finalized.
 
-Here are also the distance of shapes from a half space, which Drake does not compute, and the pairs of shapes that
-overlap wherever the joints are, such as the cover of a joint: their contact pushes in every step.
+This module also has the distance of shapes from a half space, which Drake does not compute. It finds the shapes that
+overlap at all joint positions, such as the cover of a joint, because their contact force acts in every step.
 """
 
 import re
@@ -27,20 +27,20 @@ from drake_diff.model.file_facts import GeomSays, TouchFilter
 from drake_diff.model.plant import bodies, joints
 
 ROUTES = ("corner_spheres", "hydroelastic", "differences")
-CORNER_RADIUS = 0.05  # of a corner sphere [1], relative to the smallest edge: small enough to leave the shape its size
-SPHERES_PER_RIM = 8  # of a cylinder
-HYDROELASTIC_MODULUS = 1e7  # [Pa], that of stiff rubber
+CORNER_RADIUS = 0.05  # of a corner sphere, relative to the smallest edge [1]: small enough to preserve the shape's size
+SPHERES_PER_RIM = 8  # for a cylinder
+HYDROELASTIC_MODULUS = 1e7  # [Pa], the modulus of stiff rubber
 
-MEETS_A_SPHERE = {"Sphere", "Box", "Cylinder", "Capsule", "HalfSpace"}  # in point contact under AutoDiffXd
+MEETS_A_SPHERE = {"Sphere", "Box", "Cylinder", "Capsule", "HalfSpace"}  # in point contact with AutoDiffXd
 HYDROELASTIC_SHAPES = MEETS_A_SPHERE | {"Ellipsoid", "Convex", "Mesh"}
 CONTACT_MODELS = ("point", "hydroelastic", "hydroelastic_with_fallback")
 
 
 def autodiff_supports(shape_a: pg.Shape, shape_b: pg.Shape, contact_model: str) -> bool:
-    """Whether the AutoDiffXd step takes this pair of touching shapes, as measured with Drake 1.51 and 1.58.
+    """Return whether the AutoDiffXd step supports this pair of shapes in contact, as measured with Drake 1.51 and 1.58.
 
-    For the two hydroelastic models the shapes have the properties that the route "hydroelastic" gives them.
-    Raises UnknownNameError where there is no such contact model.
+    For the two hydroelastic models, the shapes have the properties that the route "hydroelastic" assigns.
+    Raises UnknownNameError if the contact model is unknown.
     """
     if contact_model not in CONTACT_MODELS:
         raise UnknownNameError("contact_model", got=contact_model, known=CONTACT_MODELS)
@@ -51,13 +51,13 @@ def autodiff_supports(shape_a: pg.Shape, shape_b: pg.Shape, contact_model: str) 
 
 
 def replace_collision_geometry(plant: MultibodyPlant, scene_graph: pg.SceneGraph, route: str) -> tuple[str, ...]:
-    """Change what `plant` collides with, so that AutoDiffXd can step it; a sentence for each change.
+    """Replace the collision geometry of `plant` for AutoDiffXd, and return a sentence for each change.
 
-    To be called when every geometry is there. Masses, inertias and what is drawn stay as they are. `route` is one of
+    Call it after all geometries are registered. Masses, inertias and visual geometry do not change. `route` is one of
 
-    - "corner_spheres": each box, cylinder and capsule on a body that can move becomes spheres inside it;
-    - "hydroelastic": each geometry without hydroelastic properties gets compliant ones, a half space rigid ones;
-    - "differences": nothing changes, and what AutoDiffXd refuses is differenced.
+    - "corner_spheres": each box, cylinder and capsule on a movable body is replaced by spheres inside it;
+    - "hydroelastic": each geometry without hydroelastic properties becomes compliant, or rigid if it is a half space;
+    - "differences": nothing changes, and steps that AutoDiffXd does not support are differentiated numerically.
     """
     if route not in ROUTES:
         raise UnknownNameError("contact_geometry", got=route, known=ROUTES)
@@ -78,8 +78,8 @@ def _to_corner_spheres(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tup
     geometries = collision_geometries(plant, scene_graph)
     welded = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
     fixed = [int(body.index()) in welded for body, _ in geometries]
-    # Pairs that a file or a user lets pass through each other: Drake keeps its filters by geometry, so the spheres
-    # would not inherit them.
+    # Pairs that a file or a user excludes from collision. Drake stores its filters by geometry, so the spheres would
+    # not inherit them.
     pairs = [(a, b) for (body_a, a), (body_b, b) in combinations(geometries, 2) if body_a.index() != body_b.index()]
     filtered = [(a, b) for a, b in pairs if inspector.CollisionFiltered(a, b)]
     became = {geometry: [geometry] for _, geometry in geometries}
@@ -103,9 +103,9 @@ def _to_corner_spheres(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tup
 
 
 def collision_geometries(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> list[tuple[Any, Any]]:
-    """The body and the id of every rigid geometry of the plant that has the proximity role.
+    """Return the body and the id of every rigid geometry of the plant with the proximity role.
 
-    Not by plant.GetCollisionGeometriesForBody: its ids live in the plant's own list, which moves when it grows.
+    plant.GetCollisionGeometriesForBody is not safe: its ids are in the plant's own list, which is reallocated.
     """
     inspector, source = scene_graph.model_inspector(), plant.get_source_id()
     frames = [(body, plant.GetBodyFrameIdIfExists(body.index())) for body in [plant.world_body(), *bodies(plant)]]
@@ -121,7 +121,7 @@ def collision_geometries(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> l
 def _replace(
     plant: MultibodyPlant, scene_graph: pg.SceneGraph, body: Any, geometry: Any, shape: Any
 ) -> tuple[list[Any], str]:
-    """Spheres in place of a geometry, which loses its proximity role; their ids, and what became of it."""
+    """Replace a geometry by spheres and remove its proximity role; return their ids and a description."""
     inspector = scene_graph.model_inspector()
     X_BG = RigidTransform(inspector.GetPoseInFrame(geometry))
     properties = pg.ProximityProperties(inspector.GetProximityProperties(geometry))
@@ -143,10 +143,10 @@ def _replace(
 
 
 def _spheres(shape: Any) -> tuple[float, list[Array]]:
-    """The radius [m] of the spheres inside a shape, and their centres [m] in its frame.
+    """Return the radius [m] of the spheres inside a shape, and their centres [m] in its frame.
 
-    Each touches the surface from inside: three faces of a box, a cap and the side of a cylinder. Those of a
-    capsule are its two ends.
+    Each sphere touches the surface from inside: three faces of a box, or a cap and the side of a cylinder. The spheres
+    of a capsule are its two ends.
     """
     if isinstance(shape, pg.Capsule):
         return shape.radius(), [np.array([0, 0, z * shape.length() / 2]) for z in (-1, 1)]
@@ -175,7 +175,7 @@ def _to_hydroelastic(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple
         if isinstance(inspector.GetShape(geometry), pg.HalfSpace) or box is None:
             pg.AddRigidHydroelasticProperties(properties)
             became = "rigid hydroelastic, as a compliant half space has no contact with a compliant body"
-        else:  # a modulus or hint of its own stays
+        else:  # preserves an existing modulus or hint
             hint = _taken(properties, "resolution_hint", float(np.min(box.half_width())))
             modulus = _taken(properties, "hydroelastic_modulus", HYDROELASTIC_MODULUS)
             pg.AddCompliantHydroelasticProperties(hint, modulus, properties)
@@ -186,7 +186,7 @@ def _to_hydroelastic(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple
 
 
 def _taken(properties: pg.ProximityProperties, name: str, default: float) -> float:
-    """A hydroelastic property that a geometry has already, taken out of its properties, or the default."""
+    """Remove a hydroelastic property from a geometry's properties and return its value, or the default."""
     value = float(properties.GetPropertyOrDefault("hydroelastic", name, default))
     properties.RemoveProperty("hydroelastic", name)
     return value
@@ -194,7 +194,7 @@ def _taken(properties: pg.ProximityProperties, name: str, default: float) -> flo
 
 @dataclass(frozen=True, eq=False)
 class ClosestPoints:
-    """As Drake's SignedDistancePair: of the geometries A and B, of floats or AutoDiffXd."""
+    """The closest points of geometries A and B, of floats or AutoDiffXd, like Drake's SignedDistancePair."""
 
     id_A: Any
     id_B: Any
@@ -205,7 +205,7 @@ class ClosestPoints:
 
 
 def from_half_space(query: Any, ids: tuple[Any, Any]) -> ClosestPoints | None:
-    """Of a half space and a box, capsule, cylinder, ellipsoid or mesh's hull; None where Drake is to be asked."""
+    """Return the pair of a half space and a box, capsule, cylinder, ellipsoid or convex hull; None for other pairs."""
     inspector = query.inspector()
     shapes = [inspector.GetShape(i) for i in ids]
     grounds = [i for i, shape in enumerate(shapes) if isinstance(shape, HalfSpace)]
@@ -228,7 +228,7 @@ def from_half_space(query: Any, ids: tuple[Any, Any]) -> ClosestPoints | None:
 
 
 def _furthest(shape: Any, along: Any) -> Any:
-    """(3,) the point of a shape, in its frame, that is furthest along a unit vector; None of a shape not known here."""
+    """Return the shape's furthest point (3,) along a unit vector, in its frame, or None for an unsupported shape."""
     if isinstance(shape, Box):
         return np.where(along > 0, 1, -1) * (np.array(shape.size()) / 2)
     if isinstance(shape, Capsule | Cylinder):
@@ -248,19 +248,19 @@ def _furthest(shape: Any, along: Any) -> Any:
     return None
 
 
-POSTURES = 100  # beside the default one
-FIRST = 10  # of them, in which a pair has to overlap once
+POSTURES = 100  # in addition to the default configuration
+FIRST = 10  # number of first postures in which a pair must overlap at least once
 FLUSH = 1e-9  # [m]
-REACH = 4.0  # [m or rad] of a joint without limits, and of a free body
-TOLD = 6  # pairs of links named in a sentence
+REACH = 4.0  # [m or rad] for joints without limits and for floating bodies
+TOLD = 6  # maximum number of link pairs in a sentence
 Pairs = Sequence[tuple[Any, Any]]
 
 
 def inseparable_pairs(plant: MultibodyPlant, diagram: Diagram) -> Pairs:
-    """The pairs of geometries that overlap at the default positions and in 100 seeded postures within the limits.
+    """Return the pairs of geometries that overlap at the default positions and in 100 seeded postures within limits.
 
-    What is flush counts, as there rounding decides. Joints that follow others move freely here, and free bodies are
-    anywhere. Raises ModelError where Drake cannot tell what overlaps.
+    Flush geometries count, because rounding decides their contact. Joints that follow others are independent in these
+    postures, and floating bodies take any pose. Raises ModelError if Drake cannot determine the overlaps.
     """
     root, random = diagram.CreateDefaultContext(), np.random.default_rng(0)
     context, port = plant.GetMyMutableContextFromRoot(root), plant.get_geometry_query_input_port()
@@ -282,7 +282,7 @@ def inseparable_pairs(plant: MultibodyPlant, diagram: Diagram) -> Pairs:
 
 
 def _are_flush(query: Any, a: Any, b: Any) -> bool:
-    """Whether two geometries that do not overlap touch, to rounding; no where Drake does not measure such shapes."""
+    """Return whether two disjoint geometries touch up to rounding, or False if Drake cannot measure the distance."""
     try:
         return bool(query.ComputeSignedDistancePairClosestPoints(a, b).distance <= FLUSH)
     except RuntimeError:
@@ -290,7 +290,7 @@ def _are_flush(query: Any, a: Any, b: Any) -> bool:
 
 
 def _posture(plant: MultibodyPlant, random: np.random.Generator) -> Array:
-    """(nq,) positions within the limits; quaternions of unit norm."""
+    """Return random positions (nq,) within the limits, with unit quaternions."""
     lower, upper = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
     middle = np.clip(0.0, lower, upper)
     lower, upper = np.maximum(lower, middle - REACH), np.minimum(upper, middle + REACH)
@@ -304,7 +304,7 @@ def _posture(plant: MultibodyPlant, random: np.random.Generator) -> Array:
 
 
 def links_of(plant: MultibodyPlant, scene_graph: pg.SceneGraph, pairs: Pairs) -> str:
-    """The links of the pairs, for a sentence: each two once, and how many more there are."""
+    """List the links of the pairs for a sentence, without duplicates, and the number of omitted pairs."""
     inspector = scene_graph.model_inspector()
     names = (
         " - ".join(sorted(str(plant.GetBodyFromFrameId(inspector.GetFrameId(g)).name()) for g in pair))
@@ -315,7 +315,7 @@ def links_of(plant: MultibodyPlant, scene_graph: pg.SceneGraph, pairs: Pairs) ->
 
 
 def touch_what_can_separate(plant: MultibodyPlant, scene_graph: pg.SceneGraph, diagram: Diagram) -> tuple[str, ...]:
-    """Filter what overlaps in every posture; to be called when the diagram is built, before it has contexts in use."""
+    """Exclude pairs that overlap in every posture; call it on the built diagram before its contexts are in use."""
     pairs = inseparable_pairs(plant, diagram)
     for a, b in pairs:
         filtered = pg.CollisionFilterDeclaration().ExcludeBetween(pg.GeometrySet([a]), pg.GeometrySet([b]))
@@ -331,10 +331,10 @@ def touch_what_can_separate(plant: MultibodyPlant, scene_graph: pg.SceneGraph, d
 def touch_as_mujoco(
     plant: MultibodyPlant, scene_graph: pg.SceneGraph, touching: Mapping[str, TouchFilter], *, give: bool
 ) -> tuple[str, ...]:
-    """Let shapes of MJCF touch as MuJoCo does, by instance; a sentence for what changes. Pairs are added where `give`.
+    """Set the collision filters of MJCF shapes as in MuJoCo, by instance; pairs are added only with `give`.
 
-    Drake lets neighbours pass through each other, but not where a body has two joints, and knows no masks. To be called
-    when the diagram is built, before it has contexts in use.
+    Returns a sentence for each change. Drake filters neighbouring bodies, but not if a body has two joints, and it has
+    no collision masks. Call it on the built diagram before its contexts are in use.
     """
     inspector, excluded, allowed = scene_graph.model_inspector(), list[tuple[Any, Any]](), list[tuple[Any, Any]]()
     for instance, says in touching.items():
@@ -356,7 +356,7 @@ def touch_as_mujoco(
 def _shapes_of(
     plant: MultibodyPlant, scene_graph: pg.SceneGraph, instance: str, says: TouchFilter, *, alone: bool
 ) -> list[tuple[GeomSays, Any]]:
-    """The shapes of an instance, and those of the world where it is `alone` there, with what its file says of them."""
+    """Return the shapes of an instance with the file's data; include the world's shapes if the instance is `alone`."""
     inspector, by_body = scene_graph.model_inspector(), dict[str, list[Any]]()
     for body, geometry in collision_geometries(plant, scene_graph):
         whose = plant.GetModelInstanceName(body.model_instance())

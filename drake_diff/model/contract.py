@@ -1,4 +1,4 @@
-"""What the model promises before any optimization: names, units, frames, sizes, limits, contact, tolerances."""
+"""The contract of a model: names, units, frames, sizes, limits, contact parameters and tolerances."""
 
 import math
 from dataclasses import asdict, dataclass
@@ -13,7 +13,7 @@ from drake_diff.model.twin import Twin
 
 @dataclass(frozen=True)
 class CoordinateTerms:
-    """One entry of q, v or u."""
+    """An entry of q, v or u."""
 
     name: str
     unit: str
@@ -33,7 +33,7 @@ class BodyTerms:
 
 @dataclass(frozen=True)
 class JointTerms:
-    """A joint and what holds it back: damping [N s/m or N m s/rad], implicit in Drake's step."""
+    """A joint and its damping [N s/m or N m s/rad], which is implicit in Drake's step."""
 
     name: str
     type: str
@@ -45,7 +45,7 @@ class JointTerms:
 
 @dataclass(frozen=True)
 class ActuatorTerms:
-    """An actuator on a joint; PD gains and their target (the joint's default position) where it has them."""
+    """An actuator on a joint, with its PD gains, if any, whose target is the joint's default position."""
 
     name: str
     joint: str
@@ -58,25 +58,25 @@ class ActuatorTerms:
 
 @dataclass(frozen=True)
 class GeometryTerms:
-    """A geometry that can touch others; None where the model gives no value and Drake's default decides."""
+    """A geometry that may collide; a value is None if the model does not set it, so that Drake's default applies."""
 
     name: str
     body: str
     shape: str
     friction: float | None
     stiffness: float | None  # [N/m]
-    dissipation: float | None  # Hunt-Crossley [s/m]: similar and lagged contact
-    relaxation_time: float | None  # [s]: sap contact
+    dissipation: float | None  # Hunt-Crossley dissipation [s/m], for similar and lagged contact
+    relaxation_time: float | None  # [s], for sap contact
     hydroelastic_modulus: float | None  # [Pa]
 
 
 @dataclass(frozen=True)
 class ContactTerms:
-    """How contact is computed."""
+    """The contact model and its parameters."""
 
     model: str
     approximation: str
-    geometry: str  # "as modelled", or the route that was taken around pairs that AutoDiffXd refuses
+    geometry: str  # "as modelled", or the route around pairs that AutoDiffXd does not support
     collision_pairs: int
     solver_relative_tolerance: float
     sap_near_rigid_threshold: float
@@ -84,7 +84,7 @@ class ContactTerms:
 
 @dataclass(frozen=True)
 class Contract:
-    """Everything a run rests on, read from Drake in SI units; `print(contract)` shows all of it.
+    """All properties that a run depends on, read from Drake in SI units; `print(contract)` shows them.
 
     Example:
         >>> contract = dd.load_model("models/pendulum.urdf", time_step=0.01).contract
@@ -115,7 +115,7 @@ class Contract:
     notes: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain dicts and lists for JSON: an absent limit (infinite) is None."""
+        """Return dicts and lists for JSON; an absent (infinite) limit is None."""
         plain: dict[str, Any] = plain_numbers(asdict(self))
         return plain
 
@@ -150,7 +150,7 @@ class Contract:
                 f"  actuator   {a.name} on {a.joint}{limit}, gear {a.gear_ratio:g}, rotor {a.rotor_inertia:g}{gains}"
             )
         for g in self.geometries:
-            # sap knows only the relaxation time, similar and lagged only Hunt and Crossley's dissipation
+            # sap uses only the relaxation time, similar and lagged only the Hunt-Crossley dissipation
             damped = f"dissipation {_or_default(g.dissipation)} s/m"
             if self.contact.approximation == "sap":
                 damped = f"relaxation time {_or_default(g.relaxation_time)} s"
@@ -207,7 +207,7 @@ def read_contract(
     contact_geometry: str | None,
     notes: tuple[str, ...],
 ) -> Contract:
-    """The contract of the plant in `twin`; `coordinates` are the names of q and v."""
+    """Read the contract of the plant in `twin`; `coordinates` are the names of q and v."""
     plant, inspector = twin.plant, twin.inspector
     (positions, velocities), inputs = coordinates, twin.inputs
     geometries = [] if inspector is None else inspector.GetAllGeometryIds(Role.kProximity)
@@ -247,7 +247,7 @@ def _terms(names: Any, units: Any, lower: Any, upper: Any) -> tuple[CoordinateTe
 
 
 def _units(twin: Twin, which: int) -> list[str]:
-    """Units of q (which = 0) or v (which = 1), joint by joint."""
+    """Return the units of q (which = 0) or v (which = 1), joint by joint."""
     plant = twin.plant
     units = ["?"] * (plant.num_velocities() if which else plant.num_positions())
     for joint in joints(plant):

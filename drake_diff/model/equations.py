@@ -1,11 +1,11 @@
-"""The plant's equations of motion in continuous time, for collocation: a Drake System made from the discrete plant.
+"""The continuous-time equations of motion for collocation: a Drake System made from the discrete plant.
 
-    M(q) dv/dt = B u + forces(q, v, u) - C(q, v) v,    dq/dt = N(q) v,
+    M(q) dv/dt = B u + forces(q, v, u) - C(q, v) v,    dq/dt = N(q) v.
 
-with Drake's own mass matrix, force elements (gravity, springs), joint damping and bias, and what the diagram's systems
-exert, which alone depends on u. Contact, joint limits,
-PD control and constraints are not in it: they exist only in the discrete step. With r(q, v, dv/dt, u) the residual
-by inverse dynamics, d(dv/dt) = -M^-1 dr at fixed dv/dt, so AutoDiffXd never factors a matrix.
+They use Drake's mass matrix, force elements (gravity, springs), joint damping and bias, and the forces of the diagram's
+systems. Of these forces, only those of the systems depend on u. Contact, joint limits, PD control and constraints are
+not included: they exist only in the discrete step. With r(q, v, dv/dt, u) the residual of inverse dynamics,
+d(dv/dt) = -M^-1 dr at fixed dv/dt, so AutoDiffXd never factors a matrix.
 """
 
 from typing import Any
@@ -25,9 +25,9 @@ from drake_diff.model.twin import Twin
 
 
 class EquationsOfMotion:
-    """dx/dt = f(x, u) of a model, for floats and for AutoDiffXd.
+    """The function dx/dt = f(x, u) of a model, for floats and for AutoDiffXd.
 
-    Raises ModelError where the model has PD control or constraints, which have no continuous form here.
+    Raises ModelError if the model has PD control or constraints, which have no continuous form.
     """
 
     def __init__(self, model: Model):
@@ -37,17 +37,17 @@ class EquationsOfMotion:
             raise ModelError("collocation: the model's constraints have no continuous form; use method='shooting'")
         self.model = model
         self.actuation = model.actuation
-        self.systems = bool(model.inputs.fed)  # whose forces depend on x and u
+        self.systems = bool(model.inputs.fed)  # forces of systems depend on x and u
         self.plain_rates = model.plant.IsVelocityEqualToQDot()
         self._still = np.zeros(model.nv)
 
     def __call__(self, x: Array, u: Array) -> Array:
-        """(nx,) dx/dt at `x` (nx,), `u` (nu,); SimulationError where they are not finite."""
+        """Return dx/dt (nx,) at `x` (nx,), `u` (nu,); raise SimulationError if they are not finite."""
         set_state(self.model.double, x)
         return np.asarray(self.values(np.concatenate([x, u])[None])[0])
 
     def values(self, knots: Array) -> Array:
-        """(K, nx) dx/dt at `knots` (K, nx + nu), rows [x, u]; NaN where a knot is not finite."""
+        """Return dx/dt (K, nx) at `knots` (K, nx + nu) with rows [x, u]; NaN if a knot is not finite."""
         if len(knots) == 1:
             return self._rates_at(knots[0])[None]
         model, twin = self.model, self.model.double
@@ -67,7 +67,7 @@ class EquationsOfMotion:
         return rates
 
     def _rates_at(self, knot: Array) -> Array:
-        """(nx,) dx/dt at one `knot`, without the arrays of many."""
+        """Return dx/dt (nx,) at one `knot` without the arrays for many knots."""
         twin, nx, nq = self.model.double, self.model.nx, self.model.nq
         if not np.isfinite(knot).all():
             return np.full(nx, np.nan)
@@ -79,7 +79,7 @@ class EquationsOfMotion:
         return rates
 
     def autodiff(self, x: Any, u: Any) -> Any:
-        """The same with AutoDiffXd in and out."""
+        """Return dx/dt for AutoDiffXd arguments."""
         set_state(self.model.double, ExtractValue(x).ravel())
         acceleration, mass = self.acceleration(ExtractValue(u).ravel())
         twin = self.model.autodiff
@@ -93,17 +93,17 @@ class EquationsOfMotion:
         return np.concatenate([self.q_dot(twin, x), by_row])
 
     def jacobian(self, knot: Array) -> Array:
-        """(nx, nx + nu) at `knot` = [x; u], by AutoDiffXd."""
+        """Return the Jacobian (nx, nx + nu) at `knot` = [x; u] by AutoDiffXd."""
         variables, nx = InitializeAutoDiff(knot).ravel(), self.model.nx
         return gradient_rows(self.autodiff(variables[:nx], variables[nx:]), len(knot))
 
     def q_dot(self, twin: Twin, x: Any) -> Any:
-        """(nq,) N(q) v of x (nx,), whose positions are the twin's."""
+        """Return N(q) v (nq,) for x (nx,), whose positions must be set in the twin."""
         v = x[self.model.nq :]
         return twin.rates(v)
 
     def acceleration(self, u: Array) -> tuple[Array, Array]:
-        """(dv/dt (nv,), M (nv, nv)) under u (nu,) in the double context's state."""
+        """Return (dv/dt (nv,), M (nv, nv)) for u (nu,) in the double context's state."""
         twin = self.model.double
         if self.systems:
             twin.set_input(u)
@@ -115,7 +115,7 @@ class EquationsOfMotion:
 @TemplateSystem.define("ContinuousSystem_")
 def ContinuousSystem_(T):  # type: ignore[no-untyped-def]
     class Impl(LeafSystem_[T]):  # type: ignore[misc]
-        """`EquationsOfMotion` as a Drake System with one input u and the state x = [q; v]."""
+        """The Drake System of `EquationsOfMotion`, with one input u and the state x = [q; v]."""
 
         def _construct(self, equations, converter=None):  # type: ignore[no-untyped-def]
             LeafSystem_[T].__init__(self, converter)

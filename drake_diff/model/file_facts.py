@@ -1,9 +1,9 @@
-"""What robot files say that Drake's plant does not keep, and MJCF where Drake reads something else than MuJoCo means.
+"""Facts in robot files that Drake's plant does not store, and corrections of MJCF that Drake reads unlike MuJoCo.
 
-Measured with Drake 1.51 against MuJoCo: a default class that does not name an element loses what its parents say of
-it; of two <default> sections the first is forgotten; the gear of a motor is no part of its effort limit; the range of
-a position actuator's target is taken for its effort limit, and its kv is dropped; joint springs, couplings of joints
-and other kinds of actuators are left out.
+These differences were measured between Drake 1.51 and MuJoCo. A default class that does not name an element loses the
+element's inherited attributes. The first of two <default> sections is ignored. A motor's gear is not part of its effort
+limit. The range of a position actuator's target is used as its effort limit, and its kv is dropped. Joint springs,
+couplings of joints and other kinds of actuators are ignored.
 """
 
 import math
@@ -25,28 +25,28 @@ from drake_diff.model.loops import APART, WORLD, HeldBodies, HeldPoints, loops_o
 from drake_diff.model.plant import actuators
 from drake_diff.model.xml_text import Element, XmlText
 
-MAIN = "main"  # the default class that all others inherit from
-KINDS = ("motor", "position")  # of actuators that Drake reads
+MAIN = "main"  # the root default class, from which all others inherit
+KINDS = ("motor", "position")  # actuators that Drake reads
 ACTUATORS = ("general", *KINDS, "velocity", "intvelocity", "damper", "cylinder", "muscle", "adhesion")
-SHARED = ("gear", "ctrlrange", "ctrllimited", "forcerange", "forcelimited")  # by the defaults of all kinds of these
-SCALAR = ("hinge", "slide")  # the types of joints with one coordinate
+SHARED = ("gear", "ctrlrange", "ctrllimited", "forcerange", "forcelimited")  # in the defaults of all actuator kinds
+SCALAR = ("hinge", "slide")  # joint types with one coordinate
 POSES = ("pos", "quat", "axisangle", "euler", "xyaxes", "zaxis")
-FLAGS = ("contact", "constraint", "gravity", "equality")  # what <option><flag> may disable
+FLAGS = ("contact", "constraint", "gravity", "equality")  # disabled by <option><flag>
 GAINS = {"general": ("gainprm", "biasprm"), "position": ("kp", "kv"), "velocity": ("kv",)}
 OF_MASSES = ("boundmass", "boundinertia", "settotalmass")  # attributes of the compiler
-PLACE = "_before_its_joints"  # the end of the names of bodies that are added around those with several joints
-FRAME = "_frame"  # the end of the names of those that <frame>s become
+PLACE = "_before_its_joints"  # suffix of the names of bodies added around those with several joints
+FRAME = "_frame"  # suffix of the names of bodies made from <frame>s
 MOST_INCLUDES = 100
-UNSEEN = 2**30  # a mask that no other meets: Drake makes no collision shape of a geom whose masks are both 0
+UNSEEN = 2**30  # a mask that matches no other; Drake makes no collision shape of a geom with both masks 0
 
 Attributes = dict[str, str]
 Defaults = dict[str, dict[str, Attributes]]  # by class and tag
 
 
 def as_mujoco_means(xml: XmlText, path: Path, notes: list[str]) -> XmlText:
-    """The text of the MJCF file at `path` so that Drake reads it as MuJoCo does; a sentence in `notes` for each change.
+    """Rewrite the MJCF file at `path` so that Drake reads it as MuJoCo does; add a sentence to `notes` for each change.
 
-    What it includes is put in place, each on one line, so that other lines keep their numbers.
+    Included files are inserted, each on one line, so that the other lines keep their numbers.
     """
     xml = with_includes(xml, path)
     if not xml.root.get("model"):
@@ -71,7 +71,7 @@ def as_mujoco_means(xml: XmlText, path: Path, notes: list[str]) -> XmlText:
 
 
 def _frames_to_bodies(xml: XmlText) -> list[str]:
-    """Make bodies without a joint of <frame>s, whose content Drake would leave out; those with a joint stay."""
+    """Turn <frame>s, whose content Drake would ignore, into bodies without a joint; keep <frame>s with a joint."""
     frames = [
         frame
         for world in xml.root.findall("worldbody")
@@ -89,7 +89,7 @@ def _frames_to_bodies(xml: XmlText) -> list[str]:
         while body.parent is not None and body in frames:
             body = body.parent
         inertial = None if by_shapes else body.find("inertial")
-        if inertial is not None and _numbers(inertial.get("mass")) != [0.0]:  # which has the inertia of all shapes
+        if inertial is not None and _numbers(inertial.get("mass")) != [0.0]:  # <inertial> has the inertia of all shapes
             for geom in frame.findall("geom"):
                 xml.set(geom, "mass", "0")
         xml.set(frame, "name", f"{frame.get('name', 'frame')}_{i}{FRAME}")
@@ -99,9 +99,9 @@ def _frames_to_bodies(xml: XmlText) -> list[str]:
 
 
 def _without_mass(xml: XmlText) -> list[str]:
-    """Let bodies whose <inertial> has a mass of 0, which Drake refuses, have shapes without mass instead.
+    """Replace an <inertial> of mass 0, which Drake refuses, by shapes without mass.
 
-    With inertiafromgeom="true" an <inertial> counts in bodies without shapes alone, where Drake has no mass.
+    With inertiafromgeom="true", an <inertial> applies only to bodies without shapes, where Drake has no mass.
     """
     massless = list[str]()
     by_shapes = Mjcf(xml).compiler("inertiafromgeom", "auto") == "true"
@@ -121,14 +121,14 @@ def _without_mass(xml: XmlText) -> list[str]:
 
 
 def _geoms_of(body: Element) -> Iterator[Element]:
-    """Those of a body, also in its frames."""
+    """Yield the geoms of a body, including those in its frames."""
     yield from body.findall("geom")
     for frame in body.findall("frame"):
         yield from _geoms_of(frame)
 
 
 def _poses_of_several_joints(xml: XmlText) -> list[str]:
-    """Give the pose of a body with several joints to a body around it: Drake puts it behind the first of them."""
+    """Move the pose of a body with several joints to a body around it, since Drake applies it after the first joint."""
     placed = list[str]()
     for body in (b for world in xml.root.findall("worldbody") for b in world.iter("body")):
         pose = {name: value for name, value in body.attributes.items() if name in POSES}
@@ -143,7 +143,7 @@ def _poses_of_several_joints(xml: XmlText) -> list[str]:
 
 
 def _name_joints_with_armature(xml: XmlText) -> list[str]:
-    """Name the joints that have an armature and no name, by which they get it."""
+    """Name the unnamed joints with an armature, so that the armature can be assigned by name."""
     mjcf, names = Mjcf(xml), list[str]()
     joints = [joint for world in xml.root.findall("worldbody") for joint in world.iter("joint")]
     for i, joint in enumerate(joints):
@@ -154,7 +154,7 @@ def _name_joints_with_armature(xml: XmlText) -> list[str]:
 
 
 def _tendons_of_one_joint(xml: XmlText) -> list[str]:
-    """Let an actuator of a <fixed> tendon drive a joint, where the others of the tendon follow that in proportion."""
+    """Let the actuator of a <fixed> tendon drive the joint that the tendon's other joints follow in proportion."""
     mjcf, written = Mjcf(xml), list[str]()
     follows = {mimic.follower: mimic for mimic in mjcf.mimics("")}
     tendons = {t.get("name"): t for section in xml.root.findall("tendon") for t in section.findall("fixed")}
@@ -183,9 +183,9 @@ def _tendons_of_one_joint(xml: XmlText) -> list[str]:
 
 
 def _velocity_servos(xml: XmlText) -> list[str]:
-    """Write <velocity> actuators without a limit of force, which Drake does not read, as motors and damping.
+    """Rewrite <velocity> actuators without a force limit, which Drake does not read, as motors with joint damping.
 
-    One exerts gear kv (ctrl - gear v): that of a motor of the gear times kv, with a damping of gear^2 kv of its joint.
+    The force gear kv (ctrl - gear v) is that of a motor with gear times kv, plus a joint damping of gear^2 kv.
     """
     mjcf, written = Mjcf(xml), list[str]()
     elements = {e.get("name"): e for world in xml.root.findall("worldbody") for e in world.iter("joint")}
@@ -214,10 +214,10 @@ def _velocity_servos(xml: XmlText) -> list[str]:
 
 
 def _motors_and_servos(xml: XmlText) -> list[str]:
-    """Write <general> actuators of joints, which Drake does not read, as the motors and servos that they are.
+    """Rewrite <general> actuators of joints, which Drake does not read, as equivalent motors and servos.
 
-    With gain g and bias (b, -k, -d) one is a servo of kp k and kv d, or where g is k of the damping ratio -d below 0.
-    Its commanded position is (g ctrl + b) / k.
+    With gain g and bias (b, -k, -d), the actuator is a servo with kp k and kv d, or with damping ratio -d if g is k and
+    d is below 0. Its commanded position is (g ctrl + b) / k.
     """
     mjcf, written = Mjcf(xml), list[str]()
     for element in (e for section in xml.root.findall("actuator") for e in section.findall("general")):
@@ -248,7 +248,7 @@ def _motors_and_servos(xml: XmlText) -> list[str]:
 
 
 def _unread(mjcf: "Mjcf", path: Path) -> Iterator[str]:
-    """A sentence for each thing that Drake's parser leaves out without a word."""
+    """Yield a sentence for each element that Drake's parser silently ignores."""
     elements = [element for section in mjcf.root.findall("worldbody") for element in section.iter()]
     for element in elements:
         if element.tag == "replicate":
@@ -267,7 +267,7 @@ def _unread(mjcf: "Mjcf", path: Path) -> Iterator[str]:
 
 
 def with_includes(xml: XmlText, path: Path) -> XmlText:
-    """`xml`, the text of the file at `path`, with what it includes. ModelError where that never ends."""
+    """Return `xml`, the text of the file at `path`, with its included files; raise ModelError for endless includes."""
     count = 0
     while includes := [(element, file) for element in xml.root.iter("include") if (file := _included(element, path))]:
         count += len(includes)
@@ -286,14 +286,14 @@ def _included(element: Element, path: Path) -> Path | None:
 
 
 Range = tuple[float, float]
-Key = tuple[str, str]  # the names of a model instance and of a joint or link in it
+Key = tuple[str, str]  # the names of a model instance and of its joint or link
 
 
 @dataclass(frozen=True)
 class Mimic:
-    """q of `follower` = ratio * q of `leader` + offset, joints of one model instance, by their names.
+    """A coupling q of `follower` = ratio * q of `leader` + offset between named joints of one model instance.
 
-    `in_drake` says whether Drake's parser makes a constraint of it. MJCF's equalities of joints are such, too.
+    `in_drake` is true if Drake's parser adds a constraint for it. MJCF's joint equalities are also represented by this.
     """
 
     instance: str
@@ -310,15 +310,15 @@ class Mimic:
 
 @dataclass(frozen=True)
 class JointSays:
-    """Of a joint: the effort limit [N or N m] as written, None where there is none.
+    """The file's data of a joint, with the effort limit [N or N m] as written, or None.
 
-    `sides` are the least and the greatest effort, where MJCF has them differ: the limit is then the larger size.
-    `passive` says that it is not to be driven: so SDF means an effort limit of 0, where it makes a motor of each other.
-    `range` is that of the joint, `command` that of its servo's commanded positions [rad or m], and `damping_ratio` what
-    MuJoCo makes the servo's kv of, by the inertia that the joint moves in the file's pose.
-    `spring` is the stiffness [N m/rad or N/m] and the position at rest of one that Drake's parser does not read,
-    `armature` [kg m^2 or kg] MJCF's inertia of a rotor, which Drake has only where an actuator is, and `start` [rad or
-    m] the coordinate in MJCF's pose.
+    `sides` are the minimum and maximum effort if they differ in MJCF; the limit is then the larger magnitude.
+    `passive` joints must not be driven: SDF marks them by an effort limit of 0, and makes a motor of every other joint.
+    `range` is the joint's range, and `command` the range of its servo's commanded positions [rad or m]. MuJoCo computes
+    the servo's kv from `damping_ratio` and the inertia that the joint moves in the file's pose.
+    `spring` is the stiffness [N m/rad or N/m] and the rest position of a spring that Drake's parser ignores. `armature`
+    [kg m^2 or kg] is MJCF's rotor inertia, which Drake has only for joints with actuators. `start` [rad or m] is the
+    coordinate in MJCF's pose.
     """
 
     effort: float | None
@@ -334,9 +334,9 @@ class JointSays:
 
 @dataclass(frozen=True)
 class LinkSays:
-    """Of a link: mass [kg] and the trace of its inertia [kg m^2], None where not given, and its collision shapes.
+    """A link's mass [kg] and trace of inertia [kg m^2], None if not given, and its number of collision shapes.
 
-    `defaults` is whether the format has a mass and an inertia of its own for a link without: SDF has 1 and 1.
+    `defaults` is whether the format has a default mass and inertia for a link without them; in SDF both are 1.
     """
 
     mass: float | None
@@ -347,10 +347,10 @@ class LinkSays:
 
 @dataclass(frozen=True)
 class GeomSays:
-    """Of a shape of MJCF that may touch: its own name and its body's, as Drake has them, and MuJoCo's filter.
+    """A collision shape of MJCF, with its own and its body's name in Drake, and the data of MuJoCo's contact filter.
 
-    `rigid` is the number of the bodies that move as one with its own, 0 the world, `carrier` that of those that carry
-    them. Shapes whose masks meet touch, but not on one of these, or on one and its carrier, unless that is the world.
+    `rigid` numbers the groups of bodies that move as one; the world is group 0. `carrier` is the parent group. Shapes
+    with matching masks collide, unless they are in the same group, or in a group and its parent other than the world.
     """
 
     body: str
@@ -361,7 +361,7 @@ class GeomSays:
     conaffinity: int
 
     def may_touch(self, other: "GeomSays") -> bool:
-        """Whether MuJoCo's filter lets the two touch."""
+        """Return whether MuJoCo's filter allows contact between the two shapes."""
         neighbours = self.rigid and other.rigid and (self.carrier == other.rigid or other.carrier == self.rigid)
         masks = self.contype & other.conaffinity or other.contype & self.conaffinity
         return bool(masks and self.rigid != other.rigid and not neighbours)
@@ -369,26 +369,26 @@ class GeomSays:
 
 @dataclass(frozen=True)
 class TouchFilter:
-    """What may touch in an MJCF file: its shapes, the pairs of names that touch in any case, and bodies that do not."""
+    """The contact filter of an MJCF file: shapes, pairs of names that always collide, and excluded pairs of bodies."""
 
     geoms: tuple[GeomSays, ...]
     pairs: frozenset[frozenset[str]]
     excluded: frozenset[frozenset[str]]
 
     def may_touch(self, a: GeomSays, b: GeomSays) -> bool:
-        """Whether two shapes touch in MuJoCo where they meet."""
+        """Return whether two shapes may collide in MuJoCo."""
         paired, excluded = frozenset((a.name, b.name)) in self.pairs, frozenset((a.body, b.body)) in self.excluded
         return paired or (a.may_touch(b) and not excluded)
 
 
 @dataclass(frozen=True)
 class FileFacts:
-    """What the files say, joints and links by the names of their model instance and their own.
+    """The data of robot files; joints and links are indexed by the names of their model instance and their own names.
 
-    `followers` are the joints that mimic another one. `disabled` is what MJCF switches off: contact and constraint,
-    which Drake has all the same, and gravity and equality. `left_out` are the joints of actuators of MJCF that Drake
-    does not read, `touching` is what MJCF lets touch, by model instance. `thrusters` are the fields of a BodyForce for
-    each motor of a site. `loops` are what is held together, `held_points` are the constraints of the plant that do so.
+    `followers` are mimic joints. `disabled` are the flags that MJCF disables: contact and constraint, which stay active
+    in Drake, gravity and equality. `left_out` are the joints of MJCF actuators that Drake does not read. `touching` is
+    the contact filter of each MJCF instance. `thrusters` are the BodyForce fields for each motor at a site. `loops` are
+    the bodies to connect, and `held_points` the constraints of the plant that connect them.
     """
 
     joints: dict[Key, JointSays] = field(default_factory=dict)
@@ -404,12 +404,12 @@ class FileFacts:
 
 @dataclass(frozen=True)
 class FileActuator:
-    """An actuator as MuJoCo means it: the limits of its effort at the joint, and what a PD law there would have."""
+    """An actuator with MuJoCo's semantics: its effort limits at the joint, and the gains of an equivalent PD law."""
 
     kind: str
     name: str
     joint: str
-    read: bool  # by Drake
+    read: bool  # whether Drake reads it
     sides: Range  # [N or N m]
     gains: tuple[float, float] | None
     line: int
@@ -422,7 +422,7 @@ class FileActuator:
 
 
 class Mjcf:
-    """What an MJCF file says, its default classes resolved."""
+    """The data of an MJCF file with resolved default classes."""
 
     def __init__(self, xml: XmlText):
         self.xml, self.root = xml, xml.root
@@ -442,14 +442,14 @@ class Mjcf:
 
     @property
     def needs_flat_defaults(self) -> bool:
-        """Whether Drake would lose a part of the default classes."""
+        """Whether Drake would lose part of the default classes."""
         sections = self.root.findall("default")
         return len(sections) > 1 or any(_loses(section, set()) for section in sections)
 
     def flatten_defaults(self) -> None:
-        """Put a section for each class, which says all that it inherits, in the place of all.
+        """Replace all sections by one section per class, which has all inherited attributes.
 
-        Drake lets a class of its own section inherit nothing. So has MuJoCo what <main> says after the class was made.
+        In Drake, a class in its own section inherits nothing. In MuJoCo, it does not inherit later additions to <main>.
         """
         first, *others = self.root.findall("default")
         sections = [
@@ -457,10 +457,10 @@ class Mjcf:
         ]
         self.xml.replace(first, "".join(sections))
         for section in others:
-            self.xml.replace(section, "")  # which stays in the tree, to be read again
+            self.xml.replace(section, "")  # the element stays in the tree until the text is read again
 
     def attributes(self, element: Element) -> Attributes:
-        """Those of an element, with those that its default class gives."""
+        """Return the attributes of an element, including those of its default class."""
         name, element_above = element.get("class"), element.parent
         while not name and element_above is not None:
             name, element_above = element_above.get("childclass"), element_above.parent
@@ -468,7 +468,7 @@ class Mjcf:
 
     @cached_property
     def joints(self) -> dict[str, JointSays]:
-        """Those of one coordinate that have a name."""
+        """The named joints with one coordinate."""
         joints = {}
         for element in (e for body in self.root.findall("worldbody") for e in body.iter("joint")):
             says = self.attributes(element)
@@ -491,13 +491,13 @@ class Mjcf:
 
     @cached_property
     def sites(self) -> dict[str, Element]:
-        """Those that have a name."""
+        """The named sites."""
         sites = [site for world in self.root.findall("worldbody") for site in world.iter("site")]
         return {name: site for site in sites if (name := self.attributes(site).get("name"))}
 
     @property
     def has_other_springs(self) -> bool:
-        """Whether a joint has a spring that is not among `joints`: one of a ball, one without a name, a polynomial."""
+        """Whether a spring is missing in `joints`: of a ball joint, of an unnamed joint, or a polynomial."""
         springs = [
             element
             for body in self.root.findall("worldbody")
@@ -508,14 +508,14 @@ class Mjcf:
 
     @property
     def weightless(self) -> bool:
-        """Whether the file compensates the gravity of each of its bodies."""
+        """Whether the file compensates the gravity of all bodies."""
         bodies = [body for world in self.root.findall("worldbody") for body in world.iter("body")]
         return all(
             _first(body.get("gravcomp")) == 1 for body in bodies if not body.get("name").endswith((PLACE, FRAME))
         )
 
     def _range(self, says: Attributes, name: str) -> Range | None:
-        """A range that holds; None where none does."""
+        """Return an active range, or None."""
         ends = _numbers(says.get(f"{name}range", ""))
         limited = says.get(f"{name}limited", "auto")
         holds = limited == "true" or (limited == "auto" and self.autolimits)
@@ -523,7 +523,7 @@ class Mjcf:
 
     @cached_property
     def actuators(self) -> list[FileActuator]:
-        """All, in the order of the file."""
+        """All actuators in the order of the file."""
         return [self._actuator(e) for section in self.root.findall("actuator") for e in section.children]
 
     def _actuator(self, element: Element) -> FileActuator:
@@ -549,7 +549,7 @@ class Mjcf:
         )
 
     def _command(self, says: Attributes, control: Range | None, gear: float) -> Range | None:
-        """What a servo is commanded to, at the joint [rad or m]; None without a range."""
+        """Return the range of a servo's commanded positions at the joint [rad or m], or None."""
         inherited = _first(says.get("inheritrange", "0"))
         ends = self.joints[says["joint"]].range if inherited and says.get("joint") in self.joints else None
         if ends:
@@ -558,7 +558,7 @@ class Mjcf:
         return (min(e / gear for e in control), max(e / gear for e in control)) if control and gear else None
 
     def thrusters(self) -> Iterator[tuple[Element, dict[str, Any]]]:
-        """The motors of sites that push along a line, with or without a moment about it, as fields of a BodyForce."""
+        """Yield motors of sites with a force along a line, and possibly a moment about it, as fields of a BodyForce."""
         for element in (e for section in self.root.findall("actuator") for e in section.children):
             says = self.attributes(element)
             site, bias = self.sites.get(says.get("site", "")), says.get("biastype", "none")
@@ -589,7 +589,7 @@ class Mjcf:
             )
 
     def loops(self, instance: str) -> Iterator[tuple[Element, HeldBodies | None]]:
-        """Each <connect> and <weld>, and what it holds together; None of one that is not active."""
+        """Yield each <connect> and <weld> with the bodies that it connects, or None if it is not active."""
         for element in (e for section in self.root.findall("equality") for e in section.children):
             says = self._equality(element)
             if element.tag not in ("connect", "weld"):
@@ -605,7 +605,7 @@ class Mjcf:
                 yield element, _loop_of_weld(instance, says)
 
     def _equality(self, element: Element) -> Attributes:
-        """The attributes of an equality, `active` with what the file disables."""
+        """Return the attributes of an equality; `active` includes the file's disabled flags."""
         of_class = self.defaults.get(element.get("class") or MAIN, self.defaults[MAIN])
         says = {"active": "true"} | of_class.get("equality", {}) | element.attributes
         return says | ({"active": "false"} if {"equality", "constraint"} & set(self.disabled) else {})
@@ -621,7 +621,7 @@ class Mjcf:
         return HeldBodies(instance, body, other, points, others)
 
     def _turn(self, says: Attributes) -> np.ndarray:
-        """(3, 3) the orientation that the attributes of an element give."""
+        """Return the orientation (3, 3) from the attributes of an element."""
         unit = math.pi / 180 if self.degrees else 1.0
         if quat := _numbers(says.get("quat", "")):
             return Rotation.from_quat([*quat[1:], quat[0]]).as_matrix()
@@ -639,7 +639,7 @@ class Mjcf:
         return np.eye(3)
 
     def mimics(self, instance: str) -> Iterator[Mimic]:
-        """Joints that follow another one linearly, of the robot that is called `instance`."""
+        """Yield joints that follow another joint linearly, for the robot named `instance`."""
         for element in (e for section in self.root.findall("equality") for e in section.findall("joint")):
             says = self._equality(element)
             names = says.get("joint1", ""), says.get("joint2", "")
@@ -649,19 +649,19 @@ class Mjcf:
                 yield Mimic(instance, *names, terms[1], a.start + terms[0] - terms[1] * b.start, in_drake=False)
 
     def mesh_and_density(self, geom: Element) -> tuple[str, float]:
-        """The name of the mesh that gives a geom its inertia, and its density [kg/m^3]; 0 where its mass is given."""
+        """Return the mesh that defines a geom's inertia, and its density [kg/m^3], which is 0 if its mass is given."""
         says = self.attributes(geom)
         given = _numbers(says.get("mass", ""))
         return "" if given == [0.0] else says.get("mesh", ""), 0.0 if given else _first(says.get("density", "1000"))
 
     def masks(self, geom: Element) -> tuple[int, int]:
-        """Its contype and conaffinity."""
+        """Return contype and conaffinity of a geom."""
         says = self.attributes(geom)
         return int(_first(says.get("contype", "1"), 1.0)), int(_first(says.get("conaffinity", "1"), 1.0))
 
     @property
     def touching(self) -> TouchFilter:
-        """Which shapes may touch; a body without a name is called ?0, ?1, ... in the order of the file."""
+        """The contact filter; unnamed bodies are called ?0, ?1, ... in the order of the file."""
         geoms, groups, nameless = list[GeomSays](), count(1), count()
 
         def read(body: Element, name: str, rigid: int, carrier: int) -> None:
@@ -685,13 +685,13 @@ class Mjcf:
 
     @property
     def disabled(self) -> tuple[str, ...]:
-        """Which of FLAGS the file disables."""
+        """The entries of FLAGS that the file disables."""
         flags = [flag for option in self.root.findall("option") for flag in option.findall("flag")]
         return tuple(name for name in FLAGS if any(flag.get(name) == "disable" for flag in flags))
 
 
 def correct(plant: MultibodyPlant, instance: ModelInstanceIndex, mjcf: Mjcf) -> list[str]:
-    """Give the actuators of a plant that is not finalized the limits and gains that the file means; what was done."""
+    """Give the actuators of an unfinalized plant the limits and gains of the file; return notes on the changes."""
     motors = [actuator for actuator in actuators(plant) if actuator.model_instance() == instance]
     says = [actuator for kind in KINDS for actuator in mjcf.actuators if actuator.read and actuator.kind == kind]
     if [a.joint().name() for a in motors] != [a.joint for a in says]:  # in Drake's order
@@ -728,15 +728,15 @@ def correct(plant: MultibodyPlant, instance: ModelInstanceIndex, mjcf: Mjcf) -> 
 
 
 def compiler_changes_masses(xml: XmlText) -> bool:
-    """Whether the compiler of an MJCF file bounds masses or inertias, or gives their sum."""
+    """Return whether the compiler of an MJCF file bounds masses or inertias, or sets the total mass."""
     return any(_first(compiler.get(name)) > 0 for compiler in xml.root.findall("compiler") for name in OF_MASSES)
 
 
 def write_masses(xml: XmlText, read: Callable[[XmlText], dict[str, Any]]) -> str:
-    """Write out the masses and inertias that the compiler of MJCF makes: lower bounds of each, and the sum of masses.
+    """Write out the masses and inertias that the MJCF compiler computes: lower bounds of each, and the total mass.
 
-    `read` gives the bodies of a file as Drake reads it, by name. Inertias are bounded along the principal axes. What
-    Drake does not read, as in <replicate>, has no part in the sum.
+    `read` returns the bodies of a file as Drake reads it, by name. Inertias are bounded along the principal axes.
+    Elements that Drake does not read, such as <replicate>, are not part of the total mass.
     """
     compiler = Mjcf(xml).compiler
     least, least_inertia, total = (_first(compiler(name, "0")) for name in OF_MASSES)
@@ -765,13 +765,13 @@ def write_masses(xml: XmlText, read: Callable[[XmlText], dict[str, Any]]) -> str
             middle = " ".join(repr(float(c)) for c in (center if had else np.zeros(3)))
             xml.append(body, f'<inertial pos="{middle}" mass="{scale * mass!r}" fullinertia="{words}"/>')
     for element in xml.root.findall("compiler"):
-        for name in (*OF_MASSES, "inertiafromgeom"):  # which would take shapes before what is written
+        for name in (*OF_MASSES, "inertiafromgeom"):  # inertiafromgeom would use shapes instead of the written inertia
             xml.drop(element, name)
     return f"Masses are those of the compiler's bounds and sum ({', '.join(OF_MASSES)})."
 
 
 def _loop_of_weld(instance: str, says: Attributes) -> HeldBodies:
-    """The anchor in the second body and two points beside it, where relpose puts them, else where they are."""
+    """Return the anchor in the second body and two nearby points, placed by relpose or else by the file's pose."""
     anchor = np.array([*_numbers(says.get("anchor", "")), 0.0, 0.0, 0.0][:3])
     steps = (np.zeros(3), *(APART * np.eye(3)[:2]))[: 3 if _first(says.get("torquescale", "1"), 1.0) else 1]
     points = tuple(tuple((anchor + step).tolist()) for step in steps)
@@ -785,7 +785,7 @@ def _loop_of_weld(instance: str, says: Attributes) -> HeldBodies:
 
 
 def _gains_of_other_kinds(mjcf: Mjcf, path: Path) -> Iterator[str]:
-    """MuJoCo has one default for all kinds of actuators: gains of one kind are those of another, which is not read."""
+    """Yield a note for gains that an actuator inherits in MuJoCo from the default of another kind; they are ignored."""
     for element in (e for section in mjcf.root.findall("actuator") for e in section.children):
         tags = mjcf.defaults.get(element.get("class") or MAIN, mjcf.defaults[MAIN])
         others = [tag for tag in GAINS if tag != element.tag and any(name in tags.get(tag, {}) for name in GAINS[tag])]
@@ -812,7 +812,7 @@ def _read_class(section: Element, name: str, parent: str, defaults: Defaults) ->
 
 
 def _loses(section: Element, above: set[str]) -> bool:
-    """Whether a class inside does not name an element that one around it names."""
+    """Return whether an inner class does not name an element that an outer class names."""
     here = {element.tag for element in section.children if element.tag != "default"}
     if not above <= here:
         return True
@@ -827,7 +827,7 @@ def _written(tags: dict[str, Attributes]) -> str:
 
 
 def _numbers(text: str) -> list[float]:
-    """The numbers of an attribute; none where it has something else, which Drake refuses where it reads it."""
+    """Return the numbers of an attribute, or [] if it has other text, which Drake refuses when it reads it."""
     try:
         return [float(word) for word in text.split()]
     except ValueError:
@@ -840,9 +840,9 @@ def _first(text: str, default: float = 0.0) -> float:
 
 
 def read_facts(xml: XmlText, instance: str | None, facts: FileFacts) -> None:
-    """Add to `facts` what a robot file, its slips mended, says of joints and links; of MJCF no links.
+    """Add the data of joints and links in a repaired robot file to `facts`; MJCF links are not added.
 
-    `instance` is what a .dmd.yaml calls the robot.
+    `instance` is the robot's name in a .dmd.yaml.
     """
     root = xml.root
     if root.tag == "robot":
@@ -912,7 +912,7 @@ def _read_sdf(xml: XmlText, model: Element, name: str, facts: FileFacts) -> None
         mimic = joint.find("axis", "mimic")
         if mimic_element is not None:  # Drake's element
             facts.followers[key] = _drakes_mimic(key, mimic_element)
-        elif mimic is not None:  # SDF's, which Drake does not read
+        elif mimic is not None:  # SDF's element, which Drake does not read
             ratio, offset, reference = (
                 default if mimic.find(tag) is None else _or_nan(_text(mimic, tag))
                 for tag, default in (("multiplier", 1.0), ("offset", 0.0), ("reference", 0.0))
@@ -938,7 +938,7 @@ def _number(text: str) -> float | None:
     try:
         return float(text)
     except ValueError:
-        return None  # Drake refuses what it reads and cannot make a number of
+        return None  # Drake raises an error if it reads this text
 
 
 def _sum(numbers: list[float | None]) -> float | None:

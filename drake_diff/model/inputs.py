@@ -1,13 +1,13 @@
-"""What the input u of a model is: its plant's actuators, forces on bodies, and what a user's diagram exports.
+"""The entries of a model's input u: the plant's actuators, forces on bodies, and exported ports of a diagram.
 
 A diagram's own systems (propellers, wings, gains, thrusters) act on the plant through its input ports. Vector inputs
 that the diagram exports and that reach the plant are entries of u, in the order of the exports. Actuators that nothing
-in the diagram drives are entries, too: where the diagram exports them, else first. The entry of an actuator is its
-effort, or the position that its servo is commanded to: Drake's PD control then exerts
+in the diagram drives are entries, too, at the place of their exported port, or else first. The entry of an actuator is
+its effort, or the commanded position of its servo, to which Drake's PD control applies
 
     clip(kp (u - q') - kd v', -limit, limit)
 
-at the end (q', v') of the step, as MuJoCo's <position> does at its start.
+at the end (q', v') of the step, while MuJoCo's <position> uses the state at the start.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,31 +28,31 @@ from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.model.file_facts import FileFacts
 from drake_diff.model.plant import actuators, bodies, instances, joints, labelled
 
-BODY_FORCES = "body_forces"  # the exported port of those that `load_model` adds
-UNKNOWN = "?"  # the unit of an input that only its own system knows
-# [s] when what the diagram's systems exert is compared with the start: 0.01 ... 10, and far later.
-Row = tuple[str, str, float, float, int]  # name, unit, lower, upper and which actuator, -1 for none
+BODY_FORCES = "body_forces"  # the exported port of the forces that `load_model` adds
+UNKNOWN = "?"  # the unit of an input that only its own system defines
+# [s] times at which the systems' forces are compared with those at the start: 0.01 ... 10, and much later.
+Row = tuple[str, str, float, float, int]  # name, unit, lower, upper, and the index of the actuator or -1
 TIMES = (*np.linspace(0.01, 10.0, 100).tolist(), 37.1, 1003.7)
 
 
 @dataclass(frozen=True)
 class BodyForce:
-    """A force on a body as an input of a model: a propeller, a thruster, a jet. `load_model(body_forces=...)` takes it.
+    """A force on a body as a model input: a propeller, a thruster, a jet. `load_model(body_forces=...)` accepts it.
 
-    The input f [N] pushes at a point of the body along a direction fixed in it, with a moment of `moment_ratio` f
-    about that direction. It is Drake's `Propeller` with a thrust ratio of 1.
+    The input f [N] acts at a point of the body in a direction fixed to the body, with a moment `moment_ratio` f about
+    that direction. It is Drake's `Propeller` with a thrust ratio of 1.
 
     Args:
-        name: What the input is called.
-        body: The link that it pushes, "instance::link" where two model instances have one of that name.
-        point: (3,) [m] where, in the link's frame.
-        direction: (3,) along what, in the link's frame; its length does not matter.
-        moment_ratio: [m] moment about `direction` per force: positive turns by the right-hand rule.
-        lower: [N] the least force. A bound of problems on the model: steps and rollouts do not clip.
-        upper: [N] the greatest.
+        name: The name of the input.
+        body: The link it acts on, "instance::link" if two model instances have a link of that name.
+        point: (3,) The point of application in the link's frame [m].
+        direction: (3,) The direction in the link's frame; its length is irrelevant.
+        moment_ratio: The moment about `direction` per force [m], positive by the right-hand rule.
+        lower: The smallest force [N]. It bounds problems with the model, but steps and rollouts do not clip.
+        upper: The largest force [N].
 
     Raises:
-        InputError: A number is not finite, the direction is zero, or the limits leave nothing.
+        InputError: A number is not finite, the direction is zero, or `lower` is not below `upper`.
 
     Example:
         >>> rotor = dd.model.BodyForce("rotor", "ball", direction=(0, 0, 1), upper=20.0)
@@ -79,14 +79,14 @@ class BodyForce:
             object.__setattr__(self, name, tuple(numbers) if shape else numbers)
         if not np.any(self.direction):
             raise InputError(f"{subject}, direction", got=self.direction, expected="not zero")
-        for side, none in (("lower", -np.inf), ("upper", np.inf)):  # a record writes an infinite limit as None
+        for side, none in (("lower", -np.inf), ("upper", np.inf)):  # an infinite limit is None in records
             given = getattr(self, side)
             object.__setattr__(self, side, none if given is None else _limit(f"{subject}, {side}", given))
         if not self.lower < self.upper:
             raise InputError(subject, got=f"[{self.lower:g}, {self.upper:g}]", expected="lower below upper")
 
     def to_dict(self) -> dict[str, Any]:
-        """Its fields for JSON; an infinite limit is None."""
+        """Return the fields for JSON; an infinite limit is None."""
         values: dict[str, Any] = plain_numbers(asdict(self))
         return values
 
@@ -98,7 +98,7 @@ def _limit(subject: str, given: Any) -> float:
 
 
 def check_body_forces(given: Sequence[BodyForce | Mapping[str, Any]]) -> tuple[BodyForce, ...]:
-    """What `load_model` was given, or what a record has of it, as BodyForces of different names."""
+    """Convert the argument of `load_model`, or its record, to BodyForces with unique names."""
     expected = "a list of dd.model.BodyForce"
     if isinstance(given, (str, Mapping, BodyForce)) or not isinstance(given, Sequence):
         raise InputError("body_forces", got=type(given).__name__, expected=expected)
@@ -120,9 +120,9 @@ def check_body_forces(given: Sequence[BodyForce | Mapping[str, Any]]) -> tuple[B
 
 
 def add_body_forces(builder: DiagramBuilder, plant: MultibodyPlant, forces: Sequence[BodyForce]) -> None:
-    """One Propeller with an exported command for each of `forces`; the plant is finalized, the diagram not built.
+    """Add a Propeller with an exported command for each of `forces`, to a finalized plant in a diagram builder.
 
-    Raises UnknownNameError, which lists the links, or InputError where a name is an actuator's.
+    Raises UnknownNameError, which lists the links, or InputError if the name belongs to an actuator.
     """
     if not forces:
         return
@@ -132,7 +132,7 @@ def add_body_forces(builder: DiagramBuilder, plant: MultibodyPlant, forces: Sequ
             raise UnknownNameError(f"body of the BodyForce {force.name}", got=force.body, known=links)
         if force.name in driven:
             raise InputError("body_forces", got=force.name, expected="a name that no actuator has")
-        direction = np.array(force.direction) / np.max(np.abs(force.direction))  # Drake refuses a short one
+        direction = np.array(force.direction) / np.max(np.abs(force.direction))  # Drake refuses short vectors
         pose = RigidTransform(RotationMatrix.MakeFromOneVector(direction, 2), np.array(force.point))
         propellers.append(PropellerInfo(links[force.body].index(), pose, 1.0, force.moment_ratio))
     system = builder.AddNamedSystem(BODY_FORCES, Propeller(propellers))
@@ -143,33 +143,33 @@ def add_body_forces(builder: DiagramBuilder, plant: MultibodyPlant, forces: Sequ
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """What each entry of u (nu,) is, and which input ports of the plant the diagram's systems feed."""
+    """The meaning of each entry of u (nu,), and the plant's input ports that the diagram's systems feed."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
     lower: Array  # (nu,)
     upper: Array
-    actuator: NDArray[np.intp]  # (nu,) which actuator an entry drives, -1 where it is one of a port
-    commanded: NDArray[np.bool_]  # (nu,) whether an entry is a position that a servo is commanded to
-    ports: tuple[tuple[int, slice], ...]  # the diagram's own ports that are inputs, and where they stand in u
+    actuator: NDArray[np.intp]  # (nu,) index of the driven actuator, or -1 for an entry of a port
+    commanded: NDArray[np.bool_]  # (nu,) whether an entry is the commanded position of a servo
+    ports: tuple[tuple[int, slice], ...]  # the diagram's own input ports, and their slices of u
     fed: frozenset[int]  # the plant's input ports that systems feed, or that are inputs themselves
-    fed_actuators: tuple[int, ...]  # those that are no entries of u, as a system drives them
+    fed_actuators: tuple[int, ...]  # actuators that a system drives, so that they are not in u
     systems: tuple[str, ...]  # the names of the systems that act on the plant
     left_out: tuple[str, ...]  # exported ports that do not reach the plant
 
     @property
     def plain(self) -> bool:
-        """Whether u is the plant's actuation and nothing else: all actuators, in order."""
+        """Whether u consists exactly of all the plant's actuators, in order."""
         return not self.ports and not self.fed_actuators
 
     @property
     def one_sided(self) -> tuple[Array, Array]:
-        """Lower and upper limits (nu,) of efforts whose sides differ, which steps do not keep; infinite of others."""
+        """Asymmetric effort limits (lower, upper) (nu,), which steps do not enforce; infinite for the other entries."""
         differ = (self.lower != -self.upper) & ~self.commanded
         return np.where(differ, self.lower, -np.inf), np.where(differ, self.upper, np.inf)
 
     def of_actuators(self, rows: Any) -> Array:
-        """(nu, ...) of numbers for each actuator, (actuators, ...), those for each input; 0 where it is no actuator."""
+        """Convert values for each actuator (actuators, ...) to values for each input (nu, ...), 0 for other inputs."""
         rows = np.asarray(rows, dtype=float)
         if self.plain:
             return rows
@@ -179,12 +179,12 @@ class Inputs:
 
 
 class _Wiring:
-    """What feeds each input port of the leaves of a diagram: a leaf, the number of the diagram's own port, or None."""
+    """The sources of the input ports of a diagram's leaves: a leaf, the number of the diagram's port, or None."""
 
     def __init__(self, diagram: Diagram):
         self.leaves: list[Any] = []
         self.sources: dict[tuple[int, int], Any] = {}
-        self._kept: list[Any] = []  # so that no two systems of Python's have one id
+        self._kept: list[Any] = []  # keeps the Python objects alive, so that ids stay unique
         self._read(diagram, list(range(diagram.num_input_ports())))
 
     def _read(self, diagram: Any, outside: list[Any]) -> None:
@@ -207,7 +207,7 @@ class _Wiring:
                 self.sources.update({(id(system), i): source for i, source in enumerate(fed)})
 
     def consumers(self, port: int) -> list[tuple[Any, int]]:
-        """The leaves, and which of their input ports, that an input port of the diagram feeds."""
+        """Return the leaves and their input port indices that an input port of the diagram feeds."""
         by_id = {id(leaf): leaf for leaf in self.leaves}
         return [
             (by_id[system_id], i)
@@ -216,7 +216,7 @@ class _Wiring:
         ]
 
     def behind(self, plant: Any, ports: Sequence[int]) -> tuple[list[Any], set[int]]:
-        """The systems, but plant and scene graph, and the diagram's own ports that input ports of `plant` depend on."""
+        """Return the systems, except plant and scene graph, and the diagram ports that ports of `plant` depend on."""
         systems: list[Any] = []
         reached: set[int] = set()
         waiting = [self.sources[id(plant), i] for i in ports]
@@ -231,7 +231,7 @@ class _Wiring:
 
 
 def _leaf(system: Any, port: Any) -> Any:
-    """The leaf whose output a subsystem's output port is."""
+    """Return the leaf system that produces a subsystem's output port."""
     while isinstance(system, Diagram):
         system, port = system.get_output_port_locator(OutputPortIndex(int(port)))
     return system
@@ -240,12 +240,12 @@ def _leaf(system: Any, port: Any) -> Any:
 def read_inputs(
     diagram: Diagram, plant: Any, facts: FileFacts, forces: Sequence[BodyForce] = (), servos: bool = False
 ) -> Inputs:
-    """The inputs of a diagram with one plant; `forces` are those of its port `BODY_FORCES`, `facts` of its files.
+    """Read the inputs of a diagram with one plant; `forces` are for its port `BODY_FORCES`, `facts` from its files.
 
-    `servos` says whether actuators with PD gains are commanded positions, else efforts beside what these hold.
+    `servos` makes the inputs of actuators with PD gains commanded positions, or else efforts in addition to the PD law.
 
-    Raises ModelError where a system that acts on the plant has a state of its own, or where the plant's actuation is
-    fed inside and there are no other inputs.
+    Raises ModelError if a system that acts on the plant has its own state, or if the plant's actuation is connected
+    inside the diagram and there are no other inputs.
     """
     wiring = _Wiring(diagram)
     whole = int(plant.get_actuation_input_port().get_index())
@@ -263,7 +263,7 @@ def read_inputs(
     _check_states(systems)
     always_exported = [generalized, *targets] if isinstance(diagram, RobotDiagram) else []
     vectors: list[tuple[int, Any, set[int]]] = []
-    places: list[int] = []  # before which of them the actuators stand
+    places: list[int] = []  # indices before which the actuators are inserted
     left_out: list[str] = []
     for number in range(diagram.num_input_ports()):
         port, consumers = diagram.get_input_port(number), wiring.consumers(number)
@@ -360,7 +360,7 @@ def _rows_of_port(plant: Any, port: Any, into: set[int], generalized: int, force
 
 
 def _force_units(plant: Any) -> list[str]:
-    """Of the generalized force on each velocity."""
+    """Return the units of the generalized force on each velocity."""
     units = [UNKNOWN] * plant.num_velocities()
     known = {"revolute": ["N m"], "prismatic": ["N"], "quaternion_floating": ["N m"] * 3 + ["N"] * 3}
     for joint in joints(plant):
@@ -370,5 +370,5 @@ def _force_units(plant: Any) -> list[str]:
 
 
 def _told_apart(names: Sequence[str]) -> tuple[str, ...]:
-    """The names, those of ports that an actuator has too with the number of the input."""
+    """Make the names unique: append the input's index to a port's name that an actuator has, too."""
     return tuple(name if names.index(name) == i else f"{name} (u[{i}])" for i, name in enumerate(names))

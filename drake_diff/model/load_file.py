@@ -1,8 +1,8 @@
-"""From a robot file to a plant: its text before Drake reads it, what Drake's parser is given, and what it says.
+"""Load a robot file into a plant: repairs of the text, packages, the call of Drake's parser, and its messages.
 
-What would end the process inside Drake is refused here, a few slips that say nothing about the robot are mended, and
-the packages that the file and the files in it name are looked for on the disk. Nothing is downloaded and no file is
-written. Every line keeps its number, so that messages name lines of the file itself.
+Files that would crash Drake are refused, and a few mistakes that do not concern the robot are repaired. The packages
+that the file and its included files name are searched on the disk. Nothing is downloaded and no file is written. Every
+line keeps its number, so that messages refer to lines of the original file.
 """
 
 import logging
@@ -43,16 +43,16 @@ from drake_diff.model.meshes import DOWNLOADED, FileMeshes, make_absolute, put_m
 from drake_diff.model.xml_text import XmlText
 
 OF_SIMULATORS = {"gazebo": "what only Gazebo reads", "contact": "friction and the like that only PyBullet reads"}
-MOST_NODES = 100_000  # of a YAML file, its aliases written out
+MOST_NODES = 100_000  # of a YAML file with its aliases expanded
 TESTED = re.compile(r"([\w-]+)<([\d.]+) ?; extra == .tested.")
 IN_CPP = re.compile(r"Failure at \S+ in \w+\(\): ")
 
 
 @cache
 def warn_of_newer_versions() -> None:
-    """Warn once where a package is newer than the newest one that the tests ran with, by the extra `tested`."""
+    """Warn once if a package is newer than the versions in the extra `tested`, with which the tests ran."""
     newer = []
-    with suppress(PackageNotFoundError):  # run from a folder, nothing says what was tested
+    with suppress(PackageNotFoundError):  # without installed metadata, the tested versions are unknown
         for name, bound in TESTED.findall("\n".join(requires("drake-diff") or ())):
             with suppress(PackageNotFoundError):
                 if _numbers(version(name)) >= _numbers(bound):
@@ -63,16 +63,16 @@ def warn_of_newer_versions() -> None:
 
 
 def _numbers(text: str) -> list[int]:
-    """The numbers that a version begins with."""
+    """Return the leading numbers of a version."""
     return [int(number) for number in re.split(r"[^\d.]", text)[0].split(".") if number]
 
 
 def text_of(path: Path, notes: list[str]) -> XmlText | None:
-    """The XML of the robot file at `path`, its slips mended, each with a sentence in `notes`; None of a .dmd.yaml.
+    """Return the repaired XML of the robot file at `path`, or None for a .dmd.yaml, and add a note for each repair.
 
-    Raises ModelError, with the line, where it is no XML or Drake would not survive it.
+    Raises ModelError with the line if the text is not valid XML or would crash Drake.
     """
-    path.read_text()  # which says what byte is no text
+    path.read_text()  # raises an error with the position of an invalid byte
     if path.name.endswith(".dmd.yaml"):
         return None
     try:
@@ -80,7 +80,7 @@ def text_of(path: Path, notes: list[str]) -> XmlText | None:
     except ModelError as error:
         if error.__cause__ is None:
             raise ModelError(f"{path}, {error}") from error
-        # Drake forgives more; where it does not, this line is what is wrong.
+        # Drake accepts more than XML allows; if Drake fails, this line is the cause.
         notes.append(f"{path}, {error}: only what Drake reads of it is known.")
         return None
     if xml.root.tag == "mujoco":
@@ -102,7 +102,7 @@ def text_of(path: Path, notes: list[str]) -> XmlText | None:
 
 
 def _unread(xml: XmlText, path: Path) -> Iterator[str]:
-    """A sentence for each thing in a URDF or SDF that Drake's parser leaves out without a word."""
+    """Yield a sentence for each element of a URDF or SDF that Drake's parser silently ignores."""
     for friction in (f for dynamics in xml.root.iter("dynamics") for f in dynamics.findall("friction")):
         if friction.text.strip().strip("0."):
             yield f"{path}:{friction.line}: the friction of a joint, {friction.text.strip()}, is ignored."
@@ -115,7 +115,7 @@ def _unread(xml: XmlText, path: Path) -> Iterator[str]:
 
 
 def _without_lost_joints(xml: XmlText) -> list[str]:
-    """Leave out what speaks of a joint that is not there, and what a fixed joint mimics: Drake refuses both."""
+    """Remove references to joints that do not exist, and <mimic> of fixed joints; Drake refuses both."""
     sentences, joints = [], {joint.get("name"): joint for joint in xml.root.findall("joint")}
     for name, joint in joints.items():
         for mimic in joint.findall("mimic"):
@@ -137,7 +137,7 @@ def _without_lost_joints(xml: XmlText) -> list[str]:
 
 
 def _one_colour_for_each_material(xml: XmlText) -> list[str]:
-    """Drake refuses a material that is defined in two ways or in none, which only changes what is drawn."""
+    """Repair materials with two definitions or none, which Drake refuses; this changes only the visual appearance."""
     known: dict[str, str] = {}
     renamed: dict[str, None] = {}
     top = xml.root.findall("material")
@@ -161,7 +161,7 @@ def _one_colour_for_each_material(xml: XmlText) -> list[str]:
 
 
 def _continuous_without_limits(xml: XmlText) -> list[str]:
-    """URDF gives a continuous joint no limits; where a file writes 0 and 0 all the same, Drake would hold the joint."""
+    """Remove equal limits of continuous joints, which have no limits in URDF; Drake would lock such a joint."""
     sentences = []
     for joint in [j for j in xml.root.findall("joint") if j.get("type") == "continuous"]:
         limit = joint.find("limit")
@@ -177,19 +177,19 @@ def _continuous_without_limits(xml: XmlText) -> list[str]:
 
 
 def included(path: Path) -> list[str]:
-    """The robot files that the one at `path` includes, as it names them."""
+    """Return the robot files that the file at `path` includes, as it names them."""
     if path.name.endswith(".dmd.yaml"):
         return files_of_directives(path)
     try:
         includes = list(XmlText(path.read_bytes()).root.iter("include"))
     except ModelError:
-        return []  # Drake has the word
+        return []  # Drake will report the error
     uris = [include.get("file") or (uri.text.strip() if (uri := include.find("uri")) else "") for include in includes]
     return [uri for uri in uris if uri]
 
 
 def files_of_directives(path: Path) -> list[str]:
-    """What a .dmd.yaml file calls `file`. ModelError where it is no YAML, or its aliases stand for far too much."""
+    """Return the `file` values in a .dmd.yaml; raise ModelError if it is not YAML or its aliases expand too far."""
     try:
         waiting = [yaml.compose(path.read_text())]
     except yaml.YAMLError as error:
@@ -212,11 +212,11 @@ def files_of_directives(path: Path) -> list[str]:
 
 
 def add_packages(packages: PackageMap, path: Path, given: Mapping[str, str] | None) -> None:
-    """Tell Drake where packages are: as `given`, else the nearest folder of that name above the file.
+    """Add package folders to Drake's map: from `given`, or else the nearest folder of that name above the file.
 
-    That folder may also stand beside one above the file, as in a workspace of ROS, if it has a package.xml. The
-    package that Drake would download is taken out of the map, so that it is an unknown one. Raises ModelError where a
-    file includes itself, by way of others too: Drake would read on until memory ends.
+    A folder next to one above the file also counts if it has a package.xml, as in a ROS workspace. The package that
+    Drake would download is removed from the map, so that it is unknown. Raises ModelError if a file includes itself,
+    directly or indirectly, because Drake would read until the memory is exhausted.
     """
     if packages.Contains(DOWNLOADED):
         packages.Remove(DOWNLOADED)
@@ -248,9 +248,9 @@ def _add_packages_of(packages: PackageMap, file: Path, above: tuple[Path, ...]) 
 
 
 def package_above(file: Path, name: str) -> Path | None:
-    """The folder of the package of that name, by where it stands to a file; None where there is none.
+    """Search for the folder of a package from the location of a file; return None if it is not found.
 
-    It is above the file, or beside a package that is; its name is the folder's, or that of its package.xml.
+    The folder is above the file, or next to such a package. Its name is the folder's name or the name in package.xml.
     """
     for parent in file.resolve().parents:
         if parent.name == name or _name_of_package(parent) == name:
@@ -266,15 +266,15 @@ def package_above(file: Path, name: str) -> Path | None:
 
 
 def _name_of_package(folder: Path) -> str:
-    """The name that the package.xml in a folder gives; "" where there is none."""
+    """Return the name in the package.xml of a folder, or "" if there is no such file."""
     manifest = folder / "package.xml"
-    text = manifest.read_text(errors="replace") if isfile(manifest) else ""  # a folder may be closed to us
+    text = manifest.read_text(errors="replace") if isfile(manifest) else ""  # the folder may be unreadable
     name = re.search(r"<name>\s*([^<\s]+)\s*</name>", text)
     return name[1] if name else ""
 
 
 def refusal(path: Path, message: str, xml: XmlText | None, notes: list[str]) -> str:
-    """What Drake says of the file, with its name, and what to do if that is known."""
+    """Return Drake's error message with the file's name, and a remedy if one is known."""
     message = IN_CPP.sub("", message).strip().replace(f"{path}:{path}", str(path))
     unknown = re.search(r"unknown package '([^']+)'", message)
     remedy = ""
@@ -291,23 +291,23 @@ FORMATS = (".urdf", ".sdf", ".xml", ".mjcf", ".dmd.yaml")
 DRAKES_REFUSALS = (RuntimeError, ValueError, IndexError, OverflowError, SystemExit)  # the last is a failed condition
 OF_RANGES = re.compile(r"Asymmetrical effort limits are not supported|collision filter groups are not yet implemented")
 OF_GRAVITY = re.compile(r"attribute 'gravcomp' found in a 'body' tag .* ignored")
-NO_GRAVITY = "No gravity, as"  # begins a note
+NO_GRAVITY = "No gravity, as"  # the beginning of a note
 OF_A_SPRING = re.compile(r"attribute '(?:stiffness|springref)' found in a 'joint' tag .* ignored")
 
-# Drake says of every half space that deformable bodies will not touch it, which no model here has.
+# Drake warns for every half space that deformable bodies will not collide with it; no model has deformable bodies.
 logging.getLogger("drake").addFilter(lambda r: "not currently supported for deformable contact" not in r.getMessage())
 
 
 @dataclass(frozen=True)
 class FileRead:
-    """What the user should know of a file that was read, a sentence each, and what it says that Drake does not keep."""
+    """The notes for the user on a file that was read, and the facts in the file that Drake does not store."""
 
     notes: tuple[str, ...]
     facts: FileFacts
 
 
 def as_packages(value: Mapping[str, str | Path] | None) -> dict[str, str] | None:
-    """The argument `packages` as it is kept; InputError where a folder is missing."""
+    """Return the argument `packages` as strings; raise InputError if a folder does not exist."""
     if value is None:
         return None
     if not isinstance(value, Mapping):
@@ -321,11 +321,11 @@ def as_packages(value: Mapping[str, str | Path] | None) -> dict[str, str] | None
 def read_into(
     plant: MultibodyPlant, path: Path, packages: Mapping[str, str] | None = None, meshes: str = "skip"
 ) -> FileRead:
-    """Add the model in `path` to `plant`; `packages` are folders by the name that package:// uses.
+    """Add the model in `path` to `plant`; `packages` maps names in package:// to folders.
 
-    `meshes` is what becomes of collision meshes: see `load_model`.
+    `meshes` is the treatment of collision meshes, see `load_model`.
 
-    Raises InputError where the file is missing or of an unknown kind, ModelError where Drake refuses it.
+    Raises InputError if the file is missing or of an unknown type, and ModelError if Drake refuses it.
     """
     if not path.is_file():
         got = f"a directory, {path}" if path.is_dir() else str(path)
@@ -352,14 +352,14 @@ def read_into(
 
 @dataclass
 class _Reading:
-    """One call of `read_into`: what it gives to the parser, and what it was told."""
+    """The state of one call of `read_into`: the input of the parser and its messages."""
 
     parser: Parser
     meshes: FileMeshes
     notes: list[str]
     facts: FileFacts = field(default_factory=FileFacts)
-    xml: XmlText | None = None  # of the robot file that is read at the moment
-    given: dict[str, str] = field(default_factory=dict)  # the robot files by what the parser calls them
+    xml: XmlText | None = None  # the robot file that is currently read
+    given: dict[str, str] = field(default_factory=dict)  # original file names by the names that the parser reports
 
     def robot(self, path: Path) -> None:
         """Read a URDF, SDF or MJCF file."""
@@ -373,7 +373,7 @@ class _Reading:
             self._corrected(xml, added[0])
 
     def directives(self, path: Path) -> None:
-        """Read a .dmd.yaml file: each robot file that it adds as `robot` reads one."""
+        """Read a .dmd.yaml file, with each of its robot files as in `robot`."""
         text_of(path, self.notes)
         flat = FlattenModelDirectives(LoadModelDirectives(str(path)), self.parser.package_map())
         robots: dict[str, XmlText | None] = {}
@@ -396,7 +396,7 @@ class _Reading:
                 self._corrected(xml, self.parser.plant().GetModelInstanceByName(name))
 
     def _prepared(self, path: Path, instance: str | None = None) -> XmlText | None:
-        """The text of a robot file with its slips mended and its meshes looked for; None where it is no XML."""
+        """Return the repaired text of a robot file, after its meshes are resolved, or None if it is not valid XML."""
         self.xml = xml = text_of(path, self.notes)
         if xml is None:
             return None
@@ -412,29 +412,29 @@ class _Reading:
         if xml.changed or masses:
             make_absolute(xml, path)
         if masses:
-            xml = xml.read_again()  # with the bodies that were added
+            xml = xml.read_again()  # with the added bodies
             self.notes.append(write_masses(xml, self._read_alone))
         return xml
 
     def _read_alone(self, xml: XmlText) -> dict[str, Any]:
-        """The bodies of an MJCF file that is read into a plant of its own, by name."""
+        """Return the bodies of an MJCF file, by name, from a separate plant."""
         plant, before = MultibodyPlant(1.0), len(self.notes)
         parser = Parser(plant)
         parser.package_map().AddMap(self.parser.package_map())
         instances = parser.AddModelsFromString(str(xml), "xml")
-        del self.notes[before:]  # which come again
+        del self.notes[before:]  # the main parser will report them again
         bodies = [plant.get_body(index) for index in plant.GetBodyIndices(instances[0])]
         return {body.name(): body for body in bodies}
 
     def _corrected(self, xml: XmlText | None, instance: ModelInstanceIndex) -> None:
-        """Give what was read of an MJCF file the numbers that the file means."""
+        """Correct the numbers of an MJCF file that Drake interprets differently from MuJoCo."""
         if xml is not None and xml.root.tag == "mujoco":
             mjcf = Mjcf(xml)
             self.notes += correct(self.parser.plant(), instance, mjcf)
             outdated = [OF_RANGES] + [OF_A_SPRING] * (not mjcf.has_other_springs)
             plant = self.parser.plant()
             is_off = "gravity" in mjcf.disabled
-            if (mjcf.weightless or is_off) and plant.num_model_instances() == 3:  # the world's, Drake's, and this one
+            if (mjcf.weightless or is_off) and plant.num_model_instances() == 3:  # the world, Drake's, and this one
                 plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, 0.0])
                 why = "the file disables it" if is_off else "gravcomp compensates that of every body"
                 self.notes.append(f"{NO_GRAVITY} {why}.")
@@ -442,7 +442,7 @@ class _Reading:
             self.notes[:] = [note for note in self.notes if not any(meant.search(note) for meant in outdated)]
 
     def in_own_words(self, message: str) -> str:
-        """What the parser said, with the files of the user in the place of what it was given."""
+        """Replace the names of temporary input in a parser's message by the user's files."""
         for name, path in self.given.items():
             message = message.replace(name, path)
         return message
@@ -450,7 +450,7 @@ class _Reading:
 
 @contextmanager
 def _drake_warnings() -> Iterator[list[str]]:
-    """A list that collects what Drake's parser warns of, and keeps it off the terminal."""
+    """Yield a list that collects the warnings of Drake's parser, which are not printed."""
     notes: list[str] = []
 
     class Collect(logging.Handler):

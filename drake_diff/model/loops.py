@@ -1,7 +1,7 @@
-"""Loops of a robot: points of two bodies that are held together, by <connect> and <weld> of MJCF or by joints of SDF.
+"""Kinematic loops: points of two bodies that <connect> or <weld> of MJCF, or joints of SDF, constrain to coincide.
 
-A joint of SDF whose child has a joint already closes a loop. Drake has no such joints: here the child's points on the
-joint's axis are held at those of the parent. Each pair of points is one of Drake's ball constraints, nearly rigid.
+A joint of SDF closes a loop if its child already has a joint. Drake does not support such joints. They are replaced by
+constraints between the points of child and parent on the joint's axis, each a nearly rigid ball constraint of Drake.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -19,17 +19,17 @@ from drake_diff.exceptions import ModelError
 from drake_diff.model.plant import joint_pose, joints
 from drake_diff.model.xml_text import Element, XmlText
 
-APART = 0.1  # [m] between the points of one loop: the constraints are nearly rigid at any distance
-POINTS = {"ball": 1, "revolute": 2, "continuous": 2, "fixed": 3}  # of a joint of SDF
+APART = 0.1  # [m] distance between the points of a loop: the constraints are nearly rigid at any distance
+POINTS = {"ball": 1, "revolute": 2, "continuous": 2, "fixed": 3}  # number of points for each type of SDF joint
 WORLD = "world"
 
 
 @dataclass(frozen=True)
 class HeldBodies:
-    """What a file holds together: `points` of a body and those of another, both by their names in one model instance.
+    """Two bodies that a file connects: `points` of a body and of another body, named in one model instance.
 
-    `other_points` are in the other body's frame, None where they coincide with these in the file's pose. `frame` is the
-    name of a frame of the first body that points are given in, "" for the body's own.
+    `other_points` are in the other body's frame, or None if they coincide with `points` in the file's pose. `frame` is
+    the name of a frame of the first body in which the points are given, or "" for the body's own frame.
     """
 
     instance: str
@@ -42,26 +42,26 @@ class HeldBodies:
 
 @dataclass
 class HeldPoints:
-    """A point of one body that a constraint of a plant holds at a point of another."""
+    """A point of one body that a constraint of the plant connects to a point of another body."""
 
-    constraint: Any  # its MultibodyConstraintId
-    bodies: tuple[Any, Any]  # their BodyIndex
-    points: list[Array] = field(default_factory=list)  # [m] (3,) of each in its body's frame
+    constraint: Any  # a MultibodyConstraintId
+    bodies: tuple[Any, Any]  # of type BodyIndex
+    points: list[Array] = field(default_factory=list)  # [m] (3,) for each body in its frame
 
 
 def points_along(axis: Array, count: int) -> tuple[tuple[float, ...], ...]:
-    """The first `count` of the origin, a point along an axis, and one across it."""
+    """Return the first `count` points of: the origin, a point along the axis, a point perpendicular to it."""
     axis = axis / np.linalg.norm(axis)
     across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     return tuple(tuple((APART * p).tolist()) for p in (np.zeros(3), axis, across / np.linalg.norm(across))[:count])
 
 
 def loops_of_sdf(xml: XmlText, model: Element, instance: str) -> Iterator[HeldBodies]:
-    """The joints of an SDF model that close loops; they become frames of their children.
+    """Yield the joints of an SDF model that close loops, and replace them by frames of their child links.
 
-    Those of nested models come first: a joint to a link that has one there closes a loop.
+    Nested models are handled first, because a joint to a link that already has a joint there closes a loop.
 
-    Raises ModelError, with its line, where one is of a kind that points cannot hold, or drives.
+    Raises ModelError with the line if points cannot represent the joint's type, or if the joint has a motor.
     """
     has_joint = set(_driven_links(model))
     for joint in model.findall("joint"):
@@ -86,21 +86,21 @@ def loops_of_sdf(xml: XmlText, model: Element, instance: str) -> Iterator[HeldBo
         says = {"relative_to": child} | ({} if pose is None else pose.attributes)
         given = " ".join(f"{key}={quoteattr(value)}" for key, value in says.items())
         placed = f"<pose {given}>{'' if pose is None else escape(pose.text)}</pose>"
-        # To the link itself: Drake loses the pose of a frame on a frame of a nested model.
+        # Attached to the link itself, because Drake loses the pose of a frame on a frame of a nested model.
         xml.replace(joint, f"<frame name={quoteattr(name)} attached_to={quoteattr(link)}>{placed}</frame>")
         yield HeldBodies(instance, link, _link(model, parent), points_along(axis, POINTS[kind]), frame=name)
 
 
 def _ends(joint: Element) -> tuple[str, str]:
-    """The parent and the child that a joint of SDF names."""
+    """Return the names of the parent and child of an SDF joint."""
     parent, child = (element.text.strip() if (element := joint.find(tag)) else "" for tag in ("parent", "child"))
     return parent, child
 
 
 def _link(model: Element, name: str) -> str:
-    """The link that a name in an SDF model means: "inner::link" of a nested one, and of a frame what it is fixed to."""
+    """Resolve a name in an SDF model to a link, "inner::link" in a nested model; a frame resolves to its link."""
     seen: set[str] = set()
-    while name not in seen:  # frames that are fixed to each other are refused by Drake
+    while name not in seen:  # Drake refuses frames that are attached to each other
         seen.add(name)
         scope, _, rest = name.partition("::")
         inner = next((m for m in model.findall("model") if m.get("name") == scope), None)
@@ -112,7 +112,7 @@ def _link(model: Element, name: str) -> str:
 
 
 def _driven_links(model: Element) -> Iterator[str]:
-    """The links of nested models that are the child of a joint there, as `model` names them."""
+    """Yield the links of nested models that are the child of a joint there, with their names in `model`."""
     for inner in model.findall("model"):
         links = {_link(inner, _ends(joint)[1]) for joint in inner.findall("joint")}
         for link in (*links, *_driven_links(inner)):
@@ -122,12 +122,12 @@ def _driven_links(model: Element) -> Iterator[str]:
 def in_pose_of_files(
     plant: MultibodyPlant, loops: Sequence[HeldBodies], position: Callable[[Any], float]
 ) -> list[HeldBodies]:
-    """`loops` with the points of both bodies, which coincide in the files' pose where a file gives those of one alone.
+    """Return `loops` with the points of both bodies; missing points are computed to coincide in the files' pose.
 
-    The plant is not finalized and its joints are those of the files; `position` is that of a hinge or slide [rad or m]
-    in the files' pose. A .dmd.yaml may let the robot start elsewhere, and a weld in place of a joint be elsewhere.
+    The plant is not finalized and has the joints of the files. `position` returns the coordinate of a hinge or slide
+    [rad or m] in the files' pose. The default pose may differ, because of a .dmd.yaml or a weld in place of a joint.
 
-    Raises ModelError where a body is none of the plant's.
+    Raises ModelError if a body does not exist in the plant.
     """
     inboard = {joint.child_body().index(): joint for joint in joints(plant)}
 
@@ -156,7 +156,7 @@ def in_pose_of_files(
 
 
 def close_loops(plant: MultibodyPlant, loops: Sequence[HeldBodies], held: list[HeldPoints]) -> tuple[str, ...]:
-    """Hold the points of both bodies of loops together, before the plant is finalized; adds to `held`; a sentence."""
+    """Add constraints for loops to a plant before it is finalized, append them to `held`, and return a note."""
     names: list[str] = []
     for loop in loops:
         body, other = (
@@ -164,7 +164,7 @@ def close_loops(plant: MultibodyPlant, loops: Sequence[HeldBodies], held: list[H
             for name in (loop.body, loop.other)
         )
         if other.index() in {welded.index() for welded in plant.GetBodiesWeldedTo(body)}:
-            continue  # they move together, and a step would fail
+            continue  # the bodies are welded together, and a step would fail
         for point, other_point in zip(loop.points, loop.other_points or (), strict=True):
             points = [np.array(point), np.array(other_point)]
             constraint = plant.AddBallConstraint(body, points[0], other, points[1])
@@ -179,7 +179,7 @@ def close_loops(plant: MultibodyPlant, loops: Sequence[HeldBodies], held: list[H
 
 
 def _body(plant: MultibodyPlant, instance: str, name: str) -> Any:
-    """That of a model instance, or of one within it, "inner::link"; ModelError where there is none."""
+    """Return the body of a model instance or of a nested one, "inner::link"; raise ModelError if it is unknown."""
     if name == WORLD:
         return plant.world_body()
     *scopes, last = name.split("::")
@@ -192,7 +192,7 @@ def _body(plant: MultibodyPlant, instance: str, name: str) -> Any:
 
 
 def _welded_to_the_world(plant: MultibodyPlant, instance: str) -> Any:
-    """A body without mass that is welded to the world, as Drake crashes on constraints of the world itself."""
+    """Return a massless body welded to the world, because Drake crashes on constraints of the world body."""
     name, index = f"{WORLD}_of_loops", plant.GetModelInstanceByName(instance)
     if not plant.HasBodyNamed(name, index):
         nothing = SpatialInertia(0.0, np.zeros(3), UnitInertia(0.0, 0.0, 0.0))
@@ -202,9 +202,9 @@ def _welded_to_the_world(plant: MultibodyPlant, instance: str) -> Any:
 
 
 def relative_motion(plant: MultibodyPlant, context: Any, held: list[HeldPoints]) -> tuple[Array, Array]:
-    """The Jacobians (L, 3, nv) of the differences of L pairs of points by v, and the differences (L, 3) [m].
+    """Return the Jacobians (L, 3, nv) in v of the differences of L point pairs, and the differences (L, 3) [m].
 
-    They are those in the state of `context`, in the world's axes.
+    They are evaluated in the state of `context` and expressed in the world frame.
     """
     jacobians, differences = np.zeros((len(held), 3, plant.num_velocities())), np.zeros((len(held), 3))
     world = plant.world_frame()

@@ -1,7 +1,7 @@
-"""The meshes that a URDF or SDF names: looked for on the disk, and collision meshes made into what Drake can use.
+"""Meshes in robot files: their files are searched on the disk, and collision meshes are converted for Drake.
 
-Drake takes collision meshes as OBJ, VTK and glTF alone. Its parser is given a tiny sphere in the place of each other
-one, so that pose, friction and filters are read as always; then that sphere's shape is changed. Nothing is written.
+Drake accepts collision meshes only as OBJ, VTK and glTF. For any other mesh, the parser receives a tiny sphere as a
+placeholder, so that it reads pose, friction and filters as usual. The sphere is then replaced. No file is written.
 """
 
 import re
@@ -36,19 +36,19 @@ from drake_diff.model.triangles import (
 from drake_diff.model.xml_text import Element, XmlText
 
 TREATMENTS = ("skip", "convex", "spheres")
-NOT_OBJ = tuple(ending for ending in READ_BY_TRIMESH if ending != ".obj")  # Drake reads no other in MJCF
-USABLE_MESHES = (".obj", ".vtk", ".gltf", ".glb")  # by Drake
-PLACEHOLDER = 1.2345678e-9  # [m] the radius of the first; no file has such a sphere
+NOT_OBJ = tuple(ending for ending in READ_BY_TRIMESH if ending != ".obj")  # Drake reads only .obj in MJCF
+USABLE_MESHES = (".obj", ".vtk", ".gltf", ".glb")  # formats that Drake reads
+PLACEHOLDER = 1.2345678e-9  # [m] the radius of the first placeholder, unlikely in any file
 SAME_MASS = 1e-6  # relative
-MOST_TOLD = 12  # in a note; links with the same file and scale count once
+MOST_TOLD = 12  # maximum number of entries in a note; links with the same file and scale count once
 
 Scale = tuple[float, float, float]
-DOWNLOADED = "drake_models"  # the package that Drake would fetch over the network
+DOWNLOADED = "drake_models"  # the package that Drake would download
 
 
 @dataclass(frozen=True)
 class CollisionMesh:
-    """A collision mesh that is to become something else."""
+    """A collision mesh to be converted."""
 
     link: str
     path: Path
@@ -57,10 +57,10 @@ class CollisionMesh:
 
 @dataclass
 class FileMeshes:
-    """The meshes of robot files: what is to be put in the place of placeholders, and what is left out.
+    """The meshes of robot files: the replacements of placeholders, and the ignored meshes.
 
-    `wanted` has the collision meshes of URDF and SDF by their placeholder's radius [m], `converted` those of MJCF by
-    the OBJ file in `folder` that Drake reads instead, and `whole` has the other files that MJCF names.
+    `wanted` contains the collision meshes of URDF and SDF by the radius of their placeholder [m]. `converted` contains
+    MJCF meshes by the OBJ file in `folder` that Drake reads instead, and `whole` the other files that MJCF names.
     """
 
     treatment: str
@@ -74,7 +74,7 @@ class FileMeshes:
     hollow: list[str] = field(default_factory=list)
 
     def notes(self) -> list[str]:
-        """What the user should know of meshes that are not used, a sentence each."""
+        """Return a sentence for each kind of mesh that is not used."""
         sentences = {
             f"{len(self.skipped)} collision meshes skipped, Drake uses only {' '.join(USABLE_MESHES)}: "
             f'{_listed(self.skipped)}. meshes="convex" or meshes="spheres" takes them.': self.skipped,
@@ -93,9 +93,9 @@ def _listed(names: list[str]) -> str:
 
 
 def read_meshes(meshes: FileMeshes, xml: XmlText, path: Path, packages: PackageMap) -> None:
-    """Change what `xml`, the text of the robot file at `path`, says of meshes.
+    """Edit the meshes in `xml`, the text of the robot file at `path`.
 
-    Raises ModelError where a scale is no number.
+    Raises ModelError if a scale is not a number.
     """
     if xml.root.tag == "mujoco":
         _convert_assets(meshes, xml, path)
@@ -111,14 +111,14 @@ def read_meshes(meshes: FileMeshes, xml: XmlText, path: Path, packages: PackageM
 
 
 def _convert_assets(meshes: FileMeshes, xml: XmlText, path: Path) -> None:
-    """Give Drake an OBJ in the place of each mesh of an MJCF file that it does not read.
+    """Replace each mesh of an MJCF file that Drake does not read by an OBJ file.
 
-    It computes masses by them, as MuJoCo does; `put_meshes` then puts back what was there.
+    Drake then computes masses from the OBJ, as MuJoCo does; `put_meshes` restores the original meshes afterwards.
     """
     for mesh in assets_of(xml):
         file = in_any_case(asset_of(xml, mesh, path)) if mesh.get("file") else None
         if file is None:
-            continue  # which Drake says
+            continue  # Drake will report it
         if file.suffix.lower() not in (*NOT_OBJ, OF_MUJOCO):
             meshes.whole[str(file)] = file
             continue
@@ -134,7 +134,7 @@ def _convert_assets(meshes: FileMeshes, xml: XmlText, path: Path) -> None:
 
 
 def _look_for_hollows(meshes: FileMeshes, xml: XmlText, path: Path) -> None:
-    """Note each geom whose volume by MuJoCo's default rule for meshes is not the exact one, with both."""
+    """Note each geom whose volume by MuJoCo's default rule for meshes differs from the exact volume, with both."""
     mjcf = Mjcf(xml)
     files = {mesh.get("name") or Path(mesh.get("file")).stem: mesh for mesh in assets_of(xml)}
     for body in (body for section in xml.root.findall("worldbody") for body in section.iter("body")):
@@ -152,7 +152,7 @@ def _look_for_hollows(meshes: FileMeshes, xml: XmlText, path: Path) -> None:
 
 
 def _volumes_of(xml: XmlText, mesh: Element, path: Path) -> tuple[float, float]:
-    """The `volumes` of a mesh of an MJCF file; 0 of one that cannot be read, of which Drake says what is wrong."""
+    """Return the `volumes` of a mesh in an MJCF file, or 0 if it is unreadable, an error that Drake will report."""
     file = in_any_case(asset_of(xml, mesh, path)) if mesh.get("file") else None
     if file is not None and file.suffix.lower() in READ_BY_TRIMESH:
         with suppress(ModelError):
@@ -161,15 +161,15 @@ def _volumes_of(xml: XmlText, mesh: Element, path: Path) -> tuple[float, float]:
 
 
 def volumes(mesh: Triangles) -> tuple[float, float]:
-    """[m^3] the volume of a closed mesh, and what MuJoCo takes for it by its default, inertia="legacy".
+    """Return the volume [m^3] of a closed mesh, and the volume by MuJoCo's default inertia="legacy".
 
-    That is all pyramids on the faces, those that the exact volume takes away, too: first from the centre of the faces,
-    then from the centre of mass of these.
+    The legacy volume adds all pyramids over the faces, even those that the exact volume subtracts. Their first apex is
+    the centre of the faces, and their second apex the centre of mass of the first pyramids.
     """
     corners = mesh.vertices[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
     areas, middles = np.linalg.norm(normals, axis=1), np.mean(corners, axis=1)
-    with np.errstate(all="ignore"):  # a mesh that is flat has neither
+    with np.errstate(all="ignore"):  # for a flat mesh, neither exists
         top = areas @ middles / np.sum(areas)
         sizes = np.abs(np.sum((middles - top) * normals, axis=1))
         top = sizes @ (0.75 * middles + 0.25 * top) / np.sum(sizes)
@@ -178,12 +178,12 @@ def volumes(mesh: Triangles) -> tuple[float, float]:
 
 
 def assets_of(xml: XmlText) -> list[Element]:
-    """The meshes that an MJCF file declares."""
+    """Return the meshes that an MJCF file declares."""
     return [mesh for section in xml.root.findall("asset") for mesh in section.findall("mesh")]
 
 
 def asset_of(xml: XmlText, mesh: Element, path: Path) -> Path:
-    """Where the file of a mesh or texture of MJCF should be, by the folders that <compiler> says."""
+    """Return the path of the file of an MJCF mesh or texture, using the folders in <compiler>."""
     name, folders = mesh.get("file"), dict[str, str]()
     kind = "texturedir" if mesh.tag == "texture" else "meshdir"
     for compiler in xml.root.findall("compiler"):
@@ -194,7 +194,7 @@ def asset_of(xml: XmlText, mesh: Element, path: Path) -> Path:
 
 
 def _change(meshes: FileMeshes, xml: XmlText, element: Element, mesh: Element, location: Path | None) -> None:
-    """Do to a visual or collision what its mesh needs."""
+    """Edit a visual or collision element according to the file of its mesh."""
     uri, link = _uri(mesh), element.parent.get("name", "?") if element.parent else "?"
     if f"//{DOWNLOADED}/" in uri and not location:
         return
@@ -244,17 +244,17 @@ def _scale(mesh: Element, label: str) -> Scale:
 
 
 def _put_sphere(xml: XmlText, element: Element, mesh: Element, radius: float, stem: str) -> None:
-    """A placeholder where the mesh was, in the words of the format."""
+    """Replace a mesh by a placeholder sphere, in the syntax of the format."""
     of_urdf, of_sdf = f'<sphere radius="{radius!r}"/>', f"<sphere><radius>{radius!r}</radius></sphere>"
     xml.replace(mesh, of_urdf if xml.root.tag == "robot" else of_sdf)
-    if not element.get("name") and element.parent is not None:  # Drake would call it a sphere
+    if not element.get("name") and element.parent is not None:  # Drake would name it after the sphere
         names = {other.get("name") for other in element.parent.findall("collision")}
         name = next(n for n in (stem, *(f"{stem}_{i}" for i in range(len(names) + 1))) if n not in names)
         xml.set(element, "name", name)
 
 
 def set_uri(xml: XmlText, element: Element, name: str) -> None:
-    """Give a mesh or an include another file."""
+    """Set the file of a mesh or an include."""
     uri = element.find("uri")
     if uri is not None:
         xml.fill(uri, escape(name))
@@ -263,15 +263,15 @@ def set_uri(xml: XmlText, element: Element, name: str) -> None:
 
 
 def make_absolute(xml: XmlText, path: Path) -> None:
-    """Lead relative names of meshes and of included models from the root of the disk.
+    """Make the relative paths of meshes and included models absolute.
 
-    A model that is given to Drake as text has no folder to start from.
+    A model that Drake reads from a string has no folder as the base of relative paths.
     """
     if xml.root.tag == "mujoco":
         for mesh in assets_of(xml):
             if mesh.get("file") and not Path(mesh.get("file")).is_absolute():
                 xml.set(mesh, "file", str(asset_of(xml, mesh, path)))
-        for include in xml.root.iter("include"):  # what is left is missing
+        for include in xml.root.iter("include"):  # the remaining includes are missing files
             xml.set(include, "file", str((path.parent / include.get("file")).absolute()))
         return
     for element in xml.root.iter("mesh", "include"):
@@ -281,18 +281,18 @@ def make_absolute(xml: XmlText, path: Path) -> None:
 
 
 def file_at(location: Path | None) -> Path | None:
-    """The file there, its name in any case and with or without escapes."""
+    """Return the file at a path, ignoring case, with or without URL escapes."""
     return None if location is None else in_any_case(location) or in_any_case(Path(unquote(str(location))))
 
 
 def resolve_uri(uri: str, path: Path, packages: PackageMap) -> Path | None:
-    """Where `uri` leads, letter by letter; None where that is not on this disk."""
+    """Return the exact path of `uri`, or None if it is not on this disk."""
     package = re.match(r"(?:package|model)://+([^/]+)/(.*)", uri, re.DOTALL)
     if not package:
         start, name = path.parent.absolute(), uri.removeprefix("file://")
     elif packages.Contains(package[1]):
         start, name = Path(packages.GetPath(package[1])), package[2]
-    else:  # what `read_into` has not seen: package:///NAME/
+    else:  # package:///NAME/, which `read_into` did not handle
         above = next((p for p in path.resolve().parents if p.name == package[1]), None)
         if above is None:
             return None
@@ -301,7 +301,7 @@ def resolve_uri(uri: str, path: Path, packages: PackageMap) -> Path | None:
 
 
 def in_any_case(path: Path) -> Path | None:
-    """The file at an absolute `path`, or the first whose name differs in upper and lower case alone."""
+    """Return the file at an absolute `path`, or the first file whose path differs only in case."""
     try:
         if path.is_file():
             return path.resolve()
@@ -315,25 +315,25 @@ def in_any_case(path: Path) -> Path | None:
                 step = here / min(same)
             here = step
         return here.resolve() if here.is_file() else None
-    except OSError:  # a folder that may not be read, a name that is too long
+    except OSError:  # an unreadable folder, or a name that is too long
         return None
 
 
 def _became(mesh: CollisionMesh, treatment: str) -> tuple[Hull, CoverSpheres | None]:
-    """The hull of a mesh, and the spheres inside it where these are asked for. ModelError where there is no hull."""
+    """Return the hull of a mesh, with spheres inside it if requested; raise ModelError if there is no hull."""
     hull = hull_of_file(mesh.path, mesh.scale)
     return hull, _spheres(hull, mesh.path.name) if treatment == "spheres" else None
 
 
-@lru_cache(maxsize=256)  # by the hull itself, which is kept too
+@lru_cache(maxsize=256)  # the hull itself is the key, so it stays in memory
 def _spheres(hull: Hull, label: str) -> CoverSpheres:
     return fit_spheres(hull, label)
 
 
 def put_meshes(plant: MultibodyPlant, scene_graph: pg.SceneGraph, meshes: FileMeshes) -> list[str]:
-    """Change the placeholders in `plant` to hulls or spheres; a sentence for what was done.
+    """Change the placeholders in `plant` to hulls or spheres, and return a sentence on the changes.
 
-    To be called before anything else is added and the plant is finalized. Masses and inertias stay as they are.
+    Call it before anything else is added and the plant is finalized. Masses and inertias do not change.
     """
     became_other: list[CollisionMesh] = []
     _put_back(plant, scene_graph, meshes)
@@ -345,7 +345,7 @@ def put_meshes(plant: MultibodyPlant, scene_graph: pg.SceneGraph, meshes: FileMe
             continue
         try:
             hull, spheres = _became(mesh, meshes.treatment)
-        except ModelError as error:  # of URDF and SDF these are left out before
+        except ModelError as error:  # for URDF and SDF, such meshes were removed earlier
             meshes.unusable.append(f"{mesh.link} collision {mesh.path.name} ({error})")
             scene_graph.RemoveRole(plant.get_source_id(), geometry, pg.Role.kProximity)
             continue
@@ -356,7 +356,7 @@ def put_meshes(plant: MultibodyPlant, scene_graph: pg.SceneGraph, meshes: FileMe
             became = [geometry]
         else:
             became = _put_spheres(plant, scene_graph, geometry, spheres)
-        if filtered:  # Drake keeps filters by geometry, and forgets those of one whose shape changes
+        if filtered:  # Drake stores filters by geometry, and drops them when a shape changes
             between = pg.CollisionFilterDeclaration().ExcludeBetween(pg.GeometrySet(became), pg.GeometrySet(filtered))
             scene_graph.collision_filter_manager().Apply(between)
         known += became[1:]
@@ -364,7 +364,7 @@ def put_meshes(plant: MultibodyPlant, scene_graph: pg.SceneGraph, meshes: FileMe
 
 
 def _put_back(plant: MultibodyPlant, scene_graph: pg.SceneGraph, meshes: FileMeshes) -> None:
-    """Give what MJCF draws its own files again, and leave out collision meshes that Drake cannot use."""
+    """Restore the original files of MJCF visual meshes, and remove collision meshes that Drake cannot use."""
     inspector = scene_graph.model_inspector()
     for geometry in inspector.GetAllGeometryIds():
         shape = inspector.GetShape(geometry)
@@ -384,7 +384,7 @@ def _path_of(shape: Any) -> str:
 
 
 def _meant(plant: MultibodyPlant, inspector: Any, geometry: Any, meshes: FileMeshes) -> CollisionMesh | None:
-    """The collision mesh that a geometry is to become something else for."""
+    """Return the collision mesh that a geometry stands for, or None."""
     shape = inspector.GetShape(geometry)
     if isinstance(shape, pg.Sphere):
         return meshes.wanted.get(shape.radius())
@@ -396,7 +396,7 @@ def _meant(plant: MultibodyPlant, inspector: Any, geometry: Any, meshes: FileMes
 
 
 def _put_spheres(plant: MultibodyPlant, scene_graph: pg.SceneGraph, geometry: Any, spheres: CoverSpheres) -> list[Any]:
-    """The ids of the spheres that the placeholder became, its own among them."""
+    """Replace a placeholder by spheres, and return their ids, including the placeholder's."""
     inspector = scene_graph.model_inspector()
     body = plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))
     X_BG = RigidTransform(inspector.GetPoseInFrame(geometry))
@@ -411,7 +411,7 @@ def _put_spheres(plant: MultibodyPlant, scene_graph: pg.SceneGraph, geometry: An
 
 
 def _describe_meshes(meshes: list[CollisionMesh], treatment: str) -> str:
-    """One sentence for all meshes, and one for each kind of link, those that are met worst first."""
+    """Return one sentence for all meshes and one for each kind of link, sorted by decreasing fit error."""
     kinds: dict[tuple[Path, Scale], list[str]] = {}
     for mesh in meshes:
         kinds.setdefault((mesh.path, mesh.scale), []).append(mesh.link)

@@ -73,29 +73,29 @@ from drake_diff.model.repairs import (
 )
 from drake_diff.model.twin import AddedForce, OfThread, SharedPlant, Twin
 
-WITHOUT_EFFECT = (None, (), "skip")  # options of `load_model` that change nothing
+WITHOUT_EFFECT = (None, (), "skip")  # option values of `load_model` that change nothing
 T = TypeVar("T")
 CONTACT_APPROXIMATIONS = ("sap", "similar", "lagged")
-OTHERS_KEPT = 128  # how many rebuilt models are kept: a certificate by the time step needs 91
-NAMES_SHOWN = 12  # in repr: a robot arm's state is shown whole
+OTHERS_KEPT = 128  # maximum number of cached variants of a model; a certificate for the time step needs 91
+NAMES_SHOWN = 12  # in repr, enough for the whole state of a robot arm
 
 
 class Model(ShowsItsRepr):
-    """A finalized discrete plant, ready to be stepped and differentiated.
+    """A finalized discrete plant for simulation and differentiation.
 
-    Make one with `load_model` or `model_from_diagram`. The state is Drake's, `x = [q; v]`, and the input `u` the
-    efforts or commands of its motors, forces on bodies and what a diagram exports, all in SI units. A Model keeps its
-    contexts between calls and sets all of x, u and the parameters on each call, so results do not depend on the order
-    of calls. Each thread that uses a Model has contexts of its own.
+    Make a Model with `load_model` or `model_from_diagram`. The state is Drake's, `x = [q; v]`. The input `u` has the
+    efforts or commands of the motors, forces on bodies and the exported ports of a diagram, all in SI units. A Model
+    stores its contexts and sets x, u and all parameters in each call, so results do not depend on the order of calls.
+    Each thread that uses a Model has its own contexts.
 
     Attributes:
         nq, nv, nx, nu: Numbers of positions, velocities, states (nq + nv) and inputs.
         state_names, input_names: A name for each entry of x (nx,) and u (nu,).
-        time_step: [s].
+        time_step: The time step [s].
         plant, diagram: Drake's own MultibodyPlant and Diagram.
-        contract: What the model promises, to print: units, limits, masses, contact.
+        contract: The properties of the model, for printing: units, limits, masses, contact.
         source: The file it was loaded from, or None.
-        notes: What was left out of the file, and what was added to it, a sentence each.
+        notes: A sentence for each part of the file that was ignored, and for each addition.
 
     Example:
         >>> model = dd.load_model("models/cart_pole.urdf", time_step=0.01)
@@ -121,22 +121,22 @@ class Model(ShowsItsRepr):
         servos: bool = False,
     ):
         self.diagram = diagram
-        self.forces = forces  # they act beside the plant's own
+        self.forces = forces  # added to the plant's own forces
         self.source = source
         self.notes = notes
-        self.contact_geometry = contact_geometry  # the route around refused pairs that the user chose
-        self.options: dict[str, Any] | None = None  # what `load_model` was called with, None of a user's diagram
-        self.file_facts = FileFacts() if facts is None else facts  # what the file says that the plant does not keep
+        self.contact_geometry = contact_geometry  # the user's route around pairs that AutoDiffXd does not support
+        self.options: dict[str, Any] | None = None  # arguments of `load_model`, or None for a user's diagram
+        self.file_facts = FileFacts() if facts is None else facts  # facts of the file that the plant does not store
         self._rebuild = rebuild
-        self._others: dict[frozenset[tuple[str, Hashable]], Model] = {}  # the same model with something changed
+        self._others: dict[frozenset[tuple[str, Hashable]], Model] = {}  # variants of this model with changed options
         self._here = OfThread()
         self.shared = SharedPlant() if shared is None else shared
         self._whole: Model | None = None
-        self.held = 0 if coupling is None else len(coupling.mimics)  # constraints that the reduced state keeps to
+        self.held = 0 if coupling is None else len(coupling.mimics)  # constraints that the reduced state satisfies
         self.path = path_to_the_plant(diagram)
         self.plant: MultibodyPlant = follow(diagram, self.path)
         _check_plant(self)
-        self.coupling = coupling  # where the state has the independent coordinates of the plant alone
+        self.coupling = coupling  # set if the state has only the independent coordinates of the plant
         self.nq: int = self.plant.num_positions() if coupling is None else len(coupling.own_q)
         self.nv: int = self.plant.num_velocities() if coupling is None else len(coupling.own_v)
         self.nx = self.nq + self.nv
@@ -146,7 +146,7 @@ class Model(ShowsItsRepr):
         self.nu: int = len(self.inputs.names)
         self.notes += tuple(f"the exported input {name} does not reach the plant" for name in self.inputs.left_out)
         self.time_step: float = self.plant.time_step()
-        prefix = len(instances_with_joints(self.plant)) > 1  # only where names could clash
+        prefix = len(instances_with_joints(self.plant)) > 1  # only if names could clash
         positions = self.plant.GetPositionNames(add_model_instance_prefix=prefix)
         velocities = self.plant.GetVelocityNames(add_model_instance_prefix=prefix)
         if coupling is not None:
@@ -158,7 +158,7 @@ class Model(ShowsItsRepr):
         self.input_names = self.inputs.names
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """A model pickles by its file and what `load_model` was asked, and is loaded again where it is read."""
+        """Pickle the model as its file and the arguments of `load_model`; unpickling loads the file again."""
         if self.options is None or self.source is None:
             raise ModelError(
                 f"the model {self.name} cannot be pickled, as `load_model` did not load it from a file: build it in "
@@ -168,7 +168,7 @@ class Model(ShowsItsRepr):
 
     @property
     def other_quantities(self) -> frozenset[str]:
-        """What parameters are applied in this thread that are not the model's own."""
+        """The quantities of parameters that differ from the model's own in this thread."""
         return self._here.other_quantities
 
     @property
@@ -178,16 +178,16 @@ class Model(ShowsItsRepr):
 
     @property
     def has_other_parameters(self) -> bool:
-        """Whether parameters are applied that are not the model's own."""
+        """Whether parameters that differ from the model's own are applied."""
         return bool(self._here.other_quantities)
 
     def set_applied(self, vector: Any, quantities: frozenset[str]) -> None:
-        """Note that the `quantities` of `vector`, None of none, stand in this thread's contexts."""
+        """Record that the `quantities` of `vector` (or None) are set in this thread's contexts."""
         self._here.applied, self._here.other_quantities = vector, quantities
 
     @property
     def name(self) -> str:
-        """The name of the first model instance that has joints, else the file's."""
+        """The name of the first model instance with joints, or else the file's name."""
         moving = instances_with_joints(self.plant)
         if moving:
             return str(self.plant.GetModelInstanceName(moving[0]))
@@ -195,26 +195,26 @@ class Model(ShowsItsRepr):
 
     @property
     def default_state(self) -> np.ndarray:
-        """(nx,) the state that the file or diagram starts in."""
+        """The initial state (nx,) of the file or diagram."""
         context = self.plant.GetMyContextFromRoot(self.diagram.CreateDefaultContext())
         state = np.asarray(self.plant.GetPositionsAndVelocities(context))
         return state if self.coupling is None else np.asarray(self.coupling.own_state(state))
 
     @property
     def position_limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper (nq,) each [m or rad]; those of joints that follow a coordinate hold for it, too."""
+        """Lower and upper limits (nq,) each [m or rad]; limits of joints that follow a coordinate also apply to it."""
         return self.double.position_limits
 
     @property
     def velocity_limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper (nv,) each [m/s or rad/s]."""
+        """Lower and upper limits (nv,) each [m/s or rad/s]."""
         return self.double.velocity_limits
 
     @property
     def whole(self) -> Model:
-        """The model with all of the plant's coordinates, on the same contexts; itself where none is left out.
+        """The model with all coordinates of the plant, on the same contexts; the model itself if it is not reduced.
 
-        The constraints of mimic joints, which the reduced state keeps to by itself, are none of its `num_constraints`.
+        Its `num_constraints` does not count constraints of mimic joints, which the reduced state satisfies by itself.
         """
         if self.coupling is None:
             return self
@@ -238,18 +238,18 @@ class Model(ShowsItsRepr):
 
     @property
     def actuation(self) -> np.ndarray:
-        """B (nv, nu): the generalized force by the efforts of the inputs; 0 of what systems of the diagram hand on."""
+        """B (nv, nu): the generalized force per effort of the inputs; 0 for inputs of the diagram's systems."""
         return self.inputs.of_actuators(self.by_effort.T).T
 
     @property
     def by_effort(self) -> np.ndarray:
-        """(nv, actuators): the generalized force by the efforts of all actuators."""
+        """(nv, actuators): the generalized force per effort of all actuators."""
         B = np.asarray(self.plant.MakeActuationMatrix())[:, : len(actuators(self.plant))]
         return B if self.coupling is None else self.coupling.spread.T @ B
 
     @property
     def servo_gains(self) -> tuple[np.ndarray, np.ndarray]:
-        """kp and kd (nu,) of the inputs that are commanded positions; 1 and 0 of others."""
+        """kp and kd (nu,) of the inputs that are commanded positions; 1 and 0 for the others."""
         gains, every = np.array([np.ones(self.nu), np.zeros(self.nu)]), actuators(self.plant)
         for i in np.flatnonzero(self.inputs.commanded):
             servo = every[self.inputs.actuator[i]].get_controller_gains()
@@ -258,32 +258,32 @@ class Model(ShowsItsRepr):
 
     @property
     def effort_limits(self) -> np.ndarray:
-        """(nu,) what an input exerts at most [N or N m]: of two sides the smaller, infinite without a limit."""
+        """The maximum effort (nu,) of each input [N or N m]: the smaller of the two sides, infinite without a limit."""
         sides = np.minimum(np.abs(self.inputs.lower), np.abs(self.inputs.upper))
         motors = self.inputs.of_actuators([a.effort_limit() for a in actuators(self.plant)])
         return np.where(self.inputs.commanded, motors, sides)
 
     def efforts(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """(..., nu) what inputs u (..., nu) exert [N or N m], x (..., nx) being the state after the step.
+        """Return the efforts (..., nu) of inputs u (..., nu) [N or N m], with the state x (..., nx) after the step.
 
-        Of a commanded position it is kp (u - q) - kd v, not yet cut off at its motor's limit.
+        For a commanded position, the effort is kp (u - q) - kd v before saturation at the motor's limit.
         """
         kp, kd = self.servo_gains
         q, v = self._joints_of_servos(x)
         return np.asarray(kp * (u - q) - kd * v)
 
     def commands(self, x: np.ndarray, v_next: np.ndarray, efforts: np.ndarray) -> np.ndarray:
-        """(nu,) the inputs that exert `efforts` (nu,) in a step from x (nx,) to the velocities v_next (nv,)."""
+        """Return the inputs (nu,) with given `efforts` (nu,) in a step from x (nx,) to the velocities v_next (nv,)."""
         kp, kd = self.servo_gains
         q, v = self._joints_of_servos(np.concatenate([x[: self.nq], v_next]))
         return np.asarray((efforts + kp * (q + self.time_step * v) + kd * v) / kp)
 
     def neutral_input(self, x: np.ndarray) -> np.ndarray:
-        """(..., nu) of servos the positions that their joints have in x (..., nx); 0 of other inputs."""
+        """Return inputs (..., nu): for servos, the joint positions in x (..., nx); 0 for other inputs."""
         return self._joints_of_servos(x)[0]
 
     def _joints_of_servos(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities (..., nu) of the joints of commanded positions in states x (..., nx); else 0."""
+        """Return positions and velocities (..., nu) of servo joints in states x (..., nx), and 0 for other inputs."""
         which, every = self.inputs.commanded, actuators(self.plant)
         driven = [every[i].joint() for i in self.inputs.actuator[which]]
         states = x if self.coupling is None else self.coupling.state(x)
@@ -294,11 +294,11 @@ class Model(ShowsItsRepr):
 
     @property
     def num_constraints(self) -> int:
-        """How many act in the plant beside those of mimic joints that are reduced."""
+        """The number of constraints in the plant, not counting those of reduced mimic joints."""
         return int(self.plant.num_constraints()) - self.held
 
     def finite_state(self, subject: str, x: ArrayLike) -> np.ndarray:
-        """`x` (nx,) as an array; ShapeError, which names what floats, or NonFiniteError where it is no state."""
+        """Return `x` (nx,) as an array; raise ShapeError, which names floating bodies, or NonFiniteError."""
         try:
             return finite_array(subject, x, (self.nx,))
         except ShapeError as error:
@@ -309,7 +309,7 @@ class Model(ShowsItsRepr):
             raise ShapeError(subject, got=np.shape(x), expected=(self.nx,), because=why) from error
 
     def places(self, joint: Any) -> tuple[range, range]:
-        """Where the coordinates of a joint are in q and in v; empty of a joint that only follows another."""
+        """Return the ranges of a joint's coordinates in q and in v; they are empty for a reduced follower."""
         i, j = joint.position_start(), joint.velocity_start()
         q, v = range(i, i + joint.num_positions()), range(j, j + joint.num_velocities())
         if self.coupling is None:
@@ -317,19 +317,19 @@ class Model(ShowsItsRepr):
         return _range_in(self.coupling.own_q, q), _range_in(self.coupling.own_v, v)
 
     def at_time_step(self, time_step: float) -> Model:
-        """The same model at another time step [s]. ModelError where it came from a diagram, which has but one."""
+        """Return the same model with another time step [s]; raise ModelError if the model is from a diagram."""
         return self.changed(time_step=seconds("time_step [s]", time_step))
 
     def with_contact(self, approximation: str) -> Model:
-        """The same model with another contact approximation (sap, similar, lagged). ModelError like `at_time_step`."""
+        """Return the model with another contact approximation (sap, similar, lagged); for errors see `at_time_step`."""
         _check_choice("contact_approximation", approximation, CONTACT_APPROXIMATIONS)
         return self.changed(contact_approximation=approximation)
 
     def changed(self, **change: Any) -> Model:
-        """The same model with some options of `load_model` changed; the same changes give the same Model again.
+        """Return the model with changed options of `load_model`; the same changes return the same Model.
 
         Raises:
-            ModelError: It was made from a diagram, which holds one plant only.
+            ModelError: The model was made from a diagram, which contains only this plant.
             UnknownNameError: `load_model` has no such option.
 
         Example:
@@ -342,34 +342,34 @@ class Model(ShowsItsRepr):
         try:
             key = frozenset((option, _key(value)) for option, value in change.items())
         except (TypeError, ValueError):
-            return self._rebuild(**change)  # which says what is wrong with it
+            return self._rebuild(**change)  # raises an error for the invalid value
         if key not in self._others:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", ModelWarning)  # said when the model was loaded first
+                warnings.simplefilter("ignore", ModelWarning)  # shown when the model was first loaded
                 made = self._rebuild(**change)
             with self.shared.lock:
                 if len(self._others) >= OTHERS_KEPT:
                     self._others.pop(next(iter(self._others)))
-                return self._others.setdefault(key, made)  # another thread may have been faster
+                return self._others.setdefault(key, made)  # another thread may have added it first
         return self._others[key]
 
     @property
     def can_rebuild(self) -> bool:
-        """Whether the model can be had at another time step or contact approximation: one from a file can."""
+        """Whether the model can be rebuilt with other options, which requires that it was loaded from a file."""
         return self._rebuild is not None
 
     @cached_property
     def takes_forces(self) -> bool:
-        """Whether generalized forces can be added: nothing in the diagram feeds that port."""
+        """Whether generalized forces can be added, which requires that the diagram does not feed this port."""
         return not self.feeds(self.plant.get_applied_generalized_force_input_port())
 
     def feeds(self, port: Any) -> bool:
-        """Whether the diagram's own systems feed an input port of the plant, or it is itself an input of the model."""
+        """Return whether a system of the diagram, or an input of the model, feeds an input port of the plant."""
         return int(port.get_index()) in self.inputs.fed
 
     @property
     def systems_act(self) -> str:
-        """Which forces the diagram's own systems exert on the plant; empty where none does."""
+        """A list of the forces that the diagram's systems exert on the plant, or ""."""
         plant = self.plant
         ports = [plant.get_applied_generalized_force_input_port(), plant.get_applied_spatial_force_input_port()]
         reasons = [f"the diagram feeds {port.get_name()}" for port in ports if self.feeds(port)]
@@ -377,15 +377,15 @@ class Model(ShowsItsRepr):
 
     @cached_property
     def carriers(self) -> dict[Any, tuple[str, bool]]:
-        """By geometry the name of the body that carries it and whether that is fixed, as far as they were asked for."""
+        """A cache of the carrying body's name and whether it is fixed, by geometry."""
         return {}
 
     @property
     def double(self) -> Twin:
-        """The plant that everything is measured on, with this thread's context.
+        """The plant with scalar type double, with this thread's context.
 
-        Raises ModelError where what the diagram's systems exert cannot be told, or depends on time, and where another
-        thread has set a parameter that Drake keeps in the plant.
+        Raises ModelError if the forces of the diagram's systems cannot be evaluated or depend on time, or if another
+        thread has set a parameter that Drake stores in the plant.
         """
         twin = self._here.double
         if twin is None:
@@ -398,9 +398,9 @@ class Model(ShowsItsRepr):
 
     @property
     def autodiff(self) -> Twin:
-        """The AutoDiffXd twin, this thread's own, with the PD gains that Drake's conversion drops put back.
+        """This thread's AutoDiffXd twin, with the PD gains that Drake's conversion drops restored.
 
-        Raises ModelError where a system of the diagram has no AutoDiffXd form.
+        Raises ModelError if a system of the diagram has no AutoDiffXd form.
         """
         twin = self._here.autodiff
         if twin is None:
@@ -427,7 +427,7 @@ class Model(ShowsItsRepr):
 
     @cached_property
     def contract(self) -> Contract:
-        """What the model promises: names, units, limits, masses, contact, time step."""
+        """The properties of the model: names, units, limits, masses, contact, time step."""
         return read_contract(
             self.double,
             name=self.name,
@@ -438,10 +438,10 @@ class Model(ShowsItsRepr):
         )
 
     def cache(self, key: Hashable, make: Callable[[], T], *, of_structure: bool = False) -> T:
-        """The result of `make` for `key`, made once in each thread and kept as long as it and the model.
+        """Return the result of `make` for `key`, cached in each thread for the lifetime of `key` and the model.
 
-        What is made while parameters are applied that are not the model's own is not kept, unless it depends on the
-        model's structure alone (`of_structure`), which no parameter changes.
+        Results under parameters that differ from the model's own are not cached, unless they depend only on the
+        structure of the model (`of_structure`), which no parameter changes.
         """
         entries = self._here.cache
         if key in entries:
@@ -467,10 +467,10 @@ class Model(ShowsItsRepr):
 
     @cached_property
     def pd_targets(self) -> dict[Any, np.ndarray]:
-        """What PD-controlled actuators hold where no input commands it: their joints' default positions, at rest.
+        """Targets of PD-controlled actuators without an input: their joints' default positions, with zero velocity.
 
-        Without a target Drake drops the controllers and the actuation input of that instance. A port that the
-        user's diagram connects is left to it.
+        Without a target, Drake ignores the controllers and the actuation input of an instance. Ports that the user's
+        diagram connects are not set.
         """
         targets = {}
         for instance in instances(self.plant):
@@ -520,65 +520,65 @@ def load_model(
     gains: Sequence[float] | Mapping[str, Sequence[float]] | None = None,
     isolated: bool = False,
 ) -> Model:
-    """The robot in a URDF, SDF, MJCF (.xml) or .dmd.yaml file as a discrete model.
+    """Load the robot in a URDF, SDF, MJCF (.xml) or .dmd.yaml file as a discrete model.
 
     Args:
         path: The robot file.
-        time_step: [s] of the discrete plant.
+        time_step: The time step of the discrete plant [s].
         contact_model: "point", "hydroelastic" or "hydroelastic_with_fallback".
-        contact_approximation: "sap", "similar" or "lagged"; the derivatives of "sap" are the tamest by far.
-        contact_geometry: What to do about pairs of shapes that AutoDiffXd refuses, such as a box on the ground in
-            point contact. "corner_spheres" puts spheres in the place of boxes, cylinders and capsules that move;
-            "hydroelastic" makes all geometries compliant (it needs a hydroelastic `contact_model`); "differences"
-            says that differences are wanted. None takes differences too, but `audit` calls the pair an error.
-        weld_base: The link to fix to the world, as `base` does for any frame.
-        ground: Adds a half space z <= 0 with this friction coefficient; True takes Drake's usual 0.5.
-        gravity: (3,) [m/s^2], in place of Drake's (0, 0, -9.81).
-        actuators: The joints to drive beside those that the file drives: "all" revolute and prismatic joints that mimic
-            no other, a list of names, or an effort limit [N or N m] by name. Else the limit is the file's own, and
-            where that is 0 or not given there is none. A file without transmissions or actuators has no input.
-        base: "weld" fixes what floats and has joints to the world, where the file puts it; the name of a frame fixes
-            that frame at the world's origin; "free" refuses a file that holds its base.
-        fix_joints: The joints to replace by welds, at their default positions or the nearest that their limits allow.
-        packages: The folder of each package:// that the file names, by the name of the package. Without it that is the
-            nearest folder of that name above the file. Nothing is ever downloaded.
-        contact: False takes every collision shape away. "ground" lets what moves touch only what is fixed to the world,
-            such as a ground: a robot's own shapes pass through each other. "separable" lets only those shapes pass
-            through each other that overlap wherever the joints are, in the default and 100 random postures, as the
-            covers of joints do; `Model.notes` names them.
-        mimic: What becomes of joints that follow others, as a gripper's second finger does, and which Drake holds
-            together by constraints: "reduce" takes the followers out of the state, whose equations are then those of
-            the independent coordinates; "fix" welds followers and leaders where they are. None keeps all in the state,
+        contact_approximation: "sap", "similar" or "lagged". "sap" has by far the smoothest derivatives.
+        contact_geometry: The treatment of shape pairs that AutoDiffXd does not support, such as a box on the ground in
+            point contact. "corner_spheres" replaces boxes, cylinders and capsules of moving bodies by spheres;
+            "hydroelastic" makes all geometries compliant (it needs a hydroelastic `contact_model`); "differences" uses
+            finite differences. None also uses finite differences, but `audit` reports the pair as an error.
+        weld_base: The link to weld to the world, as `base` does for any frame.
+        ground: Adds a half space z <= 0 with this friction coefficient; True selects Drake's usual 0.5.
+        gravity: (3,) Gravity [m/s^2], instead of Drake's (0, 0, -9.81).
+        actuators: The joints to drive in addition to those that the file drives: "all" revolute and prismatic joints
+            without a mimic, a list of names, or a mapping from names to effort limits [N or N m]. The default limit is
+            the file's, or none if it is 0 or missing. A file without transmissions or actuators has no input.
+        base: "weld" welds floating mechanisms with joints to the world at their pose in the file. The name of a frame
+            welds that frame to the world's origin. "free" refuses a file with a fixed base.
+        fix_joints: The joints to replace by welds at their default positions, or the nearest positions within limits.
+        packages: The folder of each package:// in the file, by the package's name. The default is the nearest folder of
+            that name above the file. Nothing is ever downloaded.
+        contact: False removes all collision shapes. "ground" allows contact only between moving bodies and bodies fixed
+            to the world, such as a ground, so that the robot has no self-collision. "separable" removes contact only
+            between shapes that overlap at all joint positions, in the default and 100 random postures, such as the
+            covers of joints; `Model.notes` lists them.
+        mimic: The treatment of joints that follow others, such as a gripper's second finger, for which Drake uses
+            constraints. "reduce" removes the followers from the state, and the equations are those of the independent
+            coordinates; "fix" welds followers and leaders at their positions. None preserves all joints in the state,
             as Drake does; collocation and other engines refuse such a model.
         body_forces: `dd.model.BodyForce`s: propellers and thrusters, each an input [N] after the actuators.
-        meshes: What becomes of collision meshes of a URDF or SDF. "skip" leaves out those in formats that Drake cannot
-            use; "convex" takes the convex hull of each, from STL, DAE, OBJ, PLY and OFF files too; "spheres" takes a
-            few spheres inside each hull, whose contact AutoDiffXd can differentiate. What is drawn stays as it is.
-        relaxation_time: [s] in sap contact, of shapes for which the file gives none; Drake's own default is 0.1 s.
-        near_rigid: Drake's near-rigid threshold of sap contact, its own default 1. It softens light bodies' contact
-            where steps are long, so that they sink deeper; a smaller one keeps to the stiffness of the shapes.
-        stiffness: [N/m] of point contact, of shapes for which the file gives none, a ground that is added too; Drake's
-            own default is 1e6. Where two shapes touch it is k1 k2 / (k1 + k2): half of it, where both have it.
-        dissipation: [s/m] Hunt and Crossley's, of similar and lagged contact, of shapes for which the file gives none;
-            Drake's own default is 50.
-        inputs: "position" makes the inputs commanded positions [rad or m] of servos, within the joints' limits: Drake's
-            PD control moves each joint there, with an effort within its motor's limit. "effort" makes them efforts, in
-            the file's servos beside what holds the joints' default positions. None takes positions where the file has
-            servos (MJCF's <position>, Drake's controller_gains), else efforts.
+        meshes: The treatment of collision meshes of a URDF or SDF. "skip" ignores formats that Drake cannot use;
+            "convex" uses the convex hull of each mesh, also from STL, DAE, OBJ, PLY and OFF files; "spheres" uses a few
+            spheres inside each hull, whose contact AutoDiffXd can differentiate. Visual geometry does not change.
+        relaxation_time: For sap contact [s], for shapes without a value in the file; Drake's default is 0.1 s.
+        near_rigid: Drake's near-rigid threshold of sap contact, by default 1. It softens the contact of light bodies at
+            long time steps, so that they penetrate more; a smaller value preserves the stiffness of the shapes.
+        stiffness: For point contact [N/m], for shapes without a value in the file and for an added ground; Drake's
+            default is 1e6. The stiffness of a pair is k1 k2 / (k1 + k2), half of this value if both shapes have it.
+        dissipation: Hunt-Crossley dissipation [s/m] of similar and lagged contact, for shapes without a value in the
+            file; Drake's default is 50.
+        inputs: "position" makes the inputs commanded positions [rad or m] of servos, within the joints' limits. Drake's
+            PD control moves each joint there, with an effort within its motor's limit. "effort" makes them efforts, and
+            servos of the file also hold the joints' default positions. None selects positions if the file has servos
+            (MJCF's <position>, Drake's controller_gains), or else efforts.
         gains: (kp, kd) of the servos [N m/rad and N m s/rad, or N/m and N s/m], for all revolute and prismatic joints
-            that mimic no other, or by the name of the joint; a joint without an actuator gets one of its name. None
-            takes the file's.
-        isolated: Whether the file is first read, and a step made, in a process of its own with at most 60 s and 1 GiB:
-            Drake's parsers crash on some damaged meshes, and would end this process. It takes a few seconds.
+            without a mimic, or a mapping from joint names; a joint without an actuator gets one of its name. None uses
+            the file's gains.
+        isolated: Whether to read the file first, and make a step, in a separate process limited to 60 s and 1 GiB:
+            Drake's parsers crash on some damaged meshes, which would end this process. It takes a few seconds.
 
     Returns:
-        The Model. What was left out of the file (such as meshes in formats that Drake cannot use) and what was added
-        is a ModelWarning and stays in `Model.notes`.
+        The Model. Each part of the file that was ignored (such as meshes in formats that Drake cannot use) and each
+        addition is part of a ModelWarning and of `Model.notes`.
 
     Raises:
-        InputError: The file is missing or of an unknown kind, or an option is wrong.
-        ModelError: Drake cannot read the file, or nothing in it can move; or, `isolated`, the process that reads it
-            first crashes or reaches a limit.
+        InputError: The file is missing or of an unknown type, or an option is invalid.
+        ModelError: Drake cannot read the file, or nothing in it can move. With `isolated`: the process that reads it
+            first crashes or exceeds a limit.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -673,7 +673,7 @@ def _as_path(path: Any) -> Path:
 
 
 def check_in_child_process(source: Path, options: Mapping[str, Any]) -> None:
-    """ModelError where a limited process that loads the file and makes a step crashes, or reaches a limit."""
+    """Load the file and make a step in a child process; raise ModelError if it crashes or exceeds a limit."""
     folders = {name: str(Path(folder).absolute()) for name, folder in (options["packages"] or {}).items()}
     given = {"path": str(source.absolute()), "options": stated_options({**options, "packages": folders or None})}
     outcome = call("drake_diff.model.step:try_to_read", given)
@@ -682,7 +682,7 @@ def check_in_child_process(source: Path, options: Mapping[str, Any]) -> None:
 
 
 def stated_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options of a model that say something, for JSON; `load_model` takes them."""
+    """Return the options of `load_model` that have an effect, in a form for JSON."""
     return {key: _plain(value) for key, value in options.items() if value not in WITHOUT_EFFECT}
 
 
@@ -693,20 +693,20 @@ def _plain(value: Any) -> Any:
 
 
 def _load_again(path: str, digest: str, options: dict[str, Any]) -> Model:
-    """A model that was pickled; its file must be what it was, that files it names are is not looked at."""
+    """Load a pickled model; its file must be unchanged, but files that it names are not checked."""
     source = Path(path)
     if not source.is_file() or sha256(source.read_bytes()).hexdigest() != digest:
         was = "has changed" if source.is_file() else "does not exist"
         raise ModelError(f"{source}: a pickled model is loaded from its file, which {was}")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ModelWarning)  # said when the model was loaded first
+        warnings.simplefilter("ignore", ModelWarning)  # shown when the model was first loaded
         return load_model(source, **options)
 
 
 def _set_contact_law(plant: MultibodyPlant, scene_graph: SceneGraph, near_rigid: float | None, **given: Any) -> None:
     if near_rigid is not None:
         plant.set_sap_near_rigid_threshold(positive_float("near_rigid", near_rigid))
-    config = SceneGraphConfig()  # with Drake's own defaults
+    config = SceneGraphConfig()  # with Drake's defaults
     units = {"relaxation_time": "s", "point_stiffness": "N/m", "hunt_crossley_dissipation": "s/m"}
     for name, value in given.items():
         if value is not None:
@@ -716,26 +716,26 @@ def _set_contact_law(plant: MultibodyPlant, scene_graph: SceneGraph, near_rigid:
 
 
 def model_from_diagram(diagram: Diagram) -> Model:
-    """A Model of a user's own Drake diagram (a RobotDiagram, or any Diagram) with exactly one discrete plant in it.
+    """Make a Model of a user's Drake diagram (a RobotDiagram, or any Diagram) that contains exactly one discrete plant.
 
-    The plant may sit at any depth. The input u has one entry for each entry of the vector input ports that the diagram
-    exports and that reach the plant, in the order of the ports: the command of a Propeller, the input of a Gain, of a
-    system of your own. Where the plant's actuation is exported, the actuators stand there; where nothing is connected
-    to it, they come first. Of what a RobotDiagram exports by itself the actuation alone is an input. Derivatives by
-    autodiff need systems with an AutoDiffXd form, which those of Drake have, and yours by
-    `pydrake.systems.scalar_conversion.TemplateSystem`.
+    The plant may be at any depth. The input u has one entry for each entry of the vector input ports that the diagram
+    exports and that reach the plant, in the order of the ports: the command of a Propeller, the input of a Gain or of
+    your own system. The actuators are at the place of the exported actuation port, or first if nothing is connected to
+    it. Of the default exports of a RobotDiagram, only the actuation is an input. Derivatives by autodiff need systems
+    with an AutoDiffXd form. Drake's systems have this form, and `pydrake.systems.scalar_conversion.TemplateSystem` adds
+    it to yours.
 
     Args:
-        diagram: A pydrake Diagram, built.
+        diagram: A built pydrake Diagram.
 
     Returns:
-        The model. Its `notes` name exported ports that do not reach the plant.
+        The Model. Its `notes` name exported ports that do not reach the plant.
 
     Raises:
-        InputError: `diagram` is no Diagram.
+        InputError: `diagram` is not a Diagram.
         ModelError: The plant is continuous, not finalized, or has sampled output ports; its actuation input is
-            connected inside the diagram and there is no other input; or a system that acts on the plant has a state
-            of its own or depends on time. The message says what to change.
+            connected inside the diagram and there is no other input; or a system that acts on the plant has its own
+            state or depends on time. The message says what to change.
 
     Example:
         >>> from pydrake.planning import RobotDiagramBuilder
@@ -755,7 +755,7 @@ def model_from_diagram(diagram: Diagram) -> Model:
 
 
 def _range_in(entries: np.ndarray, of_plant: range) -> range:
-    """Where the entries are that are among some of the plant's."""
+    """Return the range of `entries` that are in `of_plant`."""
     places = np.flatnonzero(np.isin(entries, of_plant))
     return range(int(places[0]), int(places[-1]) + 1) if len(places) else range(0)
 
@@ -786,7 +786,7 @@ def _check_time(model: Model, twin: Twin) -> None:
 
 
 def _key(value: Any) -> Hashable:
-    """An option's value with a hash: a vector is the same change however it is written, True is not 1."""
+    """Make an option's value hashable; equal vectors have equal keys, but True differs from 1."""
     if isinstance(value, Mapping):
         return frozenset((name, _key(entry)) for name, entry in value.items())
     if isinstance(value, (list, tuple, np.ndarray)):
@@ -803,7 +803,7 @@ def _check_choice(subject: str, value: str, known: tuple[str, ...]) -> None:
 def _repaired(
     plant: MultibodyPlant, scene_graph: SceneGraph, source: Path, facts: FileFacts, options: dict[str, Any]
 ) -> tuple[tuple[str, ...], tuple[Mimic, ...]]:
-    """Change the plant as `options` say: a sentence for each change, and what is reduced. ModelError names the file."""
+    """Change the plant by `options`; return notes and the reduced mimics, or raise ModelError with the file's name."""
     base, weld_base, choice = options["base"], options["weld_base"], options["mimic"]
     if base is not None and weld_base is not None:
         raise InputError("base", got=f"{base!r} and weld_base={weld_base!r}", expected="one of them")
@@ -812,7 +812,7 @@ def _repaired(
     mimics: tuple[Mimic, ...] = ()
     try:
         loops = in_pose_of_files(plant, facts.loops, partial(position_in_file, plant, facts))
-        if choice is not None or options["fix_joints"]:  # Drake takes no joint out of a model with constraints
+        if choice is not None or options["fix_joints"]:  # Drake removes no joint from a model with constraints
             followers = [m for m in facts.followers.values() if choice is not None or m.in_drake]
             mimics = uncoupled(plant, still_moving(plant, followers))
         notes = fix(plant, options["fix_joints"])

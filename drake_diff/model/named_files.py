@@ -1,7 +1,7 @@
-"""What a robot file is made of: the files that it names, what those name in turn, and a copy of all of them elsewhere.
+"""The files that a robot file names, directly or indirectly, and a copy of all of them in another folder.
 
-A name can lead anywhere (`../../etc/passwd`), and a robot file may be a stranger's: what is not called like a mesh or a
-robot file is not opened at all. The licence that is nearest above a file goes with it.
+A name can lead anywhere (`../../etc/passwd`), and a robot file may be untrusted. A file is opened only if its name is
+that of a mesh or a robot file. The nearest licence above a file is copied with it.
 """
 
 import os
@@ -23,23 +23,23 @@ MESHES = (
     ".obj", ".mtl", ".vtk", ".gltf", ".glb", ".bin", ".stl", ".dae", ".ply", ".off", ".msh", ".png", ".jpg", ".jpeg",
     ".ktx2", ".webp",
 )  # fmt: skip
-OF_MJCF = (".xml", ".mjcf")  # all that such a file includes is read with it
-LIBRARIES = (".so", ".dll", ".dylib")  # plugins of Gazebo, which Drake does not read
-LIST_OF_MODELS = "model.config"  # of a folder that SDF includes
+OF_MJCF = (".xml", ".mjcf")  # all files that such a file includes are read with it
+LIBRARIES = (".so", ".dll", ".dylib")  # Gazebo plugins, which Drake does not read
+LIST_OF_MODELS = "model.config"  # of a model folder that SDF includes
 READABLE = (*MESHES, *FORMATS, LIST_OF_MODELS)
 LICENCES = ("LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "LICENCE.txt", "COPYING", "NOTICE")
 PACKAGE = re.compile(r"((?:package|model)://+([^/]+))/([^:]*)")
-LAID_OUT = "drake_diff_model_"  # of the names of temporary folders with the files of a run
-LEVELS = 16  # folders above a copy of a robot file, into which its names may lead
+LAID_OUT = "drake_diff_model_"  # the prefix of temporary folders with the files of a run
+LEVELS = 16  # folders above a copy of a robot file that its names may reach
 
 Put = Callable[[str, Path], None]
 
 
 @dataclass(frozen=True)
 class NamedFile:
-    """A file by the name that a robot file gives it, "INCLUDED: NAME" where one that it names does.
+    """A file by its name in the robot file, or "INCLUDED: NAME" if an included file names it.
 
-    `path` is where it is; without one `reason` says why. `is_list` is of a robot file whose own names are not known.
+    `path` is its location. If it is None, `reason` says why. `is_list` marks a robot file whose names cannot be listed.
     """
 
     name: str
@@ -49,15 +49,15 @@ class NamedFile:
 
     @property
     def is_mesh(self) -> bool:
-        """Whether it belongs to a shape."""
+        """Whether the file belongs to a mesh."""
         return self.name.lower().endswith(MESHES)
 
 
 def named_files(path: Path, packages: Mapping[str, str] | None = None, put: Put | None = None) -> list[NamedFile]:
-    """What the robot file at `path` names, sorted; `packages` are folders by name, as `load_model` takes them.
+    """Return the files that the robot file at `path` names, sorted; `packages` are folders by name, as in `load_model`.
 
-    `put` is called with each name and where it leads, before that is looked at; then `packages` are all that there are.
-    Raises ModelError where a file includes itself.
+    `put` is called with each name and its location before the file is opened. With `put`, only `packages` are known.
+    Raises ModelError if a file includes itself.
     """
     known = PackageMap() if put is None else PackageMap.MakeEmpty()
     if put is None:
@@ -71,7 +71,7 @@ def named_files(path: Path, packages: Mapping[str, str] | None = None, put: Put 
 def _named(
     path: Path, first: Path, packages: PackageMap, put: Put, above: tuple[tuple[str, Path], ...]
 ) -> Iterator[NamedFile]:
-    """What a file names; its relative names start from the folder of `first`. `above` are what leads here."""
+    """Yield the files that a file names, relative to the folder of `first`; `above` are the including files."""
     before, there = "".join(f"{name}: " for name, _ in above), dict[str, Path]()
     inside = {path.resolve(), *(file.resolve() for _, file in above)}
 
@@ -91,7 +91,7 @@ def _named(
                 continue
             there[name] = location
             if target.resolve() not in inside and not (path.name.endswith(OF_MJCF) and name.endswith(FORMATS)):
-                start = first if path.suffix == target.suffix == ".sdf" else target  # as Drake has it
+                start = first if path.suffix == target.suffix == ".sdf" else target  # as in Drake
                 yield from _named(target, start, packages, put, (*above, (name, target)))
     except _NotListedError as error:
         yield NamedFile(before + path.name, None, f"the files that it names cannot be listed: {error}", is_list=True)
@@ -101,28 +101,28 @@ def _named(
 
 
 def is_portable(name: str) -> bool:
-    """Whether a name leads below the folder of a copy of its robot file, as none does that is the path of a file."""
+    """Return whether a name stays below the folder of a copy of its robot file; absolute paths do not."""
     paths = (segment.removeprefix("file://") for segment in name.split(": "))
     return name.count("../") < LEVELS and not any(path.startswith("/") for path in paths)
 
 
 def _existing(location: Path | None) -> Path | None:
-    """The file there, called as there where it is a link: what that leads to need not have an ending."""
+    """Return the file at a location; keep the name of a link, because its target may have no extension."""
     target = file_at(location)
     return location if location is not None and target == location.resolve() else target
 
 
 class _NotListedError(Exception):
-    """Why it is not known what a file names."""
+    """The reason why the files that a file names cannot be listed."""
 
 
-Names = Iterator[tuple[str, Path | None]]  # each once, and where it leads, letter by letter; None: not on this disk
+Names = Iterator[tuple[str, Path | None]]  # unique names with exact locations, None if not on this disk
 
 
 def _names(path: Path, first: Path, packages: PackageMap, put_file: Put) -> Names:
     try:
         yield from _all_names(path, first, packages, put_file)
-    except (AttributeError, OSError, TypeError, ValueError, ModelError) as error:  # Drake's parser forgives more
+    except (AttributeError, OSError, TypeError, ValueError, ModelError) as error:  # Drake's parser accepts more
         raise _NotListedError(str(error).replace(str(path), path.name)) from error
 
 
@@ -130,7 +130,7 @@ def _all_names(path: Path, first: Path, packages: PackageMap, put_file: Put) -> 
     kind, folders = path.name.lower(), set[str]()
     if kind.endswith(".dmd.yaml"):
         names = files_of_directives(path)
-    elif kind.endswith(".obj"):  # of which the list of materials beside it is read
+    elif kind.endswith(".obj"):  # the material library next to it is also read
         words = re.findall(rb"^[ \t]*mtllib[ \t]+(.*\S)", path.read_bytes(), re.MULTILINE)
         names = [Path(word.decode(errors="replace")).name for word in words]
     elif kind.endswith(".gltf"):
@@ -157,7 +157,7 @@ def _all_names(path: Path, first: Path, packages: PackageMap, put_file: Put) -> 
 
 
 def _names_of_folder(name: str, location: Path, put_file: Put) -> Names:
-    """Of a folder that SDF includes: the list of its models, and these."""
+    """Yield the list of models in a folder that SDF includes, and the models."""
     listed = location / LIST_OF_MODELS
     put_file(f"{name}/{LIST_OF_MODELS}", listed)
     if listed.is_file():
@@ -167,7 +167,7 @@ def _names_of_folder(name: str, location: Path, put_file: Put) -> Names:
 
 
 def _names_of_mjcf(xml: XmlText, path: Path) -> Names:
-    """Of MJCF, whose names start from the first file's folder, wherever they stand."""
+    """Yield the names in an MJCF file, which are all relative to the first file's folder."""
     waiting, seen = [xml], set[str]()
     while waiting:
         for name in sorted({element.get("file") for element in waiting.pop().root.iter("include")} - seen - {""}):
@@ -181,7 +181,7 @@ def _names_of_mjcf(xml: XmlText, path: Path) -> Names:
 
 
 def _licences(first: Path, packages: PackageMap, put_file: Put, there: Mapping[str, Path]) -> Names:
-    """The nearest licence above each file, in its package, or as far as a folder above the one of `first`."""
+    """Yield the nearest licence above each file, within its package, or up to one folder above that of `first`."""
     seen: dict[str, Path] = {}
     for name, location in there.items():
         package = PACKAGE.match(name)
@@ -202,21 +202,21 @@ def _licences(first: Path, packages: PackageMap, put_file: Put, there: Mapping[s
 def lay_out(
     folder: Path, name: str, data: bytes, names: Collection[str], content: Callable[[str], bytes | None]
 ) -> tuple[Path, dict[str, str]]:
-    """Write the robot file `data`, and all that it names, so that every name leads below `folder`, which is empty.
+    """Write the robot file `data` and all files that it names, so that all names stay below the empty `folder`.
 
     Args:
-        folder: Where to write.
-        name: What the robot file is called.
-        data: What is in it.
-        names: What it names, and what those files name, as `named_files` calls it.
-        content: Gives what is in the file of such a name, None where there was none.
+        folder: The destination.
+        name: The name of the robot file.
+        data: The content of the robot file.
+        names: The names in it and in the files that it names, in the form of `named_files`.
+        content: Returns the content of the file with such a name, or None if there was no file.
 
     Returns:
-        Where the robot file is, and the folders of its packages.
+        The path of the robot file, and the folders of its packages.
 
     Raises:
-        ArtifactError: It names something else.
-        ModelError: A name leads elsewhere, as an absolute one does, or its names cannot be listed.
+        ArtifactError: The robot file names other files.
+        ModelError: A name leads outside, such as an absolute path, or the names cannot be listed.
     """
     root = folder.resolve()
     deep = [root.joinpath(str(i), *["d"] * LEVELS) for i in range(1 + len(names))]

@@ -1,29 +1,29 @@
-"""Named physical parameters of a model as one flat vector, and the coordinates in which solvers move them.
+"""Named physical parameters of a model as one vector, and the coordinates in which solvers change them.
 
-A name is `element.quantity`, with SI units and as many entries as stand in brackets:
+A name is `element.quantity`. Units are SI, and the number of entries is in brackets:
 
-    pole.mass                        unit inertia and centre of mass stay, so the inertia grows with the mass
-    pole.center_of_mass[3]           in the body's frame; the unit inertia about the body's origin stays
-    pole.inertia[6]                  xx yy zz xy xz yz about the centre of mass, whatever mass and centre are
+    pole.mass                        unit inertia and centre of mass are fixed, so the inertia grows with the mass
+    pole.center_of_mass[3]           in the body's frame; the unit inertia about the body's origin is fixed
+    pole.inertia[6]                  xx yy zz xy xz yz about the centre of mass, for any mass and centre
     hinge.damping                    of joints with one degree of freedom
-    hinge.offset[3]                  where the joint's frame sits on its parent: link lengths
+    hinge.offset[3]                  position of the joint's frame on its parent: link lengths
     hinge.spring_stiffness, hinge.spring_rest_angle, slide.spring_stiffness, slide.spring_rest_length
     motor.gear_ratio, motor.rotor_inertia, motor.kp, motor.kd
     ball.friction, ball.stiffness, ball.dissipation, ball.relaxation_time, ball.hydroelastic_modulus, ball.radius
                                      of all the body's collision geometries; ball/tip.friction is of one
     model.time_step, model.gravity[3]
 
-An element whose name two model instances share is called `instance::name`. Static friction follows the dynamic
-one, which is all that a discrete plant uses.
+An element whose name occurs in two model instances is called `instance::name`. Static friction is set to dynamic
+friction, because a discrete plant uses only the latter.
 
 There are three sources of a derivative:
 
-- "autodiff": Drake keeps the quantity in its context, for floats and for AutoDiffXd;
+- "autodiff": Drake stores the quantity in its context, for floats and for AutoDiffXd;
 - "chain_rule": it enters the step as a generalized force that Drake differentiates (gravity, prismatic springs);
-- "finite_difference" of the double step: Drake takes it as a plain number (PD gains, time step, all of contact). For
-  contact `derivatives.contact.jacobian` has it in closed form in many cases.
+- "finite_difference" of the double step: Drake uses a plain number (PD gains, time step, all of contact). For
+  contact, `derivatives.contact.jacobian` has the closed form in many cases.
 
-Parameters of contact are named by body ("ball.friction": all its geometries) or by geometry ("ball/tip.friction").
+Contact parameters are named by body ("ball.friction": all its geometries) or by geometry ("ball/tip.friction").
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -50,31 +50,31 @@ from drake_diff.model.plant import PROXIMITY, actuators, bodies, joints, labelle
 from drake_diff.model.twin import GravityChange, SpringChange, Twin
 
 # Drake drops the derivative of a frame's pose whose value is exactly the identity. A translation of this
-# length [m] changes no number in the step and keeps the derivative.
+# length [m] changes no digit of the step and preserves the derivative.
 IDENTITY_OFFSET = 1e-300
 AUTODIFF, CHAIN_RULE, DIFFERENCE = "autodiff", "chain_rule", "finite_difference"
 DAMPING = ("N s/m", "N m s/rad")
 
-Values = Any  # (n,) floats, or AutoDiffXd where the twin is of that type
-Elements = Callable[[Model], Mapping[str, Any]]  # what of a model has the quantity, by label
+Values = Any  # (n,) floats, or AutoDiffXd if the twin has that scalar type
+Elements = Callable[[Model], Mapping[str, Any]]  # elements of a model that have the quantity, by label
 Write = Callable[[Twin, str, Values], None]
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A quantity of some sort of element. `write` sets it in a twin, where an element is known by its label."""
+    """A quantity of one kind of element. `write` sets it in a twin for the element with a given label."""
 
     quantity: str
     source: str
     elements: Elements
-    unit: str | tuple[str, str]  # of two: where the element moves along a line, and else
-    read: Callable[[Any], Any]  # the value of an element in the model; None where it has none
+    unit: str | tuple[str, str]  # if two: for translational elements, and for all others
+    read: Callable[[Any], Any]  # returns an element's value in the model, or None
     write: Write
-    positive: bool = False  # whether Drake takes no value below zero
-    on_plant: bool = False  # whether it is set in the plant, which all contexts share
+    positive: bool = False  # whether Drake refuses negative values
+    on_plant: bool = False  # whether it is stored in the plant, which all contexts share
 
     def find(self, model: Model) -> Iterator[tuple[str, str, Any]]:
-        """The label of every element that has the quantity, the unit, and the value in the model."""
+        """Yield the label of every element with the quantity, the unit, and the value in the model."""
         for label, element in self.elements(model).items():
             value, unit = self.read(element), self.unit
             if isinstance(unit, tuple):
@@ -101,7 +101,7 @@ def _joints(model: Model) -> dict[str, Any]:
 
 
 def _springs(plant: Any, kind: Any) -> dict[str, Any]:
-    """The springs of a kind by their joint's label; of two springs on one joint neither can be named."""
+    """Return the springs of a kind by their joint's label; two springs on one joint are omitted."""
     labels = {joint.index(): label for label, joint in labelled(joints(plant)).items()}
     elements = [plant.get_force_element(tree.ForceElementIndex(i)) for i in range(plant.num_force_elements())]
     springs = [(labels[e.joint().index()], e) for e in elements if isinstance(e, kind)]
@@ -122,7 +122,7 @@ def _actuators(model: Model) -> dict[str, Any]:
 
 
 def geometries_of(twin: Twin) -> dict[str, list[Any]]:
-    """Collision geometries by the label of a body, and one by one."""
+    """Return collision geometries by the label of their body, and by their own labels."""
     inspector, plant = twin.inspector, twin.plant
     if inspector is None or twin.scene_graph is None:
         return {}
@@ -138,7 +138,7 @@ def geometries_of(twin: Twin) -> dict[str, list[Any]]:
 
 def _read_inertia(body: Any) -> list[float] | None:
     if not body.default_mass() > 0:
-        return None  # a frame without mass has no inertia: setting it would end the process
+        return None  # a frame without mass has no inertia, and setting one would end the process
     inertia = body.default_spatial_inertia()
     about_com = inertia.Shift(inertia.get_com()).CalcRotationalInertia()
     return [*about_com.get_moments(), *about_com.get_products()]
@@ -176,7 +176,7 @@ def _write_offset(twin: Twin, label: str, value: Values) -> None:
 
 
 def _setter(element: Callable[[Twin, str], Any], name: str, *, vector: bool = False) -> Write:
-    """Write a number, or a vector, by the method of Drake's element that is called `name`."""
+    """Return a function that writes a number, or a vector, by the method `name` of Drake's element."""
 
     def write(twin: Twin, label: str, value: Values) -> None:
         getattr(element(twin, label), name)(twin.context, value if vector else value[0])
@@ -218,7 +218,7 @@ def _read_gravity(model: Model) -> Any:
 def _write_gravity(twin: Twin, label: str, value: Values) -> None:
     vector = plain(value)
     twin.plant.mutable_gravity_field().set_gravity_vector(vector)
-    if np.asarray(value).dtype == object:  # the plant takes the number, a force carries its derivative
+    if np.asarray(value).dtype == object:  # the plant stores the value, and a force carries its derivative
         twin.added["gravity"] = GravityChange(value - vector)
 
 
@@ -227,9 +227,9 @@ _set_damping = _setter(Twin.joint, "SetDampingVector", vector=True)
 _set_stiffness, _set_rest_angle = _setter(_hinge_spring, "SetStiffness"), _setter(_hinge_spring, "SetNominalAngle")
 _set_rotor_inertia = _setter(Twin.actuator, "SetRotorInertia")
 
-# In the order of writing: what an earlier one moves along, a later one sets.
+# In the order of writing: later writes reset values that earlier writes change.
 MECHANISM_KINDS = (
-    # A plant keeps its time step, so nothing is written: another model stands in (`parameters.applied`).
+    # The time step of a plant is fixed, so nothing is written; another model is used (`parameters.applied`).
     Kind("time_step", DIFFERENCE, _rebuildable, "s", attrgetter("time_step"), lambda *_: None, positive=True),
     Kind("gravity", CHAIN_RULE, _taking_forces, "m/s^2", _read_gravity, _write_gravity, on_plant=True),
     Kind("mass", AUTODIFF, _bodies, "kg", get("default_mass"), _setter(Twin.body, "SetMass"), positive=True),
@@ -255,7 +255,7 @@ MECHANISM_KINDS = (
 
 
 def _contact_kind(quantity: str, unit: str, read: Callable[[Any, Any], Any], change: Callable[..., None]) -> Kind:
-    """`read(inspector, geometry)`, None where it has no value; `change(twin, geometry, value, root context)`."""
+    """Make a Kind from `read(inspector, geometry)` (None without a value) and `change(twin, geometry, value, root)`."""
 
     def values(model: Model) -> dict[str, set[Any]]:
         geometries = geometries_of(model.double)
@@ -266,7 +266,7 @@ def _contact_kind(quantity: str, unit: str, read: Callable[[Any, Any], Any], cha
         for geometry in geometries_of(twin)[label]:
             change(twin, geometry, float(value[0]), root)
 
-    # Of geometries that differ each has its own value, their body none.
+    # If the geometries of a body differ, each has its own parameter and the body has none.
     return Kind(quantity, DIFFERENCE, values, unit, lambda v: v.pop() if len(v) == 1 else None, write, positive=True)
 
 
@@ -305,7 +305,7 @@ TIME_STEP = "model.time_step"
 
 @dataclass(frozen=True, eq=False)
 class Parameter:
-    """One named parameter: its value in the model (n,), its unit and range, and what its derivative comes from."""
+    """A named parameter: its value in the model (n,), its unit and range, and the source of its derivative."""
 
     name: str
     unit: str
@@ -333,10 +333,10 @@ class Parameter:
 
 
 def list_parameters(model: Model) -> list[Parameter]:
-    """Every physical parameter that `model` can be differentiated by, sorted by name.
+    """Return every physical parameter with respect to which `model` can be differentiated, sorted by name.
 
     Args:
-        model: The model; values are those of its file or diagram.
+        model: The model; values are from its file or diagram.
 
     Returns:
         Parameters with `.name`, `.unit`, `.value` (n,), `.lower`, `.upper` and `.derivative_source`: "autodiff"
@@ -364,7 +364,7 @@ def list_parameters(model: Model) -> list[Parameter]:
 
 @dataclass(frozen=True, eq=False)
 class ParameterVector:
-    """Some parameters of a model, one after the other, and the values (np,) that they are set to."""
+    """Selected parameters of a model in sequence, with their assigned values (np,)."""
 
     model: Model
     parameters: tuple[Parameter, ...]
@@ -380,47 +380,47 @@ class ParameterVector:
 
     @cached_property
     def sources(self) -> tuple[str, ...]:
-        """The source of the derivative by each entry: "autodiff", "chain_rule" or "finite_difference"."""
+        """The source of the derivative with respect to each entry: "autodiff", "chain_rule" or "finite_difference"."""
         return tuple(p.derivative_source for p in self.parameters for _ in p.value)
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
-        """Where each parameter stands in the vector."""
+        """The slice of each parameter in the vector."""
         return slices_of(len(p.value) for p in self.parameters)
 
     @cached_property
     def differenced(self) -> NDArray[np.int64]:
-        """The indices of the entries whose derivative is a difference of the double step."""
+        """The indices of the entries whose derivatives are finite differences of the double step."""
         return np.flatnonzero([source == "finite_difference" for source in self.sources])
 
     def at(self, values: Any) -> "ParameterVector":
-        """The same parameters set to `values` (np,)."""
+        """Return the same parameters with the values `values` (np,)."""
         return replace(self, values=frozen(values))
 
     def to_dict(self) -> dict[str, Array]:
-        """The values by parameter name."""
+        """Return the values by parameter name."""
         return {p.name: self.values[s] for p, s in self.pairs}
 
     @cached_property
     def step_entry(self) -> int | None:
-        """Where the time step stands in the vector; None where it is not a parameter."""
+        """The index of the time step in the vector, or None if it is not a parameter."""
         return next((s.start for p, s in self.pairs if p.name == TIME_STEP), None)
 
     def time_step(self, values: Array) -> float:
-        """The time step [s] that goes with `values` (np,)."""
+        """Return the time step [s] for `values` (np,)."""
         return self.model.time_step if self.step_entry is None else float(values[self.step_entry])
 
     def write(self, twin: Twin, values: Any) -> None:
-        """Set every parameter in the twin: floats, or AutoDiffXd where the twin is of that type."""
+        """Set every parameter in the twin, with floats, or with AutoDiffXd if the twin has that scalar type."""
         for p, s in self._in_order:
-            # What Drake takes as plain numbers came into the AutoDiffXd twin with the double twin's context.
+            # The AutoDiffXd twin copied the plain numbers from the double twin's context.
             if twin.scalar is float or p.kind.source != "finite_difference":
                 p.kind.write(twin, p.label, values[s])
             elif p.kind.on_plant:
                 p.kind.write(twin, p.label, self.values[s])
 
     def restore(self, twin: Twin) -> None:
-        """Set the twin back to the model's own values."""
+        """Reset the twin to the model's own values."""
         twin.reset()
         for p, _ in self._in_order:
             if p.kind.on_plant:
@@ -431,9 +431,9 @@ class ParameterVector:
         return sorted(self.pairs, key=lambda pair: KINDS.index(pair[0].kind))
 
     def difference_scale(self, entries: Any = slice(None)) -> Array:
-        """How far differences move each of `entries`, relative to their step; never to values that Drake does not take.
+        """Return the scale of finite-difference steps for `entries`, which never reach values that Drake refuses.
 
-        Raises InputError where a parameter cannot be moved to both sides.
+        Raises InputError if a parameter cannot change in both directions.
         """
         scale = np.full(len(self.values), np.nan)
         wanted = np.zeros(len(self.values), dtype=bool)
@@ -458,7 +458,7 @@ class ParameterVector:
 
     @property
     def pairs(self) -> Iterator[tuple[Parameter, slice]]:
-        """Each parameter, and where it stands in the vector."""
+        """Each parameter with its slice of the vector."""
         return zip(self.parameters, self.slices, strict=True)
 
 
@@ -466,9 +466,9 @@ Parameters = Sequence[str] | Mapping[str, Any] | ParameterVector
 
 
 def select(model: Model, parameters: Parameters) -> ParameterVector:
-    """The parameters named, in that order; a mapping also gives values, else the model's own are taken.
+    """Select named parameters in the given order; a mapping also sets values, which default to the model's own.
 
-    Raises UnknownNameError, which lists those that exist, ShapeError, NonFiniteError, or InputError for a value out
+    Raises UnknownNameError, which lists the known names, ShapeError, NonFiniteError, or InputError for a value out
     of range.
     """
     if isinstance(parameters, ParameterVector):
@@ -494,12 +494,12 @@ def select(model: Model, parameters: Parameters) -> ParameterVector:
 
 
 def _select_again(model: Model | None, values: dict[str, Array]) -> ParameterVector:
-    """A vector that was pickled: kinds of parameters are functions of this module, and the same ones afterwards."""
+    """Restore a pickled vector from its values by name, so that it has the Kinds of this module."""
     return plain_parameters(values) if model is None else select(model, values)
 
 
 def plain_parameters(values: Mapping[str, Any]) -> ParameterVector:
-    """Named numbers of no model, in the order of `values`."""
+    """Return a vector of named numbers without a model, in the order of `values`."""
     parameters = []
     for name, value in values.items():
         if not (isinstance(name, str) and name):
@@ -521,7 +521,7 @@ def _check_value(p: Parameter, given: Any) -> Array:
 
 @contextmanager
 def applied(vector: ParameterVector) -> Iterator[Model]:
-    """The vector's model with the values set, or what stands in for it at another time step; undone at the end."""
+    """Yield the vector's model with the values set, or a model with another time step; reset the values at the end."""
     if not vector.parameters:
         yield vector.model
         return
@@ -537,34 +537,34 @@ def applied(vector: ParameterVector) -> Iterator[Model]:
         finally:
             model.set_applied(None, frozenset())
             vector.restore(model.double)
-            if model.has_autodiff:  # made on the way, or before
+            if model.has_autodiff:  # created in this block, or before it
                 vector.restore(model.autodiff)
 
 
 def write_autodiff(vector: ParameterVector, model: Model, variables: Any) -> None:
-    """Set the AutoDiffXd twin of a model that the vector is applied to: `variables` (np,) AutoDiffXd."""
+    """Set `variables` (np,) AutoDiffXd in the AutoDiffXd twin of a model to which the vector is applied."""
     if model.has_other_parameters:
         model.autodiff.root_context.SetTimeStateAndParametersFrom(model.double.root_context)
         if model.applied is not None and len(model.applied.values) > len(vector.values):
-            model.applied.write(model.autodiff, model.applied.values)  # what is no part of a context, such as gravity
+            model.applied.write(model.autodiff, model.applied.values)  # parameters outside the context, such as gravity
         vector.write(model.autodiff, variables)
 
 
 @dataclass(frozen=True, eq=False)
 class ParameterCoordinates:
-    """The coordinates z (np,) in which a solver moves parameters: scaled, and free of what nothing physical can have.
+    """The coordinates z (np,) in which a solver changes parameters: scaled, and always physically valid.
 
-    A parameter is divided by its first value's size; an inertia has log-Cholesky coordinates (see `to_log_cholesky`).
+    A parameter is divided by the size of its first value; an inertia has log-Cholesky coordinates (`to_log_cholesky`).
     """
 
     start: ParameterVector
 
     def __post_init__(self) -> None:
-        self.from_values(self.start.values)  # an inertia that has no coordinates is refused here
+        self.from_values(self.start.values)  # raises an error for an inertia without coordinates
 
     @property
     def scale(self) -> Array:
-        """(np,) the size of a parameter's first value; 1 where that is zero, or its coordinate is no quotient."""
+        """(np,) The magnitude of each first value; 1 if it is zero or if the coordinate is not a quotient."""
         size = np.abs(self.start.values)
         scale = np.where(size > 0, size, 1.0)
         for s in self.inertias:
@@ -573,25 +573,25 @@ class ParameterCoordinates:
 
     @property
     def inertias(self) -> list[slice]:
-        """Where the inertias stand in the vector."""
+        """The slices of the inertias in the vector."""
         return [s for p, s in self.start.pairs if p.kind.quantity == "inertia"]
 
     def from_values(self, values: Array) -> Array:
-        """z of parameter values (np,); bounds of an inertia are the whole line."""
+        """Return z for parameter values (np,); infinite bounds of an inertia stay infinite."""
         z = values / self.scale
         for s in self.inertias:
             z[s] = to_log_cholesky(values[s]) if np.all(np.isfinite(values[s])) else values[s]
         return z
 
     def to_values(self, z: Array) -> Array:
-        """(np,) parameter values of z."""
+        """Return the parameter values (np,) for z."""
         values = z * self.scale
         for s in self.inertias:
             values[s] = from_log_cholesky(z[s])
         return values
 
     def pull_back(self, z: Array, by_values: Array) -> Array:
-        """(..., np) a derivative by z from one by the values (..., np)."""
+        """Convert a derivative (..., np) with respect to the values to a derivative with respect to z."""
         by_z = by_values * self.scale
         for s in self.inertias:
             by_z[..., s] = by_values[..., s] @ derivative_of_from_log_cholesky(z[s])[1]
@@ -599,33 +599,33 @@ class ParameterCoordinates:
 
 
 def matrix(inertia: Any) -> Any:
-    """(3, 3) from the six numbers xx yy zz xy xz yz."""
+    """Return the matrix (3, 3) for the six numbers xx yy zz xy xz yz."""
     xx, yy, zz, xy, xz, yz = inertia
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def second_moment(inertia: Array) -> Array:
-    """(3, 3) S [kg m^2] of an inertia (6,) about the centre of mass."""
+    """Return the second moment S (3, 3) [kg m^2] for an inertia (6,) about the centre of mass."""
     full = matrix(inertia)
     return np.asarray(np.trace(full) / 2 * np.eye(3) - full)
 
 
 def room_of_inertia(inertia: Array) -> float:
-    """How far [kg m^2] every entry may move at least before no mass has this inertia; negative where none has it."""
+    """Return the safe change [kg m^2] of every entry before the inertia is invalid; negative if it is invalid."""
     eigenvalues = np.linalg.eigvalsh(second_moment(inertia))
     smallest, largest = float(eigenvalues[0]), float(np.abs(eigenvalues).max())
     return 0.0 if abs(smallest) <= 1e-12 * largest else smallest / 3
 
 
 def to_log_cholesky(inertia: Array) -> Array:
-    """(6,) coordinates in which every vector is a physically possible inertia, of an inertia (6,).
+    """Return coordinates (6,) of an inertia (6,), such that every vector of coordinates is a physically valid inertia.
 
-    An inertia I about the centre of mass belongs to some distribution of mass exactly where the second moment
+    An inertia I about the centre of mass belongs to a mass distribution if and only if the second moment
     S = tr(I) / 2 - I is positive semidefinite. With S = L L', L lower triangular and its diagonal (e^a, e^b, e^c), the
-    six numbers (a, b, c, L10, L20, L21) are free: the part of the log-Cholesky coordinates of Rucker and Wensing,
-    "Smooth parameterization of rigid-body inertia" (2022), that mass and centre of mass leave.
+    numbers (a, b, c, L10, L20, L21) are free. They are the log-Cholesky coordinates of Rucker and Wensing, "Smooth
+    parameterization of rigid-body inertia" (2022), that remain for a given mass and centre of mass.
 
-    Raises InputError for a point or a rod, which lie at infinity.
+    Raises InputError for a point or a rod, whose coordinates are infinite.
     """
     if room_of_inertia(inertia) <= 0:
         raise InputError("inertia", got=inertia, expected="the inertia of a body that is neither a point nor a rod")
@@ -634,7 +634,7 @@ def to_log_cholesky(inertia: Array) -> Array:
 
 
 def from_log_cholesky(coordinates: Any) -> Any:
-    """(6,) xx yy zz xy xz yz of coordinates (6,), floats or AutoDiffXd."""
+    """Return xx yy zz xy xz yz (6,) for coordinates (6,), floats or AutoDiffXd."""
     a, b, c, l10, l20, l21 = coordinates
     zero = 0.0 * a
     lower = np.array([[np.exp(a), zero, zero], [l10, np.exp(b), zero], [l20, l21, np.exp(c)]])
@@ -644,6 +644,6 @@ def from_log_cholesky(coordinates: Any) -> Any:
 
 
 def derivative_of_from_log_cholesky(coordinates: Array) -> tuple[Array, Array]:
-    """(6,) inertia and (6, 6) its derivative by the coordinates."""
+    """Return the inertia (6,) and its derivative (6, 6) with respect to the coordinates."""
     result = from_log_cholesky(InitializeAutoDiff(coordinates).ravel()).reshape(-1, 1)
     return ExtractValue(result).ravel(), np.asarray(ExtractGradient(result))

@@ -1,4 +1,4 @@
-"""The bodies, joints and actuators of a plant, found by index or by name; the plant in a diagram."""
+"""Access to a plant's bodies, joints and actuators by index or name, and to the plant in a diagram."""
 
 from typing import Any
 
@@ -22,46 +22,46 @@ from drake_diff.exceptions import ModelError, UnknownNameError
 
 _SCENE_GRAPHS = (SceneGraph_[float], SceneGraph_[AutoDiffXd])
 
-ARMATURE = "armature of "  # the prefix of actuators that only carry the armature of a joint, which nothing drives
-FLOATING = ("quaternion_floating", "rpy_floating")  # the types of joints that hold nothing
-DiagramPath = tuple[int, ...]  # the position among the subsystems, level by level
+ARMATURE = "armature of "  # the prefix of undriven actuators that only represent the armature of a joint
+FLOATING = ("quaternion_floating", "rpy_floating")  # types of joints without constraints
+DiagramPath = tuple[int, ...]  # the indices of subsystems, level by level
 
 
 def instances(plant: Any) -> list[ModelInstanceIndex]:
-    """Every model instance, the world and Drake's default one included."""
+    """Return every model instance, including the world and Drake's default instance."""
     return [ModelInstanceIndex(i) for i in range(plant.num_model_instances())]
 
 
 def instances_with_joints(plant: Any) -> list[ModelInstanceIndex]:
-    """The model instances that have positions."""
+    """Return the model instances with positions."""
     return [i for i in instances(plant) if plant.num_positions(i) > 0]
 
 
 def bodies(plant: Any) -> list[Any]:
-    """Every body but the world."""
+    """Return every body except the world."""
     members = [plant.get_body(index) for i in instances(plant) for index in plant.GetBodyIndices(i)]
     return [body for body in members if body.index() != plant.world_body().index()]
 
 
 def joints(plant: Any) -> list[Any]:
-    """Every joint, in the order of its index."""
+    """Return every joint in the order of the joint index."""
     return [plant.get_joint(JointIndex(int(i))) for i in plant.GetJointIndices()]
 
 
 def actuators(plant: Any) -> list[Any]:
-    """Every actuator that can be driven, in the order of the actuation input, where those of ARMATURE come last."""
+    """Return every drivable actuator in the order of the actuation input, in which ARMATURE actuators come last."""
     return [actuator for actuator in rotors(plant) if not actuator.name().startswith(ARMATURE)]
 
 
 def rotors(plant: Any) -> list[Any]:
-    """Every actuator of Drake's, also those that nothing drives and that give their joints an armature."""
+    """Return every actuator of Drake's plant, including undriven actuators that represent an armature."""
     return [plant.get_joint_actuator(JointActuatorIndex(int(i))) for i in plant.GetJointActuatorIndices()]
 
 
 def joint_pose(joint: Any, q: float = 0.0) -> RigidTransform:
-    """The pose of a joint's child frame in its parent frame, a hinge or slide being at the position q [rad or m].
+    """Return the pose of a joint's child frame in its parent frame, with a hinge or slide at q [rad or m].
 
-    Free bodies are in their default pose and others at zero.
+    Free bodies are in their default pose, and other joints at zero.
     """
     if isinstance(joint, RevoluteJoint):
         return RigidTransform(RotationMatrix(AngleAxis(q, joint.revolute_axis())), np.zeros(3))
@@ -73,7 +73,7 @@ def joint_pose(joint: Any, q: float = 0.0) -> RigidTransform:
 
 
 def labelled(elements: list[Any]) -> dict[str, Any]:
-    """The elements by name, or by "instance::name" where two model instances use the same."""
+    """Return the elements by name, or by "instance::name" if two model instances use the same name."""
     names = [element.name() for element in elements]
     by_label = {}
     for element, name in zip(elements, names, strict=True):
@@ -84,12 +84,12 @@ def labelled(elements: list[Any]) -> dict[str, Any]:
 
 
 def radius_of_gyration(body: Any) -> float:
-    """[m] of the file's inertia about the body's origin; 0 of a body without mass."""
+    """Return the radius of gyration [m] about the body's origin, or 0 for a body without mass."""
     moments = body.default_spatial_inertia().get_unit_inertia().get_moments()
     return float(np.sqrt(np.nan_to_num(np.sum(moments)) / 2))
 
 
-# The quantities of contact by the names that parameters have, with Drake's names for them.
+# Contact quantities by their parameter names, with Drake's names.
 PROXIMITY = {
     "friction": ("material", "coulomb_friction"),
     "stiffness": ("material", "point_contact_stiffness"),
@@ -100,9 +100,9 @@ PROXIMITY = {
 
 
 def proximity_property(inspector: Any, geometry: Any, quantity: str) -> float | None:
-    """One of PROXIMITY of a geometry, None where the model gives none; of friction the dynamic coefficient.
+    """Return a PROXIMITY quantity of a geometry, or None if it is not set; friction is the dynamic coefficient.
 
-    A discrete plant uses no other.
+    A discrete plant uses only the dynamic coefficient.
     """
     properties = inspector.GetProximityProperties(geometry)
     if not properties.HasProperty(*PROXIMITY[quantity]):
@@ -112,7 +112,7 @@ def proximity_property(inspector: Any, geometry: Any, quantity: str) -> float | 
 
 
 def scene_graph_beside(diagram: Any, path: DiagramPath) -> Any | None:
-    """The SceneGraph, of either scalar type, nearest to the plant at `path`; None where there is none."""
+    """Return the SceneGraph, of either scalar type, nearest to the plant at `path`, or None."""
     for depth in reversed(range(len(path))):
         scene_graphs = [s for s in follow(diagram, path[:depth]).GetSystems() if isinstance(s, _SCENE_GRAPHS)]
         if scene_graphs:
@@ -121,7 +121,7 @@ def scene_graph_beside(diagram: Any, path: DiagramPath) -> Any | None:
 
 
 def named(kind: str, elements: list[Any], name: str) -> Any:
-    """The one of `elements` called `name`; UnknownNameError lists those that exist."""
+    """Return the element called `name`; raise UnknownNameError, which lists the existing names."""
     matches = [element for element in elements if element.name() == name]
     if not matches:
         raise UnknownNameError(kind, got=name, known=[element.name() for element in elements])
@@ -131,7 +131,7 @@ def named(kind: str, elements: list[Any], name: str) -> Any:
 
 
 def path_to_the_plant(diagram: Diagram) -> DiagramPath:
-    """Where in `diagram` its only MultibodyPlant is; ModelError where there is none or more than one."""
+    """Return the path of the only MultibodyPlant in `diagram`; raise ModelError if there is none or more than one."""
     paths = _paths_to_plants(diagram, ())
     if len(paths) != 1:
         raise ModelError(f"diagram: expected exactly one MultibodyPlant, got {len(paths)}")
@@ -149,7 +149,7 @@ def _paths_to_plants(diagram: Diagram, here: DiagramPath) -> list[DiagramPath]:
 
 
 def follow(diagram: Any, path: DiagramPath) -> Any:
-    """The subsystem at `path`; works on the diagram and on its scalar-converted twin."""
+    """Return the subsystem at `path` in the diagram or in its scalar-converted twin."""
     system = diagram
     for i in path:
         system = system.GetSystems()[i]

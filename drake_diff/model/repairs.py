@@ -1,23 +1,23 @@
-"""What a robot file leaves out, given by arguments of `load_model`: motors, a base that is held, joints that are not.
+"""Changes of a loaded plant by arguments of `load_model`: actuators, a fixed base, and welded joints.
 
 Each function changes a plant before it is finalized, in the same way for every file format, and returns a sentence for
-each thing that it did.
+each change.
 
-Joints that copy another one, as a gripper's second finger does: q_follower = ratio q_leader + offset.
+Mimic joints copy another joint, such as a gripper's second finger: q_follower = ratio q_leader + offset.
 
-Drake keeps both joints in the state and holds them together by a constraint, nearly rigid, in every step. `load_model`
-can fix them (`fix_mimics`), or reduce the state to its independent coordinates: with q = E q_own + c and v = E v_own,
-motion that keeps to them obeys
+Drake has both joints in the state and connects them by a nearly rigid constraint in every step. `load_model` can weld
+them (`fix_mimics`), or reduce the state to its independent coordinates. With q = E q_own + c and v = E v_own, motion
+that satisfies the constraints obeys
 
     E' M(q) E dv_own/dt = E' (B u + forces(q, v) - C(q, v) v)
 
-(Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 3.2). The constraint's impulse of a step lies across
-E, so the momentum along E is what all other impulses make it: with A = M + h D that Drake solves the step by,
+(Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 3.2). The constraint's impulse in a step is orthogonal to
+E, so the momentum along E results from all other impulses. With the matrix A = M + h D of Drake's step,
 
     v'_own = (E' A E)^-1 E' A v'
 
-is the step of the reduced equations to rounding, as far as nothing is touched and no limit is met; there Drake's
-impulses are those at its own v', which differs from E v'_own by what its near-rigid constraint gives way.
+is the step of the reduced equations up to rounding, without contacts and active limits. Otherwise, Drake's impulses
+belong to its own v', which differs from E v'_own by the compliance of the near-rigid constraint.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -48,16 +48,16 @@ from drake_diff.model.file_facts import FileFacts, Mimic
 from drake_diff.model.load_file import DRAKES_REFUSALS
 from drake_diff.model.plant import ARMATURE, actuators, bodies, joint_pose, joints, labelled, named
 
-GROUND_FRICTION = 0.5  # of ground=True: what Drake's SceneGraph gives to geometry without a friction of its own
+GROUND_FRICTION = 0.5  # for ground=True: the default friction of Drake's SceneGraph
 Actuated = str | tuple[str, ...] | dict[str, float | None] | None
 INPUTS = ("position", "effort")
 Gains = tuple[float, float]
 
 
 def as_actuated(value: Any) -> Actuated:
-    """The argument `actuators` as it is kept: None, "all", names, or efforts [N or N m] by name.
+    """Normalize the argument `actuators` to None, "all", names, or efforts [N or N m] by name.
 
-    Raises InputError where it is something else.
+    Raises InputError for any other value.
     """
     if value is None or value == "all":
         return value
@@ -67,7 +67,7 @@ def as_actuated(value: Any) -> Actuated:
 
 
 def _effort(name: str, effort: Any) -> float | None:
-    """The limit, None where there is none: a record holds no infinity."""
+    """Return the limit, or None if it is infinite, because records contain no infinity."""
     if effort is None or effort == np.inf:
         return None
     if isinstance(effort, bool) or not isinstance(effort, (int, float, np.number)) or not effort > 0:
@@ -77,22 +77,22 @@ def _effort(name: str, effort: Any) -> float | None:
 
 
 def as_names(subject: str, value: Any, expected: str = "names of joints") -> tuple[str, ...]:
-    """`value` as a tuple of names; InputError where it is not a list of them."""
+    """Return `value` as a tuple of names; raise InputError if it is not a list of names."""
     if isinstance(value, str) or not isinstance(value, Collection) or not all(isinstance(n, str) for n in value):
         raise InputError(subject, got=repr(value), expected=expected)
     return tuple(value)
 
 
 def can_be_driven(joint: Any) -> bool:
-    """Whether Drake can put an actuator on a joint: revolute and prismatic ones."""
+    """Return whether Drake supports an actuator on a joint, which must be revolute or prismatic."""
     return isinstance(joint, (RevoluteJoint, PrismaticJoint))
 
 
 def add_actuators(plant: MultibodyPlant, asked: Actuated, facts: FileFacts) -> tuple[str, ...]:
-    """Add an actuator to each joint of `asked` that has none; a sentence for what was done.
+    """Add an actuator to each joint of `asked` that has none, and return notes on the changes.
 
-    An actuator is called like its joint. Its effort limit is the file's, if none is given; one of 0 is none, and so
-    are a velocity limit of 0 and a range from 0 to 0 of such a joint, which a file has whose author left them open.
+    An actuator has the name of its joint. Its effort limit defaults to the file's; a limit of 0 means no limit. For
+    such a joint, a velocity limit of 0 or a range from 0 to 0 also means no limit: it is a placeholder in the file.
     """
     if asked is None:
         return ()
@@ -127,7 +127,7 @@ def add_actuators(plant: MultibodyPlant, asked: Actuated, facts: FileFacts) -> t
 
 
 def add_armatures(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
-    """Give joints without an actuator the armature that MJCF gives them: Drake has it on actuators alone."""
+    """Add MJCF's armature to joints without an actuator, since Drake supports it only on actuators."""
     driven, added = {actuator.joint().index() for actuator in actuators(plant)}, []
     for joint in joints(plant):
         says = facts.joints.get(_key(plant, joint))
@@ -139,7 +139,7 @@ def add_armatures(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
 
 
 def check_servos(inputs: str | None, gains: Any) -> None:
-    """UnknownNameError where `inputs` is none of INPUTS nor None, InputError where gains have no servos."""
+    """Raise UnknownNameError if `inputs` is not in INPUTS or None, or InputError if gains are given without servos."""
     if inputs is not None and inputs not in INPUTS:
         raise UnknownNameError("inputs", got=inputs, known=INPUTS)
     if gains is not None and inputs != "position":
@@ -147,7 +147,7 @@ def check_servos(inputs: str | None, gains: Any) -> None:
 
 
 def as_gains(value: Any) -> Gains | dict[str, Gains] | None:
-    """The argument `gains` as it is kept; InputError where it is no pair of kp above 0 and kd of at least 0."""
+    """Normalize the argument `gains`; raise InputError for a pair without kp above 0 and kd of at least 0."""
     if isinstance(value, Mapping):
         return {str(name): _pair(f"gains[{name!r}]", pair) for name, pair in value.items()}
     return None if value is None else _pair("gains", value)
@@ -163,7 +163,7 @@ def _pair(subject: str, value: Any) -> Gains:
 def add_servos(
     plant: MultibodyPlant, inputs: str | None, gains: Gains | dict[str, Gains] | None, facts: FileFacts
 ) -> tuple[str, ...]:
-    """Give the actuators of joints the gains of servos, and the joints actuators that have none."""
+    """Set the gains of servos on actuators, and add actuators to joints that have none."""
     if inputs != "position":
         return ()
     if gains is None:
@@ -187,9 +187,9 @@ def add_servos(
 
 
 def damp_servos(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
-    """Give servos that MJCF gives a damping ratio their kv [N m s/rad or N s/m], once the plant is finalized.
+    """Set kv [N m s/rad or N s/m] of servos that have a damping ratio in MJCF, after the plant is finalized.
 
-    That is 2 ratio sqrt(kp / w), where w is the joint's own entry of the inverse mass matrix in the file's pose.
+    kv is 2 ratio sqrt(kp / w), where w is the joint's own entry of the inverse mass matrix in the file's pose.
     """
     damped = []
     with_ratio = {key: says.damping_ratio for key, says in facts.joints.items() if says.damping_ratio}
@@ -207,7 +207,7 @@ def damp_servos(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
 def _chosen(
     plant: MultibodyPlant, asked: str | Collection[str], facts: FileFacts, subject: str = "actuators"
 ) -> dict[str, Any]:
-    """The joints that are asked for, by name; UnknownNameError or InputError where one cannot be driven."""
+    """Return the requested joints by name; raise UnknownNameError or InputError for a joint that cannot be driven."""
     possible = {name: joint for name, joint in labelled(joints(plant)).items() if can_be_driven(joint)}
     copies = {name for name, joint in possible.items() if _key(plant, joint) in facts.followers}
     if asked == "all":
@@ -222,7 +222,7 @@ def _chosen(
 
 
 def _open(joint: Any) -> Iterator[str]:
-    """Take the limits of 0 from a joint that is to move; what they were of."""
+    """Remove limits of 0 from a driven joint, and yield which limits were removed."""
     if joint.velocity_upper_limits()[0] == 0 == joint.velocity_lower_limits()[0]:
         joint.set_velocity_limits([-np.inf], [np.inf])
         yield "velocity"
@@ -236,7 +236,7 @@ def _key(plant: MultibodyPlant, joint: Any) -> tuple[str, str]:
 
 
 def position_in_file(plant: MultibodyPlant, facts: FileFacts, joint: Any) -> float:
-    """That of a hinge or slide [rad or m] in the pose of its file, wherever a .dmd.yaml lets it start."""
+    """Return the position of a hinge or slide [rad or m] in its file's pose, which a .dmd.yaml does not change."""
     says = facts.joints.get(_key(plant, joint))
     if says is not None or joint.num_velocities() != 1:
         return 0.0 if says is None else says.start
@@ -252,9 +252,9 @@ def _limit_again(actuator: Any, limit: float) -> list[str]:
 
 
 def hold_base(plant: MultibodyPlant, base: str | None) -> tuple[str, ...]:
-    """Weld what floats to the world ("weld"), see that something floats ("free"), or weld the frame of that name.
+    """Weld floating bodies to the world ("weld"), check for a floating body ("free"), or weld the frame with a name.
 
-    Raises UnknownNameError where there is no such frame, ModelError where the base is not as it is asked for.
+    Raises UnknownNameError if the frame does not exist, and ModelError if the base does not match the request.
     """
     if base is None:
         return ()
@@ -289,7 +289,7 @@ def hold_base(plant: MultibodyPlant, base: str | None) -> tuple[str, ...]:
 
 
 def weld_link(plant: MultibodyPlant, name: str) -> None:
-    """Weld the link called `name` to the world; ModelError where it is tied to something."""
+    """Weld the link called `name` to the world; raise ModelError if a joint connects it to a parent."""
     link = named("link", bodies(plant), name)
     try:
         plant.WeldFrames(plant.world_frame(), link.body_frame())
@@ -299,7 +299,7 @@ def weld_link(plant: MultibodyPlant, name: str) -> None:
 
 
 def frame_named(plant: MultibodyPlant, subject: str, name: str) -> Any:
-    """The frame called `name`, or "instance::name"; UnknownNameError lists those that exist."""
+    """Return the frame called `name`, or "instance::name"; raise UnknownNameError, which lists the existing frames."""
     frames = [plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())]
     by_name = labelled([f for f in frames if f.name() and f.body().index() != plant.world_body().index()])
     if name not in by_name:
@@ -308,7 +308,7 @@ def frame_named(plant: MultibodyPlant, subject: str, name: str) -> Any:
 
 
 def floating_trees(plant: MultibodyPlant) -> list[list[Any]]:
-    """The bodies that no chain of joints ties to the world, those that hang together in one list, its root first."""
+    """Return the trees of bodies that are not connected to the world by joints, each with its root first."""
     members = [plant.world_body(), *bodies(plant)]
     index = {body.index(): i for i, body in enumerate(members)}
     ends = [(index[j.parent_body().index()], index[j.child_body().index()]) for j in joints(plant)]
@@ -334,7 +334,7 @@ def _what_holds(plant: MultibodyPlant) -> str:
 
 
 def fix(plant: MultibodyPlant, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Replace the joints called `names` by welds, where they start or at the nearest limit; a sentence that says so."""
+    """Replace the named joints by welds at their default position or nearest limit, and return a note."""
     known = {name: joint for name, joint in labelled(joints(plant)).items() if joint.num_velocities()}
     fixed_at = []
     for name in names:
@@ -360,7 +360,7 @@ def fix(plant: MultibodyPlant, names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def weld(plant: MultibodyPlant, joint: Any, q: float) -> None:
-    """Put a weld in the place of a revolute or prismatic joint at the position q; its actuators go."""
+    """Replace a revolute or prismatic joint by a weld at the position q, and remove its actuators."""
     for actuator in [a for a in actuators(plant) if a.joint().index() == joint.index()]:
         plant.RemoveJointActuator(actuator)
     name, parent, child = joint.name(), joint.frame_on_parent(), joint.frame_on_child()
@@ -370,14 +370,14 @@ def weld(plant: MultibodyPlant, joint: Any, q: float) -> None:
 
 
 def add_springs(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
-    """Put the springs of a file on its joints that Drake's parser does not read: those of MJCF."""
+    """Add the joint springs of a file that Drake's parser ignores, which are those of MJCF."""
     sentences = []
     for name, joint in labelled(joints(plant)).items():
         says = facts.joints.get(_key(plant, joint))
         if says is None or says.spring is None or not can_be_driven(joint):
             continue
         stiffness, rest = says.spring
-        if not (np.isfinite(rest) and 0 <= stiffness < np.inf):  # Drake ends the process on others
+        if not (np.isfinite(rest) and 0 <= stiffness < np.inf):  # Drake ends the process for other values
             raise ModelError(
                 f"{name}: expected a spring of finite stiffness, 0 or more, got {stiffness:g} about {rest:g}"
             )
@@ -389,13 +389,13 @@ def add_springs(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
 
 
 def check_contact(value: Any) -> None:
-    """InputError where the argument `contact` is none."""
+    """Raise InputError if the argument `contact` is invalid."""
     if not (isinstance(value, bool) or value in ("ground", "separable")):
         raise InputError("contact", got=repr(value), expected='True, False, "ground" or "separable"')
 
 
 def take_away_contact(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
-    """Let nothing collide: every collision shape loses that role and is drawn no more."""
+    """Disable all contact: remove the proximity role of every collision shape, which is then also not drawn."""
     geometries = collision_geometries(plant, scene_graph)
     for _, geometry in geometries:
         scene_graph.RemoveRole(plant.get_source_id(), geometry, pg.Role.kProximity)
@@ -403,7 +403,7 @@ def take_away_contact(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tupl
 
 
 def touch_the_world_alone(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
-    """Let what moves collide with what is fixed to the world only; to be called when every shape is there."""
+    """Exclude contact between moving bodies, except with the world; call it after all shapes are registered."""
     fixed = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
     moving = [geometry for body, geometry in collision_geometries(plant, scene_graph) if int(body.index()) not in fixed]
     if moving:
@@ -413,7 +413,7 @@ def touch_the_world_alone(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> 
 
 
 def as_ground(value: Any) -> float | bool | None:
-    """The argument `ground` as it is kept: None, True or a friction coefficient; InputError where it is no such."""
+    """Normalize the argument `ground` to None, True or a friction coefficient; raise InputError if it is invalid."""
     if value is None or value is True:
         return value
     number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, (bool, np.timedelta64))
@@ -423,7 +423,7 @@ def as_ground(value: Any) -> float | bool | None:
 
 
 def add_ground(plant: MultibodyPlant, ground: float | bool | None) -> tuple[str, ...]:
-    """Add the half space z <= 0 with this friction coefficient, or with the usual one (True)."""
+    """Add the half space z <= 0 with a friction coefficient, or with the default coefficient for True."""
     if ground is None:
         return ()
     friction = GROUND_FRICTION if ground is True else float(ground)
@@ -437,23 +437,23 @@ def add_ground(plant: MultibodyPlant, ground: float | bool | None) -> tuple[str,
 
 
 def _plain(error: BaseException) -> str:
-    """What Drake says, without the name of its own function."""
+    """Return Drake's error message without the name of its internal function."""
     return str(error).split("(): ", 1)[-1].strip()
 
 
 CHOICES = ("reduce", "fix")
-SLACK = 1e-9  # [m or rad] of limits that meet in one point but for rounding
+SLACK = 1e-9  # [m or rad] tolerance for limits that meet in one point up to rounding
 
 
 @dataclass(frozen=True, eq=False)
 class JointCoupling:
-    """The independent ("own") coordinates of a plant in which joints follow others, and all by them.
+    """The independent ("own") coordinates of a plant with mimic joints, and the map to all coordinates.
 
     Each entry of the plant's q (n,) is ratio * own entry `of_q` + offset, each of its v (m,) ratio * own entry `of_v`.
     """
 
     mimics: tuple[Mimic, ...]
-    own_q: NDArray[np.intp]  # (nq,) where the independent ones are in the plant's q
+    own_q: NDArray[np.intp]  # (nq,) indices of the independent coordinates in the plant's q
     own_v: NDArray[np.intp]  # (nv,)
     of_q: NDArray[np.intp]  # (n,)
     of_v: NDArray[np.intp]  # (m,)
@@ -463,37 +463,37 @@ class JointCoupling:
 
     @property
     def spread(self) -> Array:
-        """E (m, nv)."""
+        """The matrix E (m, nv)."""
         E = np.zeros((len(self.of_v), len(self.own_v)))
         E[np.arange(len(self.of_v)), self.of_v] = self.ratio_v
         return E
 
     def positions(self, q: Any) -> Any:
-        """The plant's q (..., n) of the own q (..., nq), floats or AutoDiffXd."""
+        """Return the plant's q (..., n) for the own q (..., nq), floats or AutoDiffXd."""
         return self.ratio_q * q[..., self.of_q] + self.offset
 
     def velocities(self, v: Any) -> Any:
-        """The plant's v (..., m) of the own v (..., nv)."""
+        """Return the plant's v (..., m) for the own v (..., nv)."""
         return self.ratio_v * v[..., self.of_v]
 
     def state(self, x: Any) -> Any:
-        """The plant's [q; v] (..., n + m) of the own x (..., nx)."""
+        """Return the plant's [q; v] (..., n + m) for the own x (..., nx)."""
         nq = len(self.own_q)
         return np.concatenate([self.positions(x[..., :nq]), self.velocities(x[..., nq:])], axis=-1)
 
     def own_state(self, state: Any) -> Any:
-        """The own x of the plant's [q; v]: followers are dropped."""
+        """Return the own x for the plant's [q; v], without the followers."""
         return np.concatenate([state[: len(self.of_q)][self.own_q], state[len(self.of_q) :][self.own_v]])
 
     def forces(self, force: Any) -> Any:
-        """(nv,) E' of the plant's generalized force (m,), floats or AutoDiffXd."""
+        """Return E' f (nv,) for the plant's generalized force f (m,), floats or AutoDiffXd."""
         reduced = force[self.own_v]
         for i in np.setdiff1d(np.arange(len(self.of_v)), self.own_v):
             reduced[self.of_v[i]] = reduced[self.of_v[i]] + self.ratio_v[i] * force[i]
         return reduced
 
     def limits(self, lower: Array, upper: Array, *, of_velocities: bool = False) -> tuple[Array, Array]:
-        """The own lower and upper limits (n,) that keep to all of the plant's."""
+        """Return the own lower and upper limits (n,) that satisfy all limits of the plant."""
         leader, ratio = (self.of_v, self.ratio_v) if of_velocities else (self.of_q, self.ratio_q)
         offset = np.zeros(len(leader)) if of_velocities else self.offset
         count = len(self.own_v if of_velocities else self.own_q)
@@ -504,25 +504,25 @@ class JointCoupling:
         return low, high
 
     def next_velocities(self, A: Any, v: Any) -> Any:
-        """(nv,) of the plant's v (m,) after a step whose impulses are those of the mass A (m, m)."""
+        """Return the own velocities (nv,) for the plant's v (m,) after a step with the matrix A (m, m)."""
         E = self.spread
         if A.dtype == float:
             return np.linalg.solve(E.T @ A @ E, E.T @ (A @ v))
         value = ExtractValue(A)
         mass = E.T @ value @ E
         solution = np.linalg.solve(mass, E.T @ (value @ ExtractValue(v.reshape(-1, 1)).ravel()))
-        missing = self.forces(A @ (v - self.velocities(solution)))  # 0, with derivatives: a step of Newton's method
+        missing = self.forces(A @ (v - self.velocities(solution)))  # 0 with nonzero derivatives: a Newton step
         return solution + np.linalg.inv(mass) @ missing
 
 
 def check_mimic(choice: str | None) -> None:
-    """UnknownNameError where it is none of CHOICES, nor None."""
+    """Raise UnknownNameError if the choice is not in CHOICES or None."""
     if choice is not None and choice not in CHOICES:
         raise UnknownNameError("mimic", got=choice, known=CHOICES)
 
 
 def _called(plant: MultibodyPlant, mimic: Mimic, name: str) -> list[Any]:
-    """The joints of that name, those of the mimic's model instance where others have them too."""
+    """Return the joints with a name, only from the mimic's model instance if the name is not unique."""
     same_name = [j for j in joints(plant) if j.name() == name]
     same_instance = [j for j in same_name if plant.GetModelInstanceName(j.model_instance()) == mimic.instance]
     return same_instance if len(same_name) > 1 else same_name
@@ -539,7 +539,7 @@ def _joint(plant: MultibodyPlant, mimic: Mimic, name: str) -> Any:
 
 
 def joints_of_mimics(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> list[tuple[Mimic, Any, Any]]:
-    """Each with the joints that follow and lead."""
+    """Return each mimic with its follower and leader joints."""
     triples = [(m, _joint(plant, m, m.follower), _joint(plant, m, m.leader)) for m in mimics]
     for mimic, _, _ in triples:
         if mimic.ratio == 0 or not np.isfinite([mimic.ratio, mimic.offset]).all():
@@ -548,7 +548,7 @@ def joints_of_mimics(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> list[t
 
 
 def _resolved(pairs: list[tuple[Mimic, Any, Any]]) -> dict[Any, tuple[Any, float, float]]:
-    """By the index of each follower the joint that leads in the end, and q = ratio * its q + offset."""
+    """Map the index of each follower to its final leader with q = ratio * (leader's q) + offset."""
     direct = {follower.index(): (leader, m.ratio, m.offset) for m, follower, leader in pairs}
     resolved = {}
     for follower in direct:
@@ -565,10 +565,10 @@ def _resolved(pairs: list[tuple[Mimic, Any, Any]]) -> dict[Any, tuple[Any, float
 
 
 def uncoupled(plant: MultibodyPlant, mimics: Iterable[Mimic]) -> tuple[Mimic, ...]:
-    """The mimic joints, whose constraints are taken out of a plant that is not finalized.
+    """Remove the constraints of mimic joints from a plant that is not finalized, and return the mimic joints.
 
-    Raises ModelError where one cannot be, or where the plant has other constraints: pydrake does not tell which is
-    which.
+    Raises ModelError if a constraint cannot be removed, or if the plant has other constraints, because pydrake does not
+    identify them.
     """
     couplings = tuple(mimics)
     _resolved(joints_of_mimics(plant, couplings))
@@ -584,7 +584,7 @@ def uncoupled(plant: MultibodyPlant, mimics: Iterable[Mimic]) -> tuple[Mimic, ..
 
 
 def still_moving(plant: MultibodyPlant, mimics: Iterable[Mimic]) -> tuple[Mimic, ...]:
-    """Those whose follower was not fixed by name. ModelError where what it follows was."""
+    """Return the mimics whose follower was not fixed by name; raise ModelError if a leader was fixed."""
 
     def fixed(mimic: Mimic, name: str) -> bool:
         return any(joint.num_velocities() == 0 for joint in _called(plant, mimic, name))
@@ -597,9 +597,9 @@ def still_moving(plant: MultibodyPlant, mimics: Iterable[Mimic]) -> tuple[Mimic,
 
 
 def fix_mimics(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> tuple[str, ...]:
-    """Weld what follows and what leads; a sentence that says where.
+    """Weld followers and leaders, and return a note with their positions.
 
-    The leader is where it starts, or at the nearest position that all joints' limits allow.
+    The leader is at its default position, or at the nearest position that all joints' limits allow.
     """
     if not mimics:
         return ()
@@ -617,7 +617,7 @@ def fix_mimics(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> tuple[str, .
         _check_limits(leader.name(), low, high)
         q = float(np.clip(leader.default_positions()[0], low, max(low, high)))
         welds += [(joint, ratio * q + offset) for joint, ratio, offset in moving]
-    positions = ", ".join(f"{joint.name()} at {q:.6g}" for joint, q in welds)  # before Drake forgets them
+    positions = ", ".join(f"{joint.name()} at {q:.6g}" for joint, q in welds)  # before the joints are removed
     for joint, q in welds:
         weld(plant, joint, q)
     return (f"{len(welds)} mimic joints and those that they follow were fixed: {positions}.",)
@@ -629,7 +629,7 @@ def _check_limits(leader: str, low: float, high: float) -> None:
 
 
 def couple(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> tuple[str, ...]:
-    """Give Drake the constraints of mimic joints again; a sentence for what is reduced."""
+    """Add the constraints of mimic joints to Drake again, and return a note on the reduction."""
     for mimic, follower, leader in joints_of_mimics(plant, mimics):
         plant.AddCouplerConstraint(follower, leader, mimic.ratio, mimic.offset)
     listing = ", ".join(map(str, mimics))
@@ -637,7 +637,7 @@ def couple(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> tuple[str, ...]:
 
 
 def coupling_of(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> JointCoupling | None:
-    """The independent coordinates of a finalized plant; None where no joint follows another."""
+    """Return the independent coordinates of a finalized plant, or None if it has no mimic joints."""
     if not mimics:
         return None
     followers = _resolved(joints_of_mimics(plant, mimics))

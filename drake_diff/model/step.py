@@ -1,4 +1,4 @@
-"""One discrete step of Drake's double plant, and a count of steps: the price of a search that no machine changes."""
+"""One discrete step of Drake's double plant, and a step counter as a machine-independent cost of a search."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from drake_diff.model.twin import Twin
 def step(
     model: Model, x: ArrayLike, u: ArrayLike | None = None, *, parameters: Mapping[str, Any] | None = None
 ) -> Array:
-    """The state one time step later, by Drake's double plant.
+    """Return the state one time step later, computed by Drake's double plant.
 
     Args:
         model: The model.
-        x: (nx,) the state [q; v].
-        u: (nu,) [N or N m] the input, constant over the step; may be left out where there is none.
+        x: (nx,) The state [q; v].
+        u: (nu,) The input [N or N m], constant over the step; optional if the model has no inputs.
         parameters: Names (see `list_parameters`) and the values that replace the model's own for this step.
 
     Returns:
-        (nx,) the next state.
+        (nx,) The next state.
 
     Raises:
-        ShapeError, NonFiniteError: x or u is wrong.
-        UnknownNameError, InputError: A parameter does not exist, or its value is not possible.
+        ShapeError, NonFiniteError: x or u is invalid.
+        UnknownNameError, InputError: A parameter does not exist, or its value is invalid.
         SimulationError: Drake cannot take the step, or its result is not finite.
 
     Example:
@@ -51,15 +51,15 @@ def step(
 
 
 def check_point(model: Model, x: ArrayLike, u: ArrayLike | None) -> tuple[Array, Array]:
-    """`x` and `u` as finite arrays of the model's sizes."""
+    """Return `x` and `u` as finite arrays of the model's sizes."""
     no_input = u is None and model.nu == 0
     return model.finite_state("x", x), finite_array("u", [] if no_input else u, (model.nu,))
 
 
 def set_state(twin: Twin, x: Any) -> None:
-    """Put the state `x` (nx,), floats or AutoDiffXd, into the twin's context.
+    """Set the state `x` (nx,), floats or AutoDiffXd, in the twin's context.
 
-    Raises SimulationError where a float is not finite: Drake would end the process with SystemExit.
+    Raises SimulationError if a float is not finite; Drake would end the process with SystemExit.
     """
     if not _is_finite(np.asarray(x)):
         raise SimulationError(f"a state is not finite: {x}")
@@ -67,9 +67,9 @@ def set_state(twin: Twin, x: Any) -> None:
 
 
 def advance(twin: Twin, x: Any, u: Any) -> Any:
-    """(nx,): one step of the twin, floats or AutoDiffXd; sizes are the caller's business.
+    """Return the state (nx,) after one step of the twin, for floats or AutoDiffXd; sizes are not checked.
 
-    The context is left at (x, u), so that what Drake computed on the way (contacts, efforts) can be read.
+    The context stays at (x, u), so that Drake's intermediate results (contacts, efforts) can be read.
     """
     plant, context = twin.plant, twin.context
     set_state(twin, x)
@@ -82,7 +82,7 @@ def advance(twin: Twin, x: Any, u: Any) -> Any:
     try:
         # value() is a view that the next step overwrites.
         x_next = twin.next_state(np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value()))
-    except (RuntimeError, SystemExit) as error:  # SystemExit: a condition in Drake, such as a stiffness above 0
+    except (RuntimeError, SystemExit) as error:  # SystemExit: a failed condition in Drake, such as a stiffness above 0
         raise SimulationError(f"Drake cannot take this step: {error}") from error
     if not _is_finite(x_next):
         raise SimulationError(f"the step leads to {x_next}, which is not finite, from x = {x}, u = {u}")
@@ -90,21 +90,21 @@ def advance(twin: Twin, x: Any, u: Any) -> Any:
 
 
 def _is_finite(numbers: Any) -> bool:
-    """Of an array (n,) of floats; AutoDiffXd are taken as they are.
+    """Return whether an array (n,) of floats is finite; AutoDiffXd arrays are not checked.
 
-    Their norm takes a fraction of the time of looking at each; a norm that no float holds is infinite.
+    The norm is much faster to compute than a check of each entry, and is infinite if it overflows.
     """
     return numbers.dtype != float or math.isfinite(math.hypot(*numbers.tolist()))
 
 
 class StepCount:
-    """Steps that were simulated in the block of `count_steps` that made it; `steps` is their number so far."""
+    """The number `steps` of simulated steps in a block of `count_steps`."""
 
     def __init__(self, within: StepCount | None = None):
         self.steps, self._within = 0, within
 
     def add(self, steps: int) -> None:
-        """Count so many more, here and in the blocks around."""
+        """Add a number of steps to this count and to those of the enclosing blocks."""
         self.steps += steps
         if self._within is not None:
             self._within.add(steps)
@@ -118,14 +118,14 @@ _counting: ContextVar[StepCount | None] = ContextVar("counting", default=None)
 
 @contextmanager
 def count_steps() -> Iterator[StepCount]:
-    """Count the steps that are simulated in a block, so that searches of any kind can be given the same budget.
+    """Count the simulated steps in a block, so that different searches can have the same budget.
 
-    One is a step of Drake's plant, by numbers or by AutoDiffXd, or an interval of `time_step` of a motion in continuous
-    time. All are counted: those of a rollout or a search, and those by which derivatives, certificates and replays are
-    taken. A derivative by formula takes none. The block counts what its own thread does, no other threads or processes.
+    A step is one of Drake's plant, with double or AutoDiffXd, or an interval `time_step` of a continuous-time motion.
+    The count includes the steps of rollouts and searches, and those for derivatives, certificates and replays. A
+    closed-form derivative takes no steps. The block counts only its own thread, no other threads or processes.
 
     Returns:
-        A context that gives a `StepCount`.
+        A context manager that yields a `StepCount`.
 
     Example:
         >>> from drake_diff.model import count_steps
@@ -144,14 +144,14 @@ def count_steps() -> Iterator[StepCount]:
 
 
 def stepped(steps: int = 1) -> None:
-    """Tell the block around, if there is one, that so many steps were simulated."""
+    """Add a number of simulated steps to the enclosing block, if any."""
     count = _counting.get()
     if count is not None:
         count.add(steps)
 
 
 def try_to_read(path: str, options: Mapping[str, Any]) -> None:
-    """Load a model and make a step of it, in a process apart: what is wrong with the file is for the caller to meet."""
+    """Load a model and make a step, in a child process; errors in the file are ignored, as the caller raises them."""
     with warnings.catch_warnings(), suppress(DrakeDiffError):
         warnings.simplefilter("ignore")
         model = load_model(path, **options)

@@ -1,12 +1,12 @@
-"""Add a small motion to a state, subtract two states: quaternions live here and nowhere else.
+"""Tangent vectors of states: addition to a state and subtraction of states, including quaternions.
 
-A tangent vector has one entry for each coordinate, except that the four of a quaternion become three: the
-rotation vector [rad] that Drake's angular velocity w_WB integrates to, expressed in the parent frame.
+A tangent vector has one entry for each coordinate, except that the four entries of a quaternion become three: the
+rotation vector [rad], the integral of Drake's angular velocity w_WB, expressed in the parent frame.
 With q a quaternion (w, x, y, z) and * the quaternion product,
     plus(q, d)  = |q| n / |n|,  n = (1, d / 2) * q / |q|      (so that d plus / d d at 0 is d q / d t per w)
     minus(p, q) = 2 vec(p * conj(q)) / scal(p * conj(q))      (its inverse: minus(plus(q, d), q) = d)
 
-`sample_states` gives seeded states to try something on: in free motion, and with geometries just touching.
+`sample_states` returns seeded test states, both in free motion and with small overlaps of geometries.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class TangentSpace:
     """The tangent space of a model's state, of dimension `size` = nx minus the number of quaternions."""
 
     nx: int
-    quaternions: tuple[int, ...]  # where in x each starts
+    quaternions: tuple[int, ...]  # the start of each quaternion in x
     names: tuple[str, ...]
 
     @property
@@ -35,7 +35,7 @@ class TangentSpace:
         return self.nx - len(self.quaternions)
 
     def plus(self, x: Array, dx: Array) -> Array:
-        """(nx,): the state `x` (nx,) moved by the tangent vector `dx` (size,)."""
+        """Return the state `x` (nx,) moved by the tangent vector `dx` (size,)."""
         moved, (of_x, of_d) = np.array(x, dtype=float), self._plain
         moved[of_x] += dx[of_d]
         for q, r in self._turns:
@@ -44,10 +44,10 @@ class TangentSpace:
         return moved
 
     def minus(self, x1: Array, x0: Array) -> Array:
-        """(size,): the tangent vector at `x0` that leads to `x1`."""
+        """Return the tangent vector (size,) at `x0` that leads to `x1`."""
         if not self.quaternions:
             return x1 - x0
-        difference, (of_x, of_d) = np.empty(self.size, np.result_type(x1, x0)), self._plain  # of AutoDiffXd, too
+        difference, (of_x, of_d) = np.empty(self.size, np.result_type(x1, x0)), self._plain  # also for AutoDiffXd
         difference[of_d] = x1[of_x] - x0[of_x]
         for q, r in self._turns:
             between = _right_product(_conjugate(x0[q])) @ x1[q]
@@ -55,9 +55,9 @@ class TangentSpace:
         return difference
 
     def scale(self, ranges: Array) -> Array:
-        """(size,): the ranges (nx,) of a state's entries as those of a tangent vector; a turn's is the same all round.
+        """Convert ranges (nx,) of a state's entries to ranges (size,) of a tangent vector, isotropic for rotations.
 
-        A quaternion changes by half of the angle that its body turns by.
+        A quaternion changes by half of the rotation angle of its body.
         """
         scales, (of_x, of_d) = np.empty(self.size), self._plain
         scales[of_d] = ranges[of_x]
@@ -66,7 +66,7 @@ class TangentSpace:
         return scales
 
     def derivative_of_plus(self, x: Array) -> Array:
-        """(nx, size): d plus(x, d) / d d at d = 0."""
+        """Return the derivative (nx, size) of plus(x, d) with respect to d at d = 0."""
         derivative = np.zeros((self.nx, self.size))
         derivative[self._plain] = 1.0
         for q, r in self._turns:
@@ -74,7 +74,7 @@ class TangentSpace:
         return derivative
 
     def derivative_of_minus(self, x: Array) -> Array:
-        """(size, nx): d minus(y, x) / d y at y = x."""
+        """Return the derivative (size, nx) of minus(y, x) with respect to y at y = x."""
         derivative = np.zeros((self.size, self.nx))
         derivative[self._plain[::-1]] = 1.0
         for q, r in self._turns:
@@ -82,25 +82,25 @@ class TangentSpace:
         return derivative
 
     def jacobian(self, x: Array, x_next: Array, by_x: Array, *others: Array) -> Array:
-        """(size, size + ...): a step's Jacobians by x (nx, nx), by u, ... (nx, n) side by side, of tangents."""
+        """Convert a step's Jacobians in x (nx, nx) and u, ... (nx, n) to tangents, side by side (size, size + ...)."""
         if not self.quaternions:
             return np.hstack([by_x, *others])
         return np.asarray(self.derivative_of_minus(x_next) @ np.hstack([by_x @ self.derivative_of_plus(x), *others]))
 
     @cached_property
     def _turns(self) -> list[tuple[slice, slice]]:
-        """Where each quaternion stands in x, and its rotation vector in a tangent vector."""
+        """The slices of each quaternion in x, and of its rotation vector in a tangent vector."""
         return [(slice(q, q + 4), slice(q - k, q - k + 3)) for k, q in enumerate(self.quaternions)]
 
     @cached_property
     def _plain(self) -> tuple[Indices, Indices]:
-        """Where all other entries stand in x, and in a tangent vector."""
+        """The indices of all other entries in x, and in a tangent vector."""
         others = np.setdiff1d(np.arange(self.nx), [q + i for q in self.quaternions for i in range(4)])
         return others, others - np.searchsorted(self.quaternions, others)
 
 
 def tangent_space(model: Model) -> TangentSpace:
-    """The tangent space of the state of `model`."""
+    """Return the tangent space of the state of `model`."""
     free = [joint for joint in joints(model.plant) if joint.type_name() == "quaternion_floating"]
     starts = sorted(model.places(joint)[0].start for joint in free)
     names = list(model.state_names)
@@ -115,24 +115,24 @@ def _conjugate(q: Array) -> Array:
 
 
 def _right_product(q: Array) -> Array:
-    """(4, 4): the matrix R with R p = p * q."""
+    """Return the matrix R (4, 4) with R p = p * q."""
     w, x, y, z = q
     return np.array([[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]])
 
 
 FREE, CONTACT = "free", "contact"
-ATTEMPTS = 200  # at a state of the kind that is wanted, before another kind is taken
-DEPTH = (1e-4, 1e-3)  # [m] how deep geometries of a contact state overlap
+ATTEMPTS = 200  # number of attempts to sample a state of the wanted kind
+DEPTH = (1e-4, 1e-3)  # [m] overlap of the geometries in a contact state
 BISECTIONS = 40
 SPEED = 0.5  # [m/s or rad/s] standard deviation, within the velocity limits
 REACH = 1.0  # [m] of a slide, or of a free body, without limits
-ONE_WAY = 2.0  # [N or N m] how far from 0 on inputs are taken that have one sign only
-EFFORT = 0.2  # part of the effort limit; of 1 N or N m where there is none
+ONE_WAY = 2.0  # [N or N m] range of inputs with a fixed sign, from the limit nearest to 0
+EFFORT = 0.2  # fraction of the effort limit, or of 1 N or N m without a limit
 
 
 @dataclass(frozen=True, eq=False)
 class SampledState:
-    """A state x (nx,) and an input u (nu,), and whether geometries touch there."""
+    """A state x (nx,) and an input u (nu,), and whether geometries are in contact."""
 
     kind: str
     x: Array
@@ -140,14 +140,14 @@ class SampledState:
 
 
 def sample_states(model: Model, count: int, seed: int = 0) -> list[SampledState]:
-    """`count` states, every other one touching where contact can be found; the same seed gives the same states."""
+    """Return `count` states, every second one in contact if possible; the same seed gives the same states."""
     random = np.random.default_rng(seed)
     lower, upper = model.inputs.lower, model.inputs.upper
     limit = model.effort_limits
     effort = EFFORT * np.where(limit < 1e6, limit, 1.0)
     middle = np.zeros(model.nu)
     one_way = ((lower >= 0) | (upper <= 0)) & ~model.inputs.commanded
-    for i in np.flatnonzero(one_way).tolist():  # a force that cannot change its sign
+    for i in np.flatnonzero(one_way).tolist():  # forces with a fixed sign
         near = lower[i] if lower[i] >= 0 else upper[i]
         far = float(np.clip(near + ONE_WAY * (1 if lower[i] >= 0 else -1), lower[i], upper[i]))
         middle[i], effort[i] = (near + far) / 2, EFFORT * abs(far - near)
@@ -163,7 +163,7 @@ def sample_states(model: Model, count: int, seed: int = 0) -> list[SampledState]
 
 
 def _free(model: Model, random: np.random.Generator) -> Array:
-    """A state without overlap, where one is found; else the last one tried."""
+    """Return a state without overlap, or the last attempt if there is none."""
     for _ in range(ATTEMPTS):
         x = any_state(model, random)
         if _depth(model, x) == 0:
@@ -172,12 +172,12 @@ def _free(model: Model, random: np.random.Generator) -> Array:
 
 
 def _touching(model: Model, random: np.random.Generator) -> Array | None:
-    """Between a free state and one with an overlap, the state where the overlap is small; None if none is found."""
+    """Bisect between a free state and one with overlap to a state with a small overlap, or return None."""
     space = tangent_space(model)
     free = _free(model, random)
     for _ in range(ATTEMPTS // 10):
         inside = any_state(model, random)
-        for start in space.quaternions:  # free bodies are pushed downwards, where the ground is
+        for start in space.quaternions:  # floating bodies move down, towards the ground
             inside[start + 6] -= REACH * random.uniform(0, 2)
         if _depth(model, inside) <= 0:
             continue
@@ -193,7 +193,7 @@ def _touching(model: Model, random: np.random.Generator) -> Array | None:
 
 
 def any_state(model: Model, random: np.random.Generator) -> Array:
-    """A state within the limits, 5 % of the range apart from them; around the default where there are none."""
+    """Return a random state within the limits, at least 5 % of the range inside, or near the default without limits."""
     nq = model.nq
     x = np.array(model.default_state)
     lower, upper = model.position_limits
@@ -202,7 +202,7 @@ def any_state(model: Model, random: np.random.Generator) -> Array:
     reach = np.array([np.pi if coordinate.unit == "rad" else REACH for coordinate in model.contract.positions])
     middle, half = np.where(limited, (lower + upper) / 2, x[:nq]), np.where(limited, 0.45 * (upper - lower), reach)
     x[:nq] = middle + half * random.uniform(-1, 1, nq)
-    for start in tangent_space(model).quaternions:  # the seven coordinates of a free body start here
+    for start in tangent_space(model).quaternions:  # the start of a floating body's seven coordinates
         x[start : start + 4] = random.standard_normal(4)
         x[start : start + 4] /= np.linalg.norm(x[start : start + 4])
         x[start + 6] += REACH
@@ -214,5 +214,5 @@ def _depth(model: Model, x: Array) -> float:
     set_state(model.double, x)
     try:
         return penetration(model)
-    except SimulationError:  # Drake cannot measure these shapes: the state is tried as it is
+    except SimulationError:  # Drake cannot measure these shapes, so the state is used without a check
         return 0.0

@@ -1,13 +1,13 @@
-"""Triangle meshes of robots: read by trimesh, made smaller for a page, wrapped in a convex hull.
+"""Triangle meshes of robots: reading by trimesh, simplification for a page, and convex hulls.
 
-trimesh is imported when the first mesh is read. What a mesh file names (textures, other files) is not opened, except
-an OBJ's list of materials beside it.
+trimesh is imported when the first mesh is read. Other files that a mesh file names (such as textures) are not opened,
+except the material library next to an OBJ.
 
-`fit_spheres` puts a few spheres in the place of a hull, as AutoDiffXd takes the contact of spheres, not that of a hull.
-The rule: where a flat ground meets the largest sphere that fits in nearly where it would meet the hull, that one sphere
-is enough. Else spheres of one smaller radius are put one after the other where the hull sticks out farthest, as close
-to there as they fit, and then where most of the surface is open; of three radii the largest is taken that is good
-enough. So a ball becomes one sphere, a rod a row, and a box (the sole of a foot) has a sphere in each corner, that
+`fit_spheres` replaces a hull by a few spheres, because AutoDiffXd supports contact of spheres but not of hulls. If flat
+ground touches the largest inscribed sphere nearly where it touches the hull, this single sphere is used. Otherwise,
+spheres of one smaller radius are added one at a time, first as close as possible to the point where the hull protrudes
+most, and then where most of the surface is uncovered. The largest sufficient radius out of three is used. A ball
+therefore becomes one sphere, a rod a row, and a box (such as the sole of a foot) has a sphere in each corner, which
 touches three faces from inside.
 """
 
@@ -30,26 +30,26 @@ from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ModelError
 
 READ_BY_TRIMESH = (".stl", ".dae", ".obj", ".ply", ".off")
-OF_MUJOCO = ".msh"  # its own binary format, which is read here
+OF_MUJOCO = ".msh"  # MuJoCo's binary format, which this module reads
 
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """How large a mesh may be, and how it is made smaller."""
+    """Size limits of meshes, and options of their simplification."""
 
-    largest_file: int = 2**29  # [bytes] of a mesh file that is read
-    most_colours: int = 12  # of one mesh; all others become one, their average
-    most_points: int = 20_000  # that all have a say in a hull; of more, only those farthest out
-    few_directions: int = 40  # in which the farthest points span a first hull; what is inside it is inside the whole
-    small_part: int = 16  # cells along the diagonal of a mesh that it keeps at least, however small it is in the robot
-    joined: float = 2.0**-20  # of a mesh's size: vertices that are closer are one
-    searches: int = 8  # for the cell that keeps a robot's faces below their limit
+    largest_file: int = 2**29  # [bytes] size limit of a mesh file
+    most_colours: int = 12  # per mesh; the remaining colours are averaged
+    most_points: int = 20_000  # all used for a hull; with more points, only the most distant are used
+    few_directions: int = 40  # for the most distant points; points inside their hull are inside the whole hull
+    small_part: int = 16  # minimum number of cells along the diagonal of a mesh, for small parts of a robot
+    joined: float = 2.0**-20  # relative to the mesh's size: closer vertices are merged
+    searches: int = 8  # iterations for the cell size that limits a robot's faces
 
 
 MESHES = MeshOptions()
 
-MOST_CORNERS = 1000  # of a convex hull
-PLAIN = (0.6, 0.6, 0.62)  # of what has no colour
+MOST_CORNERS = 1000  # for a convex hull
+PLAIN = (0.6, 0.6, 0.62)  # default colour
 
 Integers = NDArray[np.int64]
 Colour = tuple[float, float, float]
@@ -64,7 +64,7 @@ class Triangles:
     colours: Array | None = None
 
     def parts(self) -> "list[tuple[Triangles, Colour | None]]":
-        """The faces of each colour as a mesh of its own; all of them with None where the mesh has no colours."""
+        """Return the faces of each colour as a separate mesh, or the whole mesh with None if it has no colours."""
         if self.colours is None:
             return [(self, None)]
         colours, which = np.unique(self.colours, axis=0, return_inverse=True)
@@ -77,9 +77,9 @@ class Triangles:
 
 @dataclass(frozen=True, eq=False)
 class Hull:
-    """A convex hull: `corners` (n, 3) [m], and its faces as planes, `normals` (f, 3) @ x <= `offsets` (f,) inside.
+    """A convex hull: `corners` (n, 3) [m], and face planes with `normals` (f, 3) @ x <= `offsets` (f,) inside.
 
-    `triangles` (t, 3) are its faces by their corners. `lost` [m] is how far points of the mesh are outside.
+    `triangles` (t, 3) are its faces as indices of corners. `lost` [m] is how far points of the mesh are outside.
     """
 
     corners: Array
@@ -89,27 +89,27 @@ class Hull:
     lost: float
 
     def shape(self, label: str) -> Convex:
-        """The hull as a shape of Drake; a label has one line."""
+        """Return the hull as a Drake shape; line breaks in the label are removed."""
         return Convex(points=self.corners.T, label=" ".join(label.split()))
 
 
 def read_mesh(path: Path) -> Triangles:
-    """The mesh in an STL, DAE, OBJ, PLY or OFF file, in metres, in the file's own axes.
+    """Read the mesh in an STL, DAE, OBJ, PLY or OFF file, in metres and in the file's own axes.
 
-    The unit that a DAE states is used. Its `up_axis` is not: RViz, MoveIt, Gazebo and Pinocchio do not use it either,
-    and robots are made for them. Raises ModelError where the file has no triangle that can be read.
+    The unit of a DAE is used. Its `up_axis` is ignored, because RViz, MoveIt, Gazebo and Pinocchio also ignore it and
+    robots are designed for them. Raises ModelError if the file has no readable triangle.
     """
     return _read(path, *_state(path))
 
 
 def as_obj(mesh: Triangles) -> str:
-    """The mesh as the text of an OBJ file."""
+    """Return the mesh as the text of an OBJ file."""
     vertices = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in mesh.vertices.tolist())
     return vertices + "".join(f"f {a} {b} {c}\n" for a, b, c in (mesh.faces + 1).tolist())
 
 
 def _state(path: Path) -> tuple[int, int]:
-    """When the file was changed, and how large it is; ModelError where it is missing or too large."""
+    """Return the modification time and size of a file; raise ModelError if it is missing or too large."""
     try:
         state = path.stat()
     except OSError as error:
@@ -119,7 +119,7 @@ def _state(path: Path) -> tuple[int, int]:
     return state.st_mtime_ns, state.st_size
 
 
-@lru_cache(maxsize=4)  # the links of a robot often share a file; all of them would be much to keep
+@lru_cache(maxsize=4)  # the links of a robot often share a file; a larger cache would need much memory
 def _read(path: Path, _changed: int, _size: int) -> Triangles:
     import trimesh
 
@@ -130,7 +130,7 @@ def _read(path: Path, _changed: int, _size: int) -> Triangles:
         data, beside = BytesIO(path.read_bytes()), _Materials(path.parent)
         scene: Any = trimesh.load_scene(data, file_type=kind[1:], resolver=beside, process=False)
         nodes = [_mesh_of_node(scene, node, coloured=kind != ".stl") for node in scene.graph.nodes_geometry]
-    except Exception as error:  # a reader of strangers' files raises whatever it runs into
+    except Exception as error:  # a parser of untrusted files may raise any error
         message = str(error) or type(error).__name__
         raise ModelError(f"{path}: expected a mesh that can be read; trimesh says: {message}") from error
     parts = [mesh for mesh in nodes if mesh is not None and len(mesh.faces)]
@@ -149,7 +149,7 @@ def _read(path: Path, _changed: int, _size: int) -> Triangles:
 
 
 def _read_msh(path: Path) -> Triangles:
-    """MuJoCo's own format: the numbers of vertices, normals, texture coordinates and faces, then these as arrays."""
+    """Read MuJoCo's format: the counts of vertices, normals, texture coordinates and faces, then these arrays."""
     data = path.read_bytes()
     counts = np.frombuffer(data[:16], dtype="<i4").astype(int)
     if len(counts) < 4 or np.any(counts < 0) or counts[0] < 4 or counts[3] < 1:
@@ -166,7 +166,7 @@ def _read_msh(path: Path) -> Triangles:
 
 
 class _Materials:
-    """Gives trimesh the list of materials beside an OBJ file and nothing else: a stranger's file can name any file."""
+    """A file resolver for trimesh that opens only the material library of an OBJ: untrusted files can name any file."""
 
     def __init__(self, folder: Path):
         self._folder = folder
@@ -179,14 +179,14 @@ class _Materials:
 
 
 def _mesh_of_node(scene: Any, node: str, *, coloured: bool) -> Triangles | None:
-    """A mesh of a scene in the scene's frame, in metres; None for what is no mesh (lines, points)."""
+    """Return a mesh of a scene in the scene's frame, in metres, or None for lines and points."""
     X, name = scene.graph[node]
     mesh = scene.geometry[name]
     if getattr(mesh, "faces", None) is None:
         return None
     if not np.all(np.isfinite(mesh.vertices)):
         raise ValueError("a vertex is not finite")
-    unit = re.fullmatch(r"(\S+) \* meters", str(mesh.metadata.get("units")))  # of a DAE; "meters" where it is 1
+    unit = re.fullmatch(r"(\S+) \* meters", str(mesh.metadata.get("units")))  # in a DAE; "meters" if it is 1
     metre = float(unit[1]) if unit else 1.0
     vertices = metre * (np.asarray(mesh.vertices, dtype=float) @ X[:3, :3].T + X[:3, 3])
     faces = np.asarray(mesh.faces, dtype=np.int64)
@@ -194,7 +194,7 @@ def _mesh_of_node(scene: Any, node: str, *, coloured: bool) -> Triangles | None:
 
 
 def _colours(visual: Any, count: int) -> Array | None:
-    """(count, 3) the colour of each face, None where the file has none. What is translucent is drawn opaque."""
+    """Return the colour of each face (count, 3), or None if the file has none; translucent colours become opaque."""
     if visual.kind in ("vertex", "face"):
         return np.asarray(visual.face_colors, dtype=float)[:, :3] / 255
     if visual.kind == "texture":
@@ -203,7 +203,7 @@ def _colours(visual: Any, count: int) -> Array | None:
 
 
 def _few_colours(colours: Array) -> Array:
-    """The same colours where they are few; else the commonest, and the average of the others in place of these."""
+    """Return the same colours if they are few, or the most frequent ones and the average of the others."""
     distinct, which, counts = np.unique(colours, axis=0, return_inverse=True, return_counts=True)
     if len(distinct) <= MESHES.most_colours:
         return colours
@@ -213,17 +213,17 @@ def _few_colours(colours: Array) -> Array:
 
 
 def scaled(mesh: Triangles, scale: Sequence[float]) -> Triangles:
-    """The mesh with each axis multiplied by its factor of `scale` (3,)."""
-    faces = mesh.faces[:, ::-1] if np.prod(scale) < 0 else mesh.faces  # a mirror image is turned inside out
+    """Return the mesh with each axis multiplied by its factor of `scale` (3,)."""
+    faces = mesh.faces[:, ::-1] if np.prod(scale) < 0 else mesh.faces  # a reflection reverses the orientation
     return Triangles(mesh.vertices * np.asarray(scale, dtype=float), faces, mesh.colours)
 
 
 def with_fewer_faces(meshes: Sequence[Triangles], limit: int) -> tuple[Triangles, ...]:
-    """The meshes of a robot with `limit` faces together, or a little more where it has many small parts.
+    """Simplify the meshes of a robot to `limit` faces in total, or slightly more if it has many small parts.
 
-    Vertices in one cell of a grid become one (Lindstrom, "Out-of-core simplification of large polygonal models",
-    2000): the point closest to the planes of the faces that met there, so that edges stay sharp. The cell is the same
-    for the whole robot, but for parts that would lose their shape.
+    Vertices in one grid cell are merged (Lindstrom, "Out-of-core simplification of large polygonal models", 2000) into
+    the point closest to the planes of their faces, so that edges stay sharp. The cell size is the same for the whole
+    robot, except for parts that would lose their shape.
     """
     if sum(len(mesh.faces) for mesh in meshes) <= limit:
         return tuple(meshes)
@@ -233,13 +233,13 @@ def with_fewer_faces(meshes: Sequence[Triangles], limit: int) -> tuple[Triangles
         count = sum(len(faces) for _, faces, _ in clustered)
         if 0.8 * limit <= count <= limit:
             break
-        cell *= float(np.sqrt(max(count, 1) / (0.9 * limit)))  # faces go with 1 / cell^2
+        cell *= float(np.sqrt(max(count, 1) / (0.9 * limit)))  # the number of faces is proportional to 1 / cell^2
         clustered = [_clusters(mesh, cell) for mesh in meshes]
     return tuple(_clustered(mesh, *clusters) for mesh, clusters in zip(meshes, clustered, strict=True))
 
 
 def _areas(mesh: Triangles) -> tuple[Array, Array]:
-    """Unit normals (m, 3) and areas (m,) of the faces; a zero normal where a face has no area."""
+    """Return unit normals (m, 3) and areas (m,) of the faces; the normal of a face without area is zero."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
     twice = np.linalg.norm(normals, axis=1)
@@ -247,14 +247,14 @@ def _areas(mesh: Triangles) -> tuple[Array, Array]:
 
 
 def _joined(vertices: Array, faces: Integers, colours: Array | None) -> Triangles:
-    """The mesh with vertices as one that are closer than a millionth of its size, which files write once per face."""
+    """Merge vertices that are closer than a millionth of the mesh's size, as files often duplicate them per face."""
     size = float(np.max(np.ptp(vertices, axis=0)))
     _, first, which = _cells(vertices, size * MESHES.joined if size > 0 else 1.0)
     return Triangles(vertices[first], which[faces], colours)
 
 
 def _cells(vertices: Array, cell: float) -> tuple[int, Integers, Integers]:
-    """How many cells of a grid hold vertices, the first vertex in each, and the cell of each vertex."""
+    """Return the number of nonempty grid cells, the first vertex in each, and the cell of each vertex."""
     cells = np.floor((vertices - np.min(vertices, axis=0)) / cell + 0.5).astype(np.int64)
     shape = np.max(cells, axis=0) + 1
     key = (cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2]
@@ -263,7 +263,7 @@ def _cells(vertices: Array, cell: float) -> tuple[int, Integers, Integers]:
 
 
 def _clusters(mesh: Triangles, cell: float) -> tuple[Integers, Integers, float]:
-    """The cluster of each vertex, the faces that stay faces, and the cell that was used."""
+    """Return the cluster of each vertex, the faces that do not collapse, and the cell size."""
     diagonal = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
     cell = max(min(cell, diagonal / MESHES.small_part), diagonal * MESHES.joined)
     count, _, where = _cells(mesh.vertices, cell)
@@ -282,7 +282,7 @@ def _clustered(mesh: Triangles, where: Integers, remaining: Integers, cell: floa
 
 
 def _representatives(mesh: Triangles, where: Integers, cell: float) -> Array:
-    """(k, 3) for each cluster the point of least squared distance from its faces' planes, near its mean."""
+    """Return, for each cluster, the point (k, 3) near its mean with least squared distance to its faces' planes."""
     count = int(np.max(where)) + 1
     number = np.bincount(where, minlength=count)[:, None]
     means = np.stack([np.bincount(where, mesh.vertices[:, i], count) for i in range(3)], axis=1) / number
@@ -304,7 +304,7 @@ def _representatives(mesh: Triangles, where: Integers, cell: float) -> Array:
 
 
 def directions(count: int) -> Array:
-    """(count, 3) unit vectors evenly over the sphere, along a spiral of golden angles."""
+    """Return unit vectors (count, 3), evenly distributed on the sphere along a golden-angle spiral."""
     z = 1 - (2 * np.arange(count) + 1) / count
     turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
     ring = np.sqrt(1 - z * z)
@@ -312,14 +312,14 @@ def directions(count: int) -> Array:
 
 
 def hull_of_file(path: Path, scale: tuple[float, float, float]) -> Hull:
-    """The convex hull of a mesh file, each axis multiplied by its factor.
+    """Return the convex hull of a mesh file, with each axis multiplied by its factor.
 
-    Raises ModelError where it cannot be read or encloses no volume.
+    Raises ModelError if it is unreadable or encloses no volume.
     """
     return _hull_of_file(path, scale, *_state(path))
 
 
-@lru_cache(maxsize=256)  # a model is built again for every other time step
+@lru_cache(maxsize=256)  # a model is rebuilt for every other time step
 def _hull_of_file(path: Path, scale: tuple[float, float, float], changed: int, size: int) -> Hull:
     if path.suffix.lower() in READ_BY_TRIMESH:
         return hull_of(read_mesh(path).vertices * np.asarray(scale), path.name)
@@ -331,10 +331,10 @@ def _hull_of_file(path: Path, scale: tuple[float, float, float], changed: int, s
 
 
 def hull_of(points: Array, label: str) -> Hull:
-    """The convex hull of `points` (n, 3), of at most MOST_CORNERS corners.
+    """Return the convex hull of `points` (n, 3) with at most MOST_CORNERS corners.
 
-    Of more than 20,000 points only those are taken that are farthest out in MOST_CORNERS directions. Raises
-    ModelError where the points lie in one plane.
+    For more than 20,000 points, only the most distant points in MOST_CORNERS directions are used. Raises ModelError if
+    the points lie in one plane.
     """
     if len(points) > MESHES.most_points:
         size = float(np.max(np.ptp(points, axis=0)))
@@ -343,7 +343,7 @@ def hull_of(points: Array, label: str) -> Hull:
     hull = _qhull(points if len(points) <= MESHES.most_points else _farthest(points, MOST_CORNERS), label)
     if len(hull.corners) > MOST_CORNERS:
         hull = _qhull(_farthest(hull.corners, MOST_CORNERS), label)
-    lost = float(np.max(_distance(points, hull)))  # rounding, where all points were taken
+    lost = float(np.max(_distance(points, hull)))  # only rounding if all points were used
     return replace(hull, lost=lost if lost > MESHES.joined * float(np.max(np.ptp(hull.corners, axis=0))) else 0.0)
 
 
@@ -366,18 +366,18 @@ def _qhull(points: Array, label: str) -> Hull:
 
 
 def _distance(points: Array, hull: Hull) -> Array:
-    """(n,) how far each point is outside the plane that it is farthest out of, negative inside the hull."""
+    """Return the largest signed distance (n,) of each point from the face planes, which is negative inside the hull."""
     planes = np.column_stack([hull.normals, -hull.offsets]).T
     blocks = _split(points, 500)
     return np.concatenate([np.max(np.column_stack([p, np.ones(len(p))]) @ planes, axis=1) for p in blocks])
 
 
 def _split(points: Array, size: int) -> list[Array]:
-    return np.array_split(points, 1 + len(points) // size)  # a product of more points with many vectors is slow
+    return np.array_split(points, 1 + len(points) // size)  # products of larger blocks with many vectors are slow
 
 
 def _farthest(points: Array, count: int) -> Array:
-    """Those points that are farthest out along some of `count` directions."""
+    """Return the most distant points along `count` directions."""
     among, best = directions(count), points[:0]
     for block in _split(points, 2000):
         candidates = np.concatenate([best, block])
@@ -390,14 +390,14 @@ MOST_SPHERES = 8  # for one hull
 
 @dataclass(frozen=True)
 class SphereOptions:
-    """How a hull is filled with spheres."""
+    """Options for filling a hull with spheres."""
 
-    radii: tuple[float, ...] = (0.95, 0.5, 0.25)  # of the largest sphere that fits in
-    same: float = 0.5  # of their radius: spheres closer than that are as good as one
-    good_enough: float = 0.5  # of the largest radius: the largest spheres are taken that miss the hull by no more
-    close_enough: float = 0.2  # of that radius: how far a hull may stick out of its spheres, towards a flat ground
-    probes: int = 2000  # directions in which that is measured
-    surface_points: int = 600  # about so many points of the surface are looked at for how much is open
+    radii: tuple[float, ...] = (0.95, 0.5, 0.25)  # relative to the largest inscribed sphere
+    same: float = 0.5  # relative to their radius: closer spheres count as one
+    good_enough: float = 0.5  # relative to the largest radius: the gap at which the largest spheres are sufficient
+    close_enough: float = 0.2  # relative to the radius: the acceptable protrusion of a hull towards flat ground
+    probes: int = 2000  # number of directions for this measurement
+    surface_points: int = 600  # approximate number of surface points for measuring the uncovered surface
 
 
 SPHERES = SphereOptions()
@@ -405,11 +405,11 @@ SPHERES = SphereOptions()
 
 @dataclass(frozen=True, eq=False)
 class CoverSpheres:
-    """Spheres of one radius [m] about `centres` (k, 3) [m], all inside a hull.
+    """Spheres of one radius [m] around `centres` (k, 3) [m], all inside a hull.
 
-    `ground_gap` [m] is how far the hull reaches beyond the spheres at most, in any direction: a flat ground is met
-    so much later than by the hull. `open_gap` [m] is the largest distance of a point of the hull's surface from
-    the spheres' surface.
+    `ground_gap` [m] is the largest distance, over all directions, by which the hull protrudes beyond the spheres, and
+    thus by which flat ground touches the spheres later. `open_gap` [m] is the largest distance of a point on the hull's
+    surface from the spheres' surface.
     """
 
     centres: Array
@@ -419,8 +419,8 @@ class CoverSpheres:
 
 
 def fit_spheres(hull: Hull, label: str) -> CoverSpheres:
-    """At most MOST_SPHERES spheres for a hull, by the rule above; `label` names it in a ModelError."""
-    size = float(np.max(np.ptp(hull.corners, axis=0)))  # the solver's tolerances are meant for numbers near 1
+    """Fit at most MOST_SPHERES spheres to a hull by the rule above; `label` names the hull in a ModelError."""
+    size = float(np.max(np.ptp(hull.corners, axis=0)))  # the solver's tolerances require numbers near 1
     middle = np.mean(hull.corners, axis=0)
     corners = (hull.corners - middle) / size
     offsets = (hull.offsets - hull.normals @ middle) / size
@@ -436,7 +436,7 @@ def fit_spheres(hull: Hull, label: str) -> CoverSpheres:
 
 @dataclass(frozen=True, eq=False)
 class _Shape:
-    """A hull of size 1 about the origin, and points on its surface."""
+    """A hull of size 1 at the origin, and points on its surface."""
 
     corners: Array
     normals: Array
@@ -449,13 +449,13 @@ class _Shape:
         return np.asarray(np.mean(self.surface, axis=0))
 
     def largest_radius(self) -> float:
-        """That of the largest sphere that fits in (the Chebyshev ball), less what the solver may be off."""
+        """Return the radius of the largest inscribed sphere (the Chebyshev ball), minus the solver's tolerance."""
         planes = np.column_stack([self.normals, np.ones(len(self.normals))])
         solution = linprog([0, 0, 0, -1], planes, self.offsets, bounds=(None, None)).x
         return float(np.min(self.offsets - self.normals @ solution[:3])) * (1 - 1e-6)
 
     def closest_centre(self, point: Array, radius: float) -> Array:
-        """(3,) the centre closest to `point` of a sphere that fits in."""
+        """Return the centre (3,) closest to `point` of a sphere inside the hull."""
         program = MathematicalProgram()
         x = program.NewContinuousVariables(3)
         program.AddLinearConstraint(self.normals, np.full(len(self.normals), -np.inf), self.offsets - radius, x)
@@ -467,26 +467,26 @@ class _Shape:
         return np.asarray(result.GetSolution(x), dtype=float)
 
     def filled(self, radius: float) -> CoverSpheres:
-        """Spheres of `radius`, one after the other where they are missed most."""
+        """Add spheres of `radius` one at a time where the gap is largest."""
         farthest = self.corners[np.argmax(np.linalg.norm(self.corners - self.middle, axis=1))]
         centres = [self.closest_centre(farthest, radius)]
         while len(centres) < MOST_SPHERES:
             wanted = [self.closest_centre(point, radius) for point in self._missing(np.array(centres), radius)]
             new = [c for c in wanted if np.min(np.linalg.norm(centres - c, axis=1)) >= SPHERES.same * radius]
             if not new:
-                break  # the spheres will do, or none of this radius comes closer
+                break  # the spheres suffice, or no sphere of this radius comes closer
             centres.append(new[0])
         return self.measured(centres, radius)
 
     def measured(self, places: list[Array], radius: float) -> CoverSpheres:
-        """The spheres, as large as they fit in, with their gaps."""
+        """Return the spheres, with the largest radius that fits, and their gaps."""
         centres = np.array(places)
         inside = min(radius, float(np.min(self.offsets - centres @ self.normals.T)))
         ground, bare = self._gaps(centres, inside)
         return CoverSpheres(centres, inside, max(0.0, float(np.max(ground))), max(0.0, float(np.max(bare))))
 
     def _missing(self, centres: Array, radius: float) -> list[Array]:
-        """The points (3,) of the hull that need a sphere most, the worst first."""
+        """Return the points (3,) of the hull with the largest gaps, the largest first."""
         (ground, bare), missing = self._gaps(centres, radius), []
         if np.max(ground) > SPHERES.close_enough * radius:
             worst = directions(SPHERES.probes)[np.argmax(ground)]
@@ -496,7 +496,7 @@ class _Shape:
         return missing
 
     def _gaps(self, centres: Array, radius: float) -> tuple[Array, Array]:
-        """How much farther than the spheres the hull reaches by direction, and how far its surface is from them."""
+        """Return how far the hull protrudes beyond the spheres by direction, and its surface's distance from them."""
         probes = directions(SPHERES.probes).T
         ground = np.max(self.corners @ probes, axis=0) - np.max(centres @ probes, axis=0) - radius
         bare = np.min(np.linalg.norm(self.surface[:, None] - centres, axis=2), axis=1) - radius
@@ -504,7 +504,7 @@ class _Shape:
 
 
 def _surface_points(corners: Array, triangles: Integers) -> Array:
-    """Points on the hull's surface, about as many on each part as it is large, its corners among them."""
+    """Return points on the hull's surface, with density proportional to area, including its corners."""
     a, b, c = (corners[triangles[:, i]] for i in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     cuts = np.ceil(np.sqrt(SPHERES.surface_points * areas / np.sum(areas))).astype(int)

@@ -1,4 +1,4 @@
-"""One scalar type of a model: its diagram, plant, context and added forces; and what threads share of a model."""
+"""A model for one scalar type: diagram, plant, context and added forces; and the data that threads share."""
 
 import threading
 from collections.abc import Hashable, Iterator
@@ -22,18 +22,18 @@ from drake_diff.model.repairs import JointCoupling
 
 
 class AddedForce(Protocol):
-    """A force that acts over a step as if it were part of the model, explicit in the state before it."""
+    """A force that acts over a step as a part of the model, explicit in the state before the step."""
 
     def force(self, plant: Any, context: Any) -> Any:
-        """(nv,) the generalized force [N or N m] in the state of `context`."""
+        """Return the generalized force (nv,) [N or N m] in the state of `context`."""
 
     def potential(self, plant: Any, context: Any) -> float:
-        """[J] what the force adds to the potential energy."""
+        """Return the potential energy [J] of the force."""
 
 
 @dataclass
 class SpringChange:
-    """A prismatic spring with another stiffness k [N/m] and rest length l [m]: -k (q - l) + k0 (q - l0) is added."""
+    """A change of a prismatic spring to stiffness k [N/m] and rest length l [m], -k (q - l) + k0 (q - l0)."""
 
     position: int
     velocity: int
@@ -44,7 +44,7 @@ class SpringChange:
 
     @classmethod
     def none(cls, spring: Any) -> "SpringChange":
-        """The spring as it is."""
+        """Return the unchanged spring."""
         k, rest, joint = spring.stiffness(), spring.nominal_position(), spring.joint()
         k, rest = (float(getattr(number, "value", lambda n=number: n)()) for number in (k, rest))
         return cls(joint.position_start(), joint.velocity_start(), k, rest, k, rest)
@@ -62,7 +62,7 @@ class SpringChange:
 
 @dataclass
 class GravityChange:
-    """Gravity beyond that of the plant [m/s^2]: generalized gravity is linear in the vector g."""
+    """Additional gravity [m/s^2]; generalized gravity is linear in the vector g."""
 
     added: Any  # (3,)
 
@@ -77,25 +77,25 @@ class GravityChange:
         return total
 
     def potential(self, plant: Any, context: Any) -> float:
-        return 0.0  # the plant's own gravity carries the value; what is added has only a derivative
+        return 0.0  # the value is in the plant's own gravity; the added force has only a derivative
 
 
 @dataclass(frozen=True, eq=False)
 class Twin:
-    """One scalar type of the model: its diagram, its plant, and one context that is kept and reused."""
+    """The model for one scalar type: its diagram, its plant, and one context that is reused."""
 
     scalar: Any  # float or AutoDiffXd
     diagram: Any
     plant: Any
     scene_graph: Any
     root_context: Any
-    context: Any  # the plant's, inside root_context
-    defaults: Any  # a root context that nobody touches
+    context: Any  # the plant's context in root_context
+    defaults: Any  # a root context that is never changed
     inputs: Inputs
-    own: tuple[AddedForce, ...] = ()  # the model's own beside Drake's, which no parameter changes
-    coupling: JointCoupling | None = None  # where x has the independent coordinates of the plant alone
+    own: tuple[AddedForce, ...] = ()  # the model's added forces, which no parameter changes
+    coupling: JointCoupling | None = None  # set if x has only the independent coordinates of the plant
     added: dict[str, AddedForce] = field(default_factory=dict)  # for parameters that Drake does not have
-    thread: int = field(default_factory=get_ident)  # whose context it is
+    thread: int = field(default_factory=get_ident)  # the owner of the context
 
     def body(self, label: str) -> Any:
         return self._labelled[0][label]
@@ -112,14 +112,14 @@ class Twin:
 
     @cached_property
     def _actuation(self) -> Any:
-        """The plant's own input port where u is its actuation and nothing else, or None."""
+        """The plant's actuation input port if u is exactly its actuation, or else None."""
         plain = self.inputs.plain and not self.inputs.commanded.any()
         plain = plain and self.plant.num_actuators() == len(self.inputs.names)
         return self.plant.get_actuation_input_port() if plain else None
 
     @cached_property
     def _servos(self) -> list[tuple[Any, int, NDArray[np.intp], NDArray[np.intp]]]:
-        """The ports of desired states, their sizes, and which of their entries are which of u."""
+        """The ports of desired states, their sizes, and the indices of their entries in the port and in u."""
         every, ports = actuators(self.plant), []
         for instance in instances(self.plant):
             driven = [i for i, a in enumerate(every) if a.model_instance() == instance]
@@ -140,7 +140,7 @@ class Twin:
         return [(slice(j.velocity_start(), j.velocity_start() + j.num_velocities()), j) for j in moving]
 
     def damping(self) -> Any:
-        """(nv,) the joint damping coefficients in the context [N s/m or N m s/rad]."""
+        """Return the joint damping coefficients (nv,) in the context [N s/m or N m s/rad]."""
         coefficients = self._joint_damping()
         if self.coupling is not None:
             coefficients = self.coupling.forces(self.coupling.ratio_v * coefficients)
@@ -153,7 +153,7 @@ class Twin:
         return coefficients
 
     def _implicit_damping(self) -> Any:
-        """(nv,) of the plant: that of joints, and of PD control, h kp + kd, where it is not at its limit."""
+        """Return the plant's damping (nv,): that of joints, and h kp + kd of PD control that is not saturated."""
         coefficients, h = self._joint_damping(), self.plant.time_step()
         efforts = self.plant.get_net_actuation_output_port().Eval(self.context) if self._controlled else ()
         for i, actuator, velocity in self._controlled:
@@ -164,26 +164,26 @@ class Twin:
 
     @cached_property
     def _controlled(self) -> list[tuple[int, Any, int]]:
-        """The actuators with PD gains: their numbers, and where the velocities of their joints are."""
+        """The actuators with PD gains: their indices, and the velocity indices of their joints."""
         every = enumerate(actuators(self.plant))
         return [(i, a, int(a.joint().velocity_start())) for i, a in every if a.has_controller()]
 
     @property
     def position_limits(self) -> tuple[Array, Array]:
-        """Lower and upper (nq,) each; of independent coordinates those that all joints' limits allow."""
+        """Lower and upper limits (nq,) each; for independent coordinates, the limits of all their joints."""
         limits = np.array(self.plant.GetPositionLowerLimits()), np.array(self.plant.GetPositionUpperLimits())
         return limits if self.coupling is None else self.coupling.limits(*limits)
 
     @property
     def velocity_limits(self) -> tuple[Array, Array]:
-        """Lower and upper (nv,) each."""
+        """Lower and upper limits (nv,) each."""
         limits = np.array(self.plant.GetVelocityLowerLimits()), np.array(self.plant.GetVelocityUpperLimits())
         return limits if self.coupling is None else self.coupling.limits(*limits, of_velocities=True)
 
     def set_state(self, x: Any) -> None:
-        """Put the state x (nx,) into the context. ModelError in another thread than that which it was made in.
+        """Set the state x (nx,) in the context; raise ModelError in a thread other than the context's owner.
 
-        Raises TimeIsUpError where a time that was set is over: nearly all that takes time begins here.
+        Raises TimeIsUpError after a time limit; nearly all expensive computations begin with this method.
         """
         check_time()
         if self.thread != get_ident():
@@ -194,12 +194,12 @@ class Twin:
         self.plant.SetPositionsAndVelocities(self.context, x if self.coupling is None else self.coupling.state(x))
 
     def state(self) -> Any:
-        """(nx,) of the context."""
+        """Return the state (nx,) in the context."""
         state = self.plant.GetPositionsAndVelocities(self.context)
         return state if self.coupling is None else self.coupling.own_state(state)
 
     def next_state(self, end: Any) -> Any:
-        """(nx,) of the plant's state after the step from the context's state, of which Drake made `end`."""
+        """Return the own state (nx,) after a step from the context's state, where `end` is Drake's next state."""
         if self.coupling is None:
             return end
         plant, nq = self.plant, self.plant.num_positions()
@@ -209,7 +209,7 @@ class Twin:
         return np.concatenate([q[self.coupling.own_q], v])
 
     def rates(self, v: Any) -> Any:
-        """(nq,) dq/dt at the context's positions and the velocities v (nv,)."""
+        """Return dq/dt (nq,) for the context's positions and the velocities v (nv,)."""
         if self.coupling is None:
             return self._rates(v)
         return self._rates(self.coupling.velocities(v))[self.coupling.own_q]
@@ -218,31 +218,31 @@ class Twin:
         return np.asarray(self.plant.MapVelocityToQDot(self.context, v)).ravel()
 
     def mass_matrix(self) -> Any:
-        """(nv, nv) in the context's state."""
+        """Return the mass matrix (nv, nv) in the context's state."""
         mass = self.plant.CalcMassMatrix(self.context)
         return mass if self.coupling is None else self.coupling.spread.T @ mass @ self.coupling.spread
 
     def own_force(self, force: Any) -> Any:
-        """(nv,) of a generalized force on the plant's own velocities."""
+        """Convert a generalized force on the plant's own velocities to the model's velocities (nv,)."""
         return force if self.coupling is None else self.coupling.forces(force)
 
     @property
     def inspector(self) -> Any:
-        """The scene graph's inspector, with the context's own properties; None where there is no scene graph."""
+        """The scene graph's inspector with the context's properties, or None without a scene graph."""
         port = self.plant.get_geometry_query_input_port()
         return port.Eval(self.context).inspector() if port.HasValue(self.context) else None
 
     def touches(self) -> bool:
-        """Whether the step from the context's state has any contact."""
+        """Return whether the step from the context's state has any contact."""
         contacts = self.plant.get_contact_results_output_port().Eval(self.context)
         return bool(contacts.num_point_pair_contacts() or contacts.num_hydroelastic_contacts())
 
     def overlaps(self) -> bool:
-        """Whether any two geometries that may collide do, in the context's state; no step is taken."""
+        """Return whether any two geometries that may collide overlap in the context's state, without a step."""
         return bool(self.plant.get_geometry_query_input_port().Eval(self.context).HasCollisions())
 
     def set_input(self, u: Any) -> None:
-        """Put the input `u` (nu,), floats or AutoDiffXd, into the context."""
+        """Set the input `u` (nu,), floats or AutoDiffXd, in the context."""
         if self._actuation is not None:
             self._actuation.FixValue(self.context, u)
             return
@@ -259,9 +259,9 @@ class Twin:
             self.plant.get_actuation_input_port().FixValue(self.context, effort)
 
     def applied_force(self) -> Any:
-        """(nv,) the generalized force that the diagram's systems apply beside the actuators.
+        """Return the generalized force (nv,) of the diagram's systems, without actuators.
 
-        It is that at the context's state and input, which holds over a step.
+        It is evaluated at the context's state and input, and is constant over a step.
         """
         plant, context, fed = self.plant, self.context, self.inputs.fed
         total = np.zeros(plant.num_velocities()).astype(self.scalar)
@@ -279,9 +279,9 @@ class Twin:
         return self.own_force(total)
 
     def systems_force(self) -> Any:
-        """(nv,) `applied_force`, and that of the actuators which the diagram's systems drive, within their limits.
+        """Return `applied_force` plus the force (nv,) of actuators that the diagram's systems drive, within limits.
 
-        Raises SimulationError where a system cannot be evaluated.
+        Raises SimulationError if a system cannot be evaluated.
         """
         try:
             return self.applied_force() + self._driven_force()
@@ -289,7 +289,7 @@ class Twin:
             raise SimulationError(f"the forces of the diagram's systems cannot be evaluated: {error}") from error
 
     def _driven_force(self) -> Any:
-        """(nv,) of the actuators that the diagram's systems drive."""
+        """Return the force (nv,) of the actuators that the diagram's systems drive."""
         total, plant, fed = np.zeros(self.plant.num_velocities()).astype(self.scalar), self.plant, self.inputs.fed
         whole = plant.get_actuation_input_port()
         parts = {i: plant.get_actuation_input_port(i) for i in instances(plant)}
@@ -308,30 +308,30 @@ class Twin:
         return self.own_force(total)
 
     def inverse_dynamics(self, acceleration: Any) -> Any:
-        """(nv,) M a + bias less gravity, springs, damping, added forces and what the diagram's systems exert.
+        """Return M a + bias minus gravity, springs, damping, added forces and the systems' forces (nv,).
 
-        It is that at the context's state, and input where systems depend on it.
+        It is evaluated at the context's state, and at its input if systems depend on it.
         """
         if self.coupling is not None:
             acceleration = self.coupling.velocities(acceleration)
-        self.plant.CalcForceElementsContribution(self.context, self._workspace)  # which overwrites it
+        self.plant.CalcForceElementsContribution(self.context, self._workspace)  # overwrites the workspace
         needed = self.plant.CalcInverseDynamics(self.context, acceleration, self._workspace)
-        if self.forces:  # AutoDiffXd's are a copy: not writable
+        if self.forces:  # AutoDiffXd's result is a copy and not writable
             needed = needed - self.added_force()
         needed = self.own_force(needed)
         return needed - self.systems_force() if self.inputs.fed else needed
 
     @property
     def forces(self) -> tuple[AddedForce, ...]:
-        """All forces that act beside Drake's own."""
+        """All forces that are added to Drake's own forces."""
         return (*self.own, *self.added.values())
 
     def added_force(self) -> Any:
-        """The generalized force of `forces` in the state of the context, on the plant's own velocities."""
+        """Return the generalized force of `forces` in the context's state, on the plant's own velocities."""
         return sum(force.force(self.plant, self.context) for force in self.forces)
 
     def reset(self) -> None:
-        """Put every parameter of the context back to the model's own."""
+        """Reset every parameter in the context to the model's own value."""
         self.root_context.SetTimeStateAndParametersFrom(self.defaults)
         if self.added:
             self.added.clear()
@@ -343,30 +343,30 @@ REMEDY = "which Drake keeps in the plant, not in a context: load a model of its 
 
 
 class OfThread(threading.local):
-    """What a model keeps for one thread: a context holds one state, and so does much that is made of it.
+    """The data of a model for one thread, because a context, and much of the derived data, has only one state.
 
-    Nobody else sees it, so that threads which share a model cannot read each other's states. It ends with its thread.
+    Threads that share a model cannot read each other's states. The data is deleted when its thread ends.
     """
 
     def __init__(self) -> None:
         self.double: Twin | None = None
         self.autodiff: Twin | None = None
         self.cache: dict[Hashable, Any] = {}
-        # What parameters in the contexts are, for the time being, not the model's own: see `parameters.applied`.
+        # Quantities of parameters that are temporarily not the model's own; see `parameters.applied`.
         self.other_quantities: frozenset[str] = frozenset()
-        self.applied: Any = None  # the ParameterVector that is applied, if one is
+        self.applied: Any = None  # the ParameterVector that is applied, or None
 
 
 class SharedPlant:
-    """Which threads have contexts of one plant, and whether one of them has changed the plant itself."""
+    """The threads with contexts of one plant, and the thread, if any, that changed the plant itself."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
         self._users: WeakSet[threading.Thread] = WeakSet()
-        self._changed: tuple[threading.Thread, str] | None = None  # by whom, and what
+        self._changed: tuple[threading.Thread, str] | None = None  # the thread, and the names of the changed parameters
 
     def enter(self) -> None:
-        """Before a thread makes a context. ModelError where another one has changed the plant."""
+        """Register a thread before it creates a context; raise ModelError if another thread has changed the plant."""
         me = threading.current_thread()
         with self.lock:
             if self._changed is not None and self._changed[0] is not me:
@@ -376,9 +376,9 @@ class SharedPlant:
 
     @contextmanager
     def changed(self, names: str) -> Iterator[None]:
-        """For as long as the parameters `names` are written into the plant itself.
+        """Mark the plant as changed while the parameters `names` are set in the plant itself.
 
-        Raises ModelError where another thread uses the plant; until the end no other one may begin to.
+        Raises ModelError if another thread uses the plant. Other threads cannot start to use it until the block ends.
         """
         me = threading.current_thread()
         with self.lock:

@@ -1,7 +1,7 @@
-"""The text of an XML file with the places of its elements, so that it can be changed and every line keeps its number.
+"""The text of an XML file with the positions of its elements, so that edits preserve the line numbers.
 
-Python's ElementTree forgets comments, prefixes and lines, and refuses prefixes that nobody declared. Drake forgives
-those, and its messages name lines.
+Python's ElementTree discards comments, prefixes and lines, and refuses undeclared prefixes. Drake accepts undeclared
+prefixes, and its messages refer to lines.
 """
 
 import re
@@ -13,14 +13,14 @@ from xml.sax.saxutils import quoteattr
 
 from drake_diff.exceptions import ModelError
 
-DEEPEST = 300  # elements in one another: Python and Drake's parser end at some depth
+DEEPEST = 300  # maximum nesting depth: recursion in Python and in Drake's parser is limited
 
 
 @dataclass(eq=False)
 class Element:
-    """An element: its tag with the prefix that the file gives it, attributes, children, and where its text stands.
+    """An element: its tag with the prefix in the file, attributes, children, and the position of its text.
 
-    `start`, `inside` and `end` are positions in bytes: of its "<", behind its start tag, and behind its end tag.
+    `start`, `inside` and `end` are byte positions: of its "<", after its start tag, and after its end tag.
     """
 
     tag: str
@@ -37,7 +37,7 @@ class Element:
         return self.attributes.get(name, default)
 
     def find(self, *path: str) -> "Element | None":
-        """The first child of that tag, its first child of the next tag, and so on."""
+        """Return the first child with the first tag, then its first child with the next tag, and so on."""
         element: Element | None = self
         for tag in path:
             element = None if element is None else next((c for c in element.children if c.tag == tag), None)
@@ -47,7 +47,7 @@ class Element:
         return [child for child in self.children if child.tag == tag]
 
     def iter(self, *tags: str) -> "Iterator[Element]":
-        """This element and all below it, in the order of the file; of those tags where some are given."""
+        """Yield this element and its descendants in the order of the file, or only those with the given tags."""
         if not tags or self.tag in tags:
             yield self
         for child in self.children:
@@ -57,13 +57,13 @@ class Element:
 class XmlText:
     """An XML file's text that can be changed in place.
 
-    Raises ModelError, with the line, where the text is no XML; it has no cause where the text is XML that is not read:
-    too deep, or with entities. `changed` says that the text is not the file's.
+    Raises ModelError with the line if the text is not valid XML. The error has no cause if the text is valid but not
+    supported: too deep, or with entities. `changed` means that the text differs from the file.
     """
 
     def __init__(self, data: bytes, *, changed: bool = False):
         self.data, self._was_changed = data, changed
-        # Drake takes a comment with -- in it, which no XML may have; lines and positions stay.
+        # Drake accepts comments that contain --, which XML forbids. Blanks preserve lines and positions.
         self._tags = re.sub(rb"<!--.*?-->", lambda match: re.sub(rb"[^\n]", b" ", match[0]), data, flags=re.DOTALL)
         self._changes: list[tuple[int, int, bytes]] = []
         self._open: list[Element] = []
@@ -104,41 +104,41 @@ class XmlText:
             self._open[-1].text += text
 
     def _behind_tag(self, start: int) -> int:
-        """The position behind the tag that begins at `start`: its ">" outside of quotes."""
+        """Return the position after the tag that begins at `start`, that is, after its ">" outside of quotes."""
         match = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>").match(self._tags, start)
         return match.end() if match else len(self._tags)
 
     def content(self, element: Element) -> str:
-        """The XML text inside an element."""
+        """Return the XML text inside an element."""
         close = self._end_tag(element)
         return "" if close is None else self.data[element.inside : close].decode()
 
     def _end_tag(self, element: Element) -> int | None:
-        """Where the end tag of an element begins; None where it has none."""
+        """Return the position of an element's end tag, or None if it has no end tag."""
         if self.data[element.inside - 2 : element.inside] == b"/>":
             return None
         return self._tags.rindex(b"</", element.inside, element.end)
 
     def remove(self, element: Element) -> None:
-        """Take an element out; its lines stay, empty."""
+        """Remove an element; its lines stay in the text as empty lines."""
         if element.parent is not None:
             element.parent.children.remove(element)
         self._replace(element.start, element.end, b"")
 
     def replace(self, element: Element, text: str) -> None:
-        """Put XML text in the place of an element."""
+        """Replace an element by XML text."""
         self._replace(element.start, element.end, text.encode())
 
     def before(self, element: Element, text: str) -> None:
-        """Put XML text in front of an element."""
+        """Insert XML text before an element."""
         self._replace(element.start, element.start, text.encode())
 
     def after(self, element: Element, text: str) -> None:
-        """Put XML text behind an element."""
+        """Insert XML text after an element."""
         self._replace(element.end, element.end, text.encode())
 
     def append(self, element: Element, text: str) -> None:
-        """Put XML text behind all that is inside an element."""
+        """Insert XML text at the end of an element's content."""
         close = self._end_tag(element)
         if close is None:
             self.fill(element, text)
@@ -146,14 +146,14 @@ class XmlText:
             self._replace(close, close, text.encode())
 
     def rename(self, element: Element, tag: str) -> None:
-        """Give an element another tag."""
+        """Change the tag of an element."""
         close, length = self._end_tag(element), len(element.tag.encode())
         for start in (element.start + 1, *([] if close is None else [close + 2])):
             self._replace(start, start + length, tag.encode())
         element.tag = tag
 
     def set(self, element: Element, name: str, value: str) -> None:
-        """Give an attribute another value, or add it."""
+        """Set the value of an attribute, or add the attribute."""
         element.attributes[name] = value
         match, new = self._attribute(element, name), quoteattr(value).encode()
         if match:
@@ -163,7 +163,7 @@ class XmlText:
             self._replace(offset, offset, b" " + name.encode() + b"=" + new)
 
     def drop(self, element: Element, name: str) -> None:
-        """Take an attribute out, if it is there."""
+        """Remove an attribute if it exists."""
         if match := self._attribute(element, name):
             self._replace(element.start + match.start(), element.start + match.end(), b"")
 
@@ -172,7 +172,7 @@ class XmlText:
         return re.search(rb"\s" + re.escape(name.encode()) + rb"\s*=\s*(\"[^\"]*\"|'[^']*')", tag)
 
     def fill(self, element: Element, content: str) -> None:
-        """Put XML text in the place of all that is inside an element."""
+        """Replace the content of an element by XML text."""
         close = self._end_tag(element)
         if close is None:
             self._replace(element.inside - 2, element.inside, f">{content}</{element.tag}>".encode())
@@ -185,15 +185,15 @@ class XmlText:
 
     @property
     def changed(self) -> bool:
-        """Whether anything was changed."""
+        """Whether the text was changed."""
         return self._was_changed or bool(self._changes)
 
     def read_again(self) -> "XmlText":
-        """The text as it is now, with the places and attributes that its elements have in it."""
+        """Parse the changed text again, with its new positions and attributes."""
         return XmlText(str(self).encode(), changed=self.changed)
 
     def __str__(self) -> str:
-        """The text with all changes; of two in one place the outer one counts."""
+        """Return the text with all changes; an outer change overrides the changes inside it."""
         parts, end_of_last = [], 0
         for start, end, new in sorted(self._changes, key=lambda change: (change[0], -change[1])):
             if start >= end_of_last:

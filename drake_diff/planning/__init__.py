@@ -1,4 +1,4 @@
-"""From a robot file to a verified plan: load, mend, choose where to go, guess, solve, save, verify."""
+"""Planning from a robot file to a verified plan: load, repair, choose a goal, guess, solve, save, verify."""
 
 from drake_diff._base import attach_stub as _attach_stub
 

@@ -1,7 +1,7 @@
-"""First guesses of a plan: from goals to postures that keep them, lines that touch nothing, and motions along these.
+"""Initial guesses of a plan: postures that reach the goals, collision-free paths, and motions along the paths.
 
-What is in the way is gone around by OMPL's RRT-Connect, since Drake has no planner that samples postures. These are
-guesses alone: what they lead to is checked as any other plan.
+OMPL's RRT-Connect finds paths around obstacles, since Drake has no sampling-based planner. These are only initial
+guesses; the resulting plans are verified like any other plan.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -26,37 +26,37 @@ from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, Obstacle, clearances
 from drake_diff.planning.robot import HOLD_SHARE, TOUCHING, Robot, drive, floating, share_to_hold, shares
 
-# Postures that keep goals.
+# Postures that reach goals.
 REACHED = 1e-6  # [m]
-LIMIT_MARGIN = 0.01  # of a joint's range: how far from its limits they are
-SEEDS, MORE_SEEDS = 12, 40  # first postures of inverse kinematics; where obstacles are in the way
-CANDIDATES = 3  # postures that are tried
-MOVE = 0.25  # part of a joint's range that a random goal is away, at most
-RANDOM, DRAWS, NEARER = 2, 50, 0.5  # random goals, postures that are drawn for one, and how they come nearer
-SOON = 2.0  # [s] a random goal is no further than what its joints do in that time
-# Lines of postures.
-BENDS, WIDTH = 100, 0.4  # lines bent at random that are looked at, and of a joint's range how far they are pulled
+LIMIT_MARGIN = 0.01  # of a joint's range: the distance from its limits
+SEEDS, MORE_SEEDS = 12, 40  # initial guesses of inverse kinematics, without and with obstacles
+CANDIDATES = 3  # maximum number of postures
+MOVE = 0.25  # of a joint's range: the maximum distance of a random goal
+RANDOM, DRAWS, NEARER = 2, 50, 0.5  # random goals, samples per goal, and reduction of the samples' distance
+SOON = 2.0  # [s] time in which the joints can reach a random goal
+# Paths of postures.
+BENDS, WIDTH = 100, 0.4  # number of random bent paths, and their maximum deflection relative to a joint's range
 MOST_LINES = 2
-NEAR = 0.04  # [rad or m] between the postures of a line that are looked at
-SEARCHES, MOST_LOOKS, LONGEST_LEG = 3, 20_000, 0.6  # searches, postures of one, [rad or m] that it adds at once
-CONTROLS, CUBIC = (8, 12, 20, 40), 4  # of a curve along what a search found: the fewest that keep it clear; its order
+NEAR = 0.04  # [rad or m] distance between the checked postures of a path
+SEARCHES, MOST_LOOKS, LONGEST_LEG = 3, 20_000, 0.6  # searches, checks per search, [rad or m] step length of a search
+CONTROLS, CUBIC = (8, 12, 20, 40), 4  # control points of a spline along a path (the fewest without collision); order
 # Motions.
-FASTEST = 1.0  # [rad/s or m/s] the peak of a joint without a velocity limit
-OF_SPEED, OF_EFFORT, OF_PULL = 0.6, 0.9, 0.8  # of a velocity limit, of an effort limit: what a guess, a controller uses
-SHORTEST, LONGEST = 0.6, 6.0  # [s] a motion
-STEPS = (30, 100)  # fewest and most of a plan
-PEAK = 1.875  # the greatest slope of the smooth way from 0 to 1
-CORRECTIONS, EXACT = 3, 1e-11  # [rad/s or m/s]
-PULL, DAMP = 30.0, 9.0  # [1/s^2], [1/s] of a controller
-# Flights: [m/s], [rad/s] at most; [m], [rad] to each side and [m] the height of a random goal; goals that are drawn.
+FASTEST = 1.0  # [rad/s or m/s] peak speed of a joint without a velocity limit
+OF_SPEED, OF_EFFORT, OF_PULL = 0.6, 0.9, 0.8  # share of speed limits, of effort limits, and of a controller's effort
+SHORTEST, LONGEST = 0.6, 6.0  # [s] limits of a motion's duration
+STEPS = (30, 100)  # minimum and maximum number of steps of a plan
+PEAK = 1.875  # the maximum slope of the smooth profile from 0 to 1
+CORRECTIONS, EXACT = 3, 1e-11  # corrections of an input; tolerance [rad/s or m/s]
+PULL, DAMP = 30.0, 9.0  # [1/s^2] and [1/s] gains of a controller
+# Flights: maximum [m/s], [rad/s]; ranges [m], [rad] and height [m] of a random goal; number of random goals.
 FLY_SPEED, FLY_TURN, FLY_FAR, FLY_TURNED, FLY_UP, FLIGHTS = 1.0, 1.0, (1.0, 1.0, 0.5), 1.0, 0.75, 20
 
 
 @dataclass(frozen=True, eq=False)
 class Goals:
-    """Goals of one robot: positions (3,) of frames, positions of joints by their place in q; none is a random goal.
+    """Goals of one robot: positions (3,) of frames, and joint positions by index in q; a random goal if both are empty.
 
-    `avoid` is what it keeps clear of on its way.
+    `avoid` are the obstacles.
     """
 
     frames: Mapping[str, Array]
@@ -65,14 +65,14 @@ class Goals:
 
     @property
     def is_free(self) -> bool:
-        """Whether nothing is asked for."""
+        """Whether no goal is given."""
         return not self.frames and not self.joints
 
 
 def read_goals(model: Model, goals: Mapping[str, Any], avoid: Sequence[Obstacle] = ()) -> Goals:
-    """The task that `goals` are for `model`: a name with three numbers is a frame's, with one a joint's.
+    """Read the `goals` for `model`: a name with three numbers is a frame, and a name with one number is a joint.
 
-    Raises UnknownNameError where there is no such frame or joint, InputError where the numbers do not fit.
+    Raises UnknownNameError if there is no such frame or joint, and InputError for invalid numbers.
     """
     places: dict[str, Array] = {}
     angles: dict[int, float] = {}
@@ -80,7 +80,7 @@ def read_goals(model: Model, goals: Mapping[str, Any], avoid: Sequence[Obstacle]
     for name, value in goals.items():
         numbers = np.atleast_1d(np.asarray(value, dtype=float))
         if len(numbers) == 3:
-            frame_position(model, name)  # which names the frames where this is none
+            frame_position(model, name)  # raises UnknownNameError with the existing frames
             places[name] = finite_array(f"goal {name} [m]", numbers, (3,))
         elif len(numbers) == 1:
             if name not in of_joints or (model.nq != model.nv and of_joints[name] < model.nq - model.nv + 6):
@@ -102,32 +102,32 @@ def read_goals(model: Model, goals: Mapping[str, Any], avoid: Sequence[Obstacle]
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """Where a robot may be: where its shapes do not overlap, and where it keeps clear of obstacles."""
+    """The free space of a robot: postures without self-collision, at a distance from obstacles."""
 
     robot: Robot
     clear: tuple[ClearanceConstraint, ...]
 
     @classmethod
     def around(cls, robot: Robot, avoid: Sequence[Obstacle]) -> "Space":
-        """That of a robot and what it avoids."""
+        """Make the free space of a robot with obstacles to avoid."""
         return cls(robot, tuple(clearances([c for obstacle in avoid for c in obstacle.bind(robot.model)])))
 
     def lacking(self, qs: Array) -> Array:
-        """(K,) [m] what is used of an obstacle's margin at postures qs (K, nq), at most; below 0 where none is."""
+        """Return the largest violation (K,) [m] of an obstacle's margin at postures qs (K, nq), negative if none."""
         xs = np.hstack([qs, np.zeros((len(qs), self.robot.model.nv))])
         return np.asarray(np.max([np.full(len(qs), -np.inf), *(c.lacking(xs) for c in self.clear)], axis=0))
 
     def is_free(self, qs: Array) -> bool:
-        """Whether the robot may be in all of the postures qs (K, nq)."""
+        """Return whether all postures qs (K, nq) are in the free space."""
         return bool(np.max(self.lacking(qs)) <= 0) and all(self.robot.overlap(q) <= TOUCHING for q in qs)
 
     def check(self, subject: str, q: Array) -> None:
-        """InputError where posture q (nq,) is too near to an obstacle."""
+        """Raise InputError if posture q (nq,) is too close to an obstacle."""
         for c in self.clear:
             c.check(subject, np.concatenate([q, np.zeros(self.robot.model.nv)]))
 
     def obstruction(self, q: Array) -> str:
-        """What is too near to an obstacle at posture q (nq,); "" where nothing is."""
+        """Describe the obstacle that is too close in posture q (nq,), or return ""."""
         x = np.concatenate([q, np.zeros(self.robot.model.nv)])
         worst = max(self.clear, key=lambda c: float(c.lacking(x[None])[0]), default=None)
         is_near = worst is not None and worst.lacking(x[None])[0] > 0
@@ -135,9 +135,9 @@ class Space:
 
 
 def postures(robot: Robot, task: Goals, seed: int) -> list[Array]:
-    """Postures (nq,) that keep the task, the nearest to the start first; ModelError where none is found.
+    """Return postures (nq,) that reach the goals, sorted by distance from the start; raise ModelError if none exist.
 
-    Where nothing is asked for it is a random one: inside the limits, without overlap, and held by its motors.
+    Without goals, the postures are random: within the limits, without overlap, and such that the motors can hold them.
     """
     random, space = np.random.default_rng([seed, 1]), Space.around(robot, task.avoid)
     if task.is_free:
@@ -170,8 +170,8 @@ def postures(robot: Robot, task: Goals, seed: int) -> list[Array]:
 
 
 def _reach(robot: Robot, task: Goals, first: Array, fixed: Array) -> tuple[Array, float]:
-    """The posture nearest to `first` (nq,) inside the limits that has the frames at their goals, and how far [m] it
-    is off; what is `fixed` (nq,) stays."""
+    """Return the posture closest to `first` (nq,) within the limits with the frames at their goals, and the error [m].
+    Entries that are `fixed` (nq,) do not change."""
     model, plant = robot.model, robot.model.double.plant
     margin, tolerance = LIMIT_MARGIN * (robot.upper - robot.lower), REACHED / 10
     low, high = np.where(fixed, first, robot.lower + margin), np.where(fixed, first, robot.upper - margin)
@@ -192,15 +192,15 @@ def _random_goals(space: Space, random: np.random.Generator) -> list[Array]:
 
 
 def _random_posture(space: Space, random: np.random.Generator) -> Array | None:
-    """Some way off the start, inside the limits, where nothing is touched and the motors hold the weight, best within
-    HOLD_SHARE; None where none of those drawn is."""
+    """Sample a posture near the start, within the limits, without overlap, that the motors can hold, preferably within
+    HOLD_SHARE; return None if there is none."""
     robot = space.robot
     far = speed_limits(robot.model) * SOON / PEAK
     reach = np.minimum(MOVE * (robot.upper - robot.lower), far)
     margin = 0.2 * MOVE * (robot.upper - robot.lower)
     best, least = None, 1.0
     for i in range(DRAWS):
-        fraction = NEARER ** (i // (DRAWS // 5))  # some robots can only hold what is near
+        fraction = NEARER ** (i // (DRAWS // 5))  # some robots can only hold nearby postures
         q = robot.q + fraction * random.uniform(-1, 1, len(reach)) * reach
         q = np.clip(q, robot.lower + margin, robot.upper - margin)
         if any(robot.overlap(robot.q + s * (q - robot.q)) > TOUCHING for s in (0.25, 0.5, 0.75, 1.0)):
@@ -217,17 +217,17 @@ def _random_posture(space: Space, random: np.random.Generator) -> Array | None:
 
 @dataclass(frozen=True, eq=False)
 class PostureLine:
-    """A curve of postures: a clamped B-spline by its control points (K, nq), the first and last of which it meets."""
+    """A path of postures: a clamped B-spline with control points (K, nq), from the first to the last control point."""
 
     name: str
     controls: Array
 
     def at(self, s: Array) -> Array:
-        """(M, nq) at s (M,), from 0 at the start to 1 at the end."""
+        """Return the postures (M, nq) at s (M,), from 0 at the start to 1 at the end."""
         return np.asarray(self._curve().vector_values(s)).T
 
     def slopes(self, s: Array) -> Array:
-        """(M, nq) its derivatives by s."""
+        """Return the derivatives (M, nq) with respect to s."""
         return np.asarray(self._curve().MakeDerivative().vector_values(s)).T
 
     def _curve(self) -> BsplineTrajectory:
@@ -236,21 +236,21 @@ class PostureLine:
 
     @property
     def length(self) -> float:
-        """[rad or m] that of its control points' chain, the largest coordinate of each piece."""
+        """The length [rad or m] of the control polygon, using the largest coordinate of each segment."""
         return float(np.sum(np.max(np.abs(np.diff(self.controls, axis=0)), axis=1)))
 
     @property
     def postures(self) -> Array:
-        """(M, nq) near each other, from the first to the last."""
+        """Closely spaced postures (M, nq) from the first to the last."""
         return self.at(np.linspace(0, 1, 2 + int(np.ceil(self.length / NEAR))))
 
 
 def lines(space: Space, target: Array, seed: int) -> list[PostureLine]:
-    """Lines from where the robot starts to `target` (nq,), the best first.
+    """Return paths from the robot's start to `target` (nq,), the best first.
 
-    The straight one if it is clear; else the shortest bent ones that are, and of those that searches find; else the
-    straight one, for a solver to push out of the way. MissingDependencyError where only a search could help, without
-    OMPL.
+    The result is the straight path if it is collision-free, or else the shortest collision-free paths among bent paths
+    and RRT-Connect searches, or else the straight path, which a solver may correct. Raises MissingDependencyError if
+    only a search could help and OMPL is not installed.
     """
     robot = space.robot
     straight = PostureLine("a straight line in the joints", np.array([robot.q, target]))
@@ -273,7 +273,7 @@ def lines(space: Space, target: Array, seed: int) -> list[PostureLine]:
 
 
 def _search(space: Space, target: Array, seed: int) -> PostureLine | None:
-    """Around what is in the way, by RRT-Connect; None where it finds nothing.
+    """Search for a path around obstacles by RRT-Connect; return None if none is found.
 
     Source: Kuffner and LaValle, "RRT-Connect: an efficient approach to single-query path planning", 2000.
     """
@@ -283,7 +283,7 @@ def _search(space: Space, target: Array, seed: int) -> PostureLine | None:
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(chain, axis=0), axis=1))])
     for count in CONTROLS:
         knots = np.array(BsplineBasis(CUBIC, count).knots())
-        even = along[-1] * np.array([np.mean(knots[i + 1 : i + CUBIC]) for i in range(count)])  # of an even speed
+        even = along[-1] * np.array([np.mean(knots[i + 1 : i + CUBIC]) for i in range(count)])  # for a uniform speed
         line = PostureLine(
             "a way around by a search", np.array([np.interp(even, along, column) for column in chain.T]).T
         )
@@ -293,7 +293,7 @@ def _search(space: Space, target: Array, seed: int) -> PostureLine | None:
 
 
 def _chain(space: Space, target: Array, seed: int) -> Array | None:
-    """(K, nq) postures from the start to `target`, the straight lines between which are clear; None without any."""
+    """Return postures (K, nq) from the start to `target`, connected by collision-free straight lines, or None."""
     from ompl import base, geometric, util
 
     robot, looks = space.robot, 0
@@ -320,7 +320,7 @@ def _chain(space: Space, target: Array, seed: int) -> Array | None:
     level = util.getLogLevel()
     util.setLogLevel(util.LOG_NONE)
     try:
-        util.RNG.setSeed(seed + 1)  # 0 is no seed
+        util.RNG.setSeed(seed + 1)  # 0 is not a valid seed
         limits = base.RealVectorBounds(size)
         for i, ends in enumerate(zip(robot.lower, robot.upper, start, target, strict=True)):
             limits.setLow(i, min(ends))
@@ -351,9 +351,9 @@ def _chain(space: Space, target: Array, seed: int) -> Array | None:
 
 @dataclass(frozen=True, eq=False)
 class MotionGuess:
-    """A motion xs (N+1, nx) under us (N, nu) of `model`, and what it is called.
+    """A motion xs (N+1, nx) of `model` with inputs us (N, nu), and its name.
 
-    `effort` is the largest share of an effort limit that it takes, `depth` [m] its deepest overlap.
+    `effort` is the largest share of an effort limit along the motion, and `depth` [m] its deepest overlap.
     """
 
     name: str
@@ -369,7 +369,7 @@ class MotionGuess:
         return len(self.us)
 
     def in_steps(self, count: int) -> "MotionGuess":
-        """The same motion at `count` + 1 even times, for a search whose horizon is free."""
+        """Resample the motion at `count` + 1 uniform times, for a search with a free horizon."""
         now, then = np.linspace(0, 1, count + 1), np.linspace(0, 1, len(self.xs))
         xs = np.array([np.interp(now, then, column) for column in self.xs.T]).T
         us = np.array([np.interp((now[1:] + now[:-1]) / 2, (then[1:] + then[:-1]) / 2, c) for c in self.us.T]).T
@@ -377,16 +377,16 @@ class MotionGuess:
 
 
 def speed_limits(model: Model) -> Array:
-    """(nv,) what a first guess may use of the velocity limits; FASTEST where there is none, or one of 0."""
+    """Return speed limits (nv,) for initial guesses; FASTEST for joints with a velocity limit of 0 or none."""
     limits = np.array([min(abs(v.lower), abs(v.upper)) for v in model.contract.velocities])
     return np.where((limits > 0) & np.isfinite(limits), np.minimum(OF_SPEED * limits, 5 * FASTEST), FASTEST)
 
 
 def along(robot: Robot, line: PostureLine, *, slower: float = 1.0) -> MotionGuess:
-    """The smooth motion along a line, at rest at both ends, and the inputs that make it.
+    """Return the smooth motion along a path, at rest at both ends, with its inputs.
 
-    It is as fast as the joints' speeds and efforts allow, within the limits of this module. SimulationError where
-    Drake cannot take a step of it.
+    It is as fast as the joints' speed and effort limits allow, within the limits of this module. Raises SimulationError
+    if Drake cannot take a step.
     """
     t = np.linspace(0, 1, 101)
     speeds = np.abs(line.slopes(smooth(t))) * (30 * t**2 * (1 - t) ** 2)[:, None]
@@ -401,10 +401,10 @@ def along(robot: Robot, line: PostureLine, *, slower: float = 1.0) -> MotionGues
 
 
 def flight(robot: Robot, places: Mapping[str, Array], seed: int) -> MotionGuess:
-    """A smooth flight of what floats to where the frames of `places` are at theirs (3,) [m], at rest.
+    """Return a smooth flight of floating bodies that moves the frames of `places` to their positions (3,) [m], at rest.
 
-    Without places each body goes to a random one, by a straight line on which nothing overlaps, turned about the
-    vertical.
+    Without `places`, each body flies to a random position along a straight line without overlaps, and rotates about
+    the vertical.
     """
     model, random, still = robot.model, np.random.default_rng([seed, 4]), np.zeros(robot.model.nv)
     free, space = floating(model), tangent_space(model)
@@ -431,12 +431,12 @@ def flight(robot: Robot, places: Mapping[str, Array], seed: int) -> MotionGuess:
 
 
 def flown(random: np.random.Generator) -> Array:
-    """(3,) [m] a way to go through the air, drawn at random."""
+    """Return a random displacement (3,) [m] in the air."""
     return np.array(FLY_FAR) * random.uniform(-1, 1, 3) + np.array([0.0, 0.0, FLY_UP])
 
 
 def _carrier(robot: Robot, name: str) -> int:
-    """Where the velocities begin of the floating body that carries a frame or body: the one that takes it along."""
+    """Return the velocity index of the floating body that carries a frame or body."""
     locate, still = frame_position(robot.model, name), np.zeros(robot.model.nv)
     free = floating(robot.model)
     for _, q_start, v_start in free:
@@ -448,12 +448,12 @@ def _carrier(robot: Robot, name: str) -> int:
 
 
 def _timed(robot: Robot, name: str, postures_at: Callable[[Array], Array], duration: float) -> MotionGuess:
-    """The motion through postures (M, nq) at s (M,) from 0 to 1 in `duration` [s], and the inputs that make it."""
+    """Return the motion through postures (M, nq) at s (M,) from 0 to 1 in `duration` [s], with its inputs."""
     model = robot.model
     steps = int(np.clip(round(duration / model.time_step), *STEPS))
     if duration / steps > 1.25 * model.time_step:
         model = model.at_time_step(float(f"{duration / steps:.1g}"))
-    # One step before the end it is at the goal, and rests there: Drake's step moves by the velocity after it.
+    # It reaches the goal one step before the end and rests there: Drake's step uses the velocity after the step.
     path = postures_at(smooth(np.clip(np.arange(steps + 1) / (steps - 1), 0.0, 1.0)))
     space, still = tangent_space(model), np.zeros(model.nv)
     xs, us = [np.append(robot.q, still)], list[Array]()
@@ -468,11 +468,11 @@ def _timed(robot: Robot, name: str, postures_at: Callable[[Array], Array], durat
 
 
 def _inputs(model: Model, x: Array, wanted: Array) -> tuple[Array, Array]:
-    """(nu,) the inputs whose step from x (nx,) leads to the velocities `wanted` (nv,), and (nx,) where it leads."""
+    """Return the inputs (nu,) for a step from x (nx,) to the velocities `wanted` (nv,), and the next state (nx,)."""
     twin, h, nq = model.double, model.time_step, model.nq
     set_state(twin, x)
     change = wanted - x[nq:]
-    # The step's own equation, whose damping acts on the velocity after it; probing the step would meet joint limits.
+    # The step's equation with implicit damping; numerical probing of the step would meet joint limits.
     needed = twin.inverse_dynamics(change / h) + twin.damping() * change
     per_input = model.servo_gains[0]
     by_effort = h * np.linalg.solve(twin.mass_matrix() + h * np.diag(twin.damping()), model.actuation)
@@ -483,7 +483,7 @@ def _inputs(model: Model, x: Array, wanted: Array) -> tuple[Array, Array]:
         off = wanted - x_next[nq:]
         if i == CORRECTIONS or np.max(np.abs(off), initial=0.0) < EXACT:
             break
-        if i == 1:  # the equation has no controllers in the plant, nor thrusters that turn with their body
+        if i == 1:  # the equation lacks the plant's controllers and the rotation of body-fixed thrusters
             probes = [np.array(advance(twin, x, u + d))[nq:] - x_next[nq:] for d in np.diag(1 / per_input)]
             effect = np.array(probes).T * per_input
         u = u + np.linalg.lstsq(effect, off, rcond=None)[0]
@@ -491,7 +491,7 @@ def _inputs(model: Model, x: Array, wanted: Array) -> tuple[Array, Array]:
 
 
 def _positions(model: Model) -> Indices:
-    """(nv,) where in q the coordinate of each velocity of a joint is."""
+    """Return the index in q (nv,) of the coordinate of each joint velocity."""
     indices = np.arange(model.nv)
     for joint in joints(model.plant):
         q, v = model.places(joint)
@@ -503,16 +503,16 @@ def _positions(model: Model) -> Indices:
 def by_controller(
     robot: Robot, model: Model, target: Array, *, steps: int, reach: float, name: str
 ) -> MotionGuess | None:
-    """What `model` of the robot does when each input pulls its own joint toward `target` (nq,), `reach` of the way.
+    """Simulate `model` with controllers that move each joint toward `target` (nq,) by a fraction `reach` of the way.
 
-    None where Drake cannot take a step of it.
+    Returns None if Drake cannot take a step.
     """
     x = np.concatenate([robot.q, np.zeros(model.nv)])
     limits = np.minimum(model.effort_limits, 1e4)
     xs, us = [x], []
     try:
         effect = drive(model, robot.q)
-        joint_v = np.argmax(np.abs(effect), axis=0)  # the velocity that an input acts on most
+        joint_v = np.argmax(np.abs(effect), axis=0)  # the velocity on which an input acts most
         gain = model.time_step / effect[joint_v, np.arange(model.nu)]
         joint_q = _positions(model)[joint_v]
         for k in range(steps):

@@ -1,4 +1,4 @@
-"""From a robot file to a verified plan, in one call: what `drake-diff plan` does."""
+"""Plan from a robot file to a verified plan in one call; the function behind `drake-diff plan`."""
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -50,42 +50,42 @@ from drake_diff.runs.save import keep_plan, plan_kept, write_run
 from drake_diff.runs.verify import Verification, verify_own
 
 TIMES = (None, "least")
-TRIED_TWICE = 36  # velocities: of a larger robot on its feet a second goal would take half a minute more
-SMALL = 7  # velocities: of a larger robot any smooth motion will do, as its best one takes minutes
-FASTER = (0.02, 2.0)  # of the first guess's duration: the range of a least time
-SPEED_WEIGHT = 0.01  # of a speed against an effort, both as shares of their limits
-FEW = 40  # steps of a least time, which is refined: a slow guess has more than a fast motion needs
-FINE, COARSE = 1e-5, 1e-4  # errors of an interval; inputs that jump need ever more intervals for less
-BESIDE = 0.05  # [rad or m] the range of each joint around a guess that a motion is kept near
-LOOKS = 3  # of the ten places in each step, those at which overlap is looked for are so many apart
-BUDGET, LONG_BUDGET = 40.0, 120.0  # [s] on the clock, of one attempt: another one needs no search
-REACHES = ((0.5, 50), (0.25, 50), (0.1, 50), (0.1, 25), (0.1, 12))  # part of the way, and steps to go it
-# Where shapes must touch: spheres have derivatives, and their contact is the same in steps of other lengths.
+TRIED_TWICE = 36  # velocities: for a larger robot on its feet, a second goal would take 30 s more
+SMALL = 7  # velocities: larger robots get any smooth motion, as an optimal one takes minutes
+FASTER = (0.02, 2.0)  # relative to the duration of the initial guess: the range of a least time
+SPEED_WEIGHT = 0.01  # of a speed relative to an effort, both as shares of their limits
+FEW = 40  # initial steps of a least-time problem, which is refined: a slow guess has more than a fast motion needs
+FINE, COARSE = 1e-5, 1e-4  # interval error tolerances; inputs with jumps need ever more intervals for a smaller one
+BESIDE = 0.05  # [rad or m] margin of each joint around the range of a guess
+LOOKS = 3  # overlap is checked at every third of the ten points in each step
+BUDGET, LONG_BUDGET = 40.0, 120.0  # [s] wall-clock limits of one attempt, without and with a longer search
+REACHES = ((0.5, 50), (0.25, 50), (0.1, 50), (0.1, 25), (0.1, 12))  # fractions of the distance, and numbers of steps
+# For contact: spheres have derivatives, and this contact does not depend on the time step.
 GENTLE: dict[str, Any] = {"time_step": 0.005, "meshes": "spheres", "contact_geometry": "corner_spheres"}
 GENTLE |= {"near_rigid": 0.1, "relaxation_time": 0.02}
-SMALLEST_WAY = 0.01  # [rad or m] of the coordinate that goes furthest: less is no plan
+SMALLEST_WAY = 0.01  # [rad or m] for the coordinate with the largest motion; smaller motions are rejected
 NOTHING = "no initial guess was found that its motors can follow within its limits: give a goal of joints"
 GENTLY = ((0.25, 100), (0.1, 100))
-COMES_TO_REST = 400  # steps of GENTLE
-WIDTH, DRAWS = 0.3, 30  # of a coordinate's range, and postures: another one to begin in
+COMES_TO_REST = 400  # steps of GENTLE until the robot is at rest
+WIDTH, DRAWS = 0.3, 30  # of a coordinate's range, and the number of samples of another start
 
 Report = Callable[[str, str], None]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Plan(ShowsItsRepr):
-    """What `plan` did with a robot file, from its repairs to the verdict on the artifact.
+    """The result of `plan` for a robot file, from its repairs to the verdict on the artifact.
 
     Attributes:
-        model: The model that was planned for.
-        repairs: What was mended in the file, a sentence each.
-        findings: What `audit` found in the mended model.
+        model: The planned model.
+        repairs: A sentence for each repair of the file.
+        findings: The findings of `audit` on the repaired model.
         solution: The plan.
         record: The record that was written.
-        verification: What `verify` found in the directory.
-        directory: What was written.
-        tried: What was tried, and how it ended, a sentence each.
-        apart: Whether the last of it was verified and no shapes of the robot overlap along it.
+        verification: The result of `verify` on the directory.
+        directory: The directory that was written.
+        tried: A sentence for each attempt with its outcome.
+        apart: Whether the last attempt was verified and no shapes of the robot overlap along it.
     """
 
     model: Model
@@ -100,12 +100,12 @@ class Plan(ShowsItsRepr):
 
     @property
     def success(self) -> bool:
-        """Whether the plan is one and its artifact came out again."""
+        """Whether the plan was verified and its artifact was reproduced."""
         return self.apart and self.record.verdict == "pass" and self.verification.holds
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """Ten lines on what was done."""
+        """A summary in ten lines."""
         m, s = self.model, self.solution
         severe = [f for f in self.findings if f.severity in ("error", "warning")]
         certificates = [c.verdict for c in s.certificates]
@@ -155,30 +155,30 @@ def plan(
     packages: Mapping[str, str | Path] | None = None,
     report: Report | None = None,
 ) -> Plan:
-    """Load a robot file, mend what it leaves out, plan a motion to a goal, write the run and verify it.
+    """Load a robot file, repair it, plan a motion to a goal, write the run and verify it.
 
     Args:
         robot: A URDF, SDF, MJCF (.xml) or .dmd.yaml file.
-        goals: What is to be where at the end, at rest: three numbers [m] by the name of a frame or body, one number
-            [rad or m] by the name of a joint. None takes a random state that the robot can reach.
+        goals: The targets at the end, at rest: three numbers [m] for the name of a frame or body, one number [rad or m]
+            for the name of a joint. None selects a random reachable state.
         avoid: Obstacles: `SphereObstacle`s and `BoxObstacle`s.
-        time: "least" for the shortest time; None for the least effort (of large robots: any smooth motion).
-        out: The directory to write; `artifacts/plan_<robot>` where not given.
-        seed: Of what is drawn; the same seed gives the same plan.
-        restarts: How many more first guesses each search is given, to list other optima and to keep the cheapest.
-        meshes: Whether the directory gets a copy of the meshes; see `save`.
-        packages: The folders of the file's packages by their names; see `load_model`.
-        report: Gets a stage and a sentence now and then.
+        time: "least" for the shortest time; None for the least effort (for large robots: any smooth motion).
+        out: The output directory; `artifacts/plan_<robot>` by default.
+        seed: The random seed; the same seed gives the same plan.
+        restarts: The number of additional initial guesses of each search, to list other optima and select the cheapest.
+        meshes: Whether to copy the meshes to the directory; see `save`.
+        packages: The folders of the file's packages by name; see `load_model`.
+        report: Called with a stage and a sentence to report progress.
 
     Returns:
-        The `Plan`; its `success` says whether all of it holds.
+        The `Plan`. Its `success` is true if the plan and its artifact were verified.
 
     Raises:
-        InputError: A goal, an obstacle or an option is wrong.
+        InputError: A goal, an obstacle or an option is invalid.
         ModelError: The file cannot be read, nothing in it can be driven, or a goal cannot be reached.
-        ArtifactError: Somebody else is writing `out`.
-        WriteError: The disk is full, or does not let a file be written; the message says where the plan is.
-        KeyboardInterrupt: It was interrupted, and an earlier run is in `out`; a note says where this one is.
+        ArtifactError: Another process is writing `out`.
+        WriteError: A file cannot be written, for example on a full disk; the message says where the plan is.
+        KeyboardInterrupt: The planning was interrupted, and `out` has an earlier run; a note says where this run is.
 
     Example:
         >>> from tempfile import mkdtemp
@@ -192,7 +192,7 @@ def plan(
         raise InputError("time", got=repr(time), expected='None or "least"')
     note = report or (lambda stage, sentence: None)
     if out is not None:
-        check_place(Path(out).resolve())  # before minutes are spent
+        check_place(Path(out).resolve())  # before the planning, which takes minutes
     with warnings.catch_warnings(), ExitStack() as stack:
         warnings.simplefilter("ignore", ModelWarning)
         folders: list[Path] = []
@@ -224,8 +224,8 @@ def plan(
         with plan_kept(best, directory.name, folders[0]):
             record = write_run(best, folders[0], meshes=meshes)
         if best.status is Status.INTERRUPTED and is_taken(directory):
-            raise KeyboardInterrupt  # it stays beside the earlier run
-        stack.close()  # it takes its place
+            raise KeyboardInterrupt  # the new run stays next to the earlier run
+        stack.close()  # moves the run to its directory
         note("verify", record.verdict)
         verification = verify_own(directory)
     return Plan(ready.model, ready.repairs, findings, best, record, verification, directory, tuple(tried), apart)
@@ -233,9 +233,9 @@ def plan(
 
 @dataclass(frozen=True, eq=False)
 class _Attempt:
-    """One problem, the guess that its search starts from, and how it is searched.
+    """A problem, the initial guess of its search, and the search options.
 
-    `instead` is what to try where the robot's shapes overlap along what is found.
+    `instead` is the next attempt if the robot's shapes overlap along the solution.
     """
 
     name: str
@@ -246,7 +246,7 @@ class _Attempt:
     instead: "_Attempt | None" = None
 
     def restarted(self, restarts: int) -> "_Attempt":
-        """The same with as many more first guesses."""
+        """Return the attempt with a number of additional initial guesses."""
         return replace(self, options={**self.options, "restarts": restarts})
 
     def solved(self, progress: Callable[[str], None], on_plan: Callable[[Solution], None]) -> Solution:
@@ -255,10 +255,10 @@ class _Attempt:
         return solve(self.problem, initial_guess=begun, progress=progress, **arguments)
 
     def depth(self, solution: Solution) -> float:
-        """[m] the deepest overlap of shapes along a solution; 0 where none is looked for, or all are in its steps."""
+        """Return the deepest overlap [m] of shapes along a solution; 0 if not checked or if steps have all contact."""
         model = self.problem.model
         if model.contract.contact.collision_pairs and (model.options or {}).get("contact") is True:
-            return 0.0  # how deep they may is judged by its replays
+            return 0.0  # the replays check the penetration
         every, motion = along_steps(solution.times, solution.xs)
         xs = motion(every) if solution.transcribed is None else solution.transcribed.at(every)[0]
         return max(self.robot.overlap(x[: self.problem.model.nq]) for x in xs[::LOOKS])
@@ -272,7 +272,7 @@ def _keep(plan: Solution, folder: Path) -> None:
 def _first_that_holds(
     attempts: Iterator[_Attempt], note: Report, on_plan: Callable[[Solution], None]
 ) -> tuple[list[str], list[Solution], bool]:
-    """How each attempt ended, the solutions, and whether the last one is verified and keeps shapes apart.
+    """Return the outcome of each attempt, the solutions, and whether the last is verified and without overlap.
 
     An interrupt ends the attempts.
     """
@@ -305,7 +305,7 @@ def _first_that_holds(
 
 
 def _attempts(robot: Robot, task: Goals, least: str | None, seed: int) -> Iterator[_Attempt]:
-    """What to try, one after the other, until one is verified."""
+    """Yield attempts until one is verified."""
     if robot.standing is not None:
         yield from _of_standing(robot, robot.standing, task, seed)
         return
@@ -321,14 +321,14 @@ def _attempts(robot: Robot, task: Goals, least: str | None, seed: int) -> Iterat
 
 
 def _of_flying(robot: Robot, task: Goals, seed: int) -> Iterator[_Attempt]:
-    """What thrusters carry: along a guess where they push and turn it in any direction, else with least effort."""
+    """Yield attempts for thrusters: along a guess if they can produce any acceleration, or else with least effort."""
     guess = flight(robot, task.frames, seed)
     model, x0 = guess.model, guess.xs[0]
     effect = differentiate_step(model, x0, model.neutral_input(x0)).B[model.nq :]
     if np.linalg.matrix_rank(effect) == model.nv:
         yield _feasible(robot, task, guess)
         return
-    x_goal = x0.copy()  # as it is now turned, at rest
+    x_goal = x0.copy()  # at rest in the current orientation
     for _, q, _ in floating(model):
         x_goal[q + 4 : q + 7] = np.nan if task.frames else x0[q + 4 : q + 7] + flown(np.random.default_rng([seed, 4]))
     for longer in (1, 2):
@@ -339,7 +339,7 @@ def _of_flying(robot: Robot, task: Goals, seed: int) -> Iterator[_Attempt]:
 
 
 def _of_standing(robot: Robot, standing: tuple[Legs, Rest], task: Goals, seed: int) -> Iterator[_Attempt]:
-    """A robot on its feet, which stay where they are; where the goal is free, to another one if need be."""
+    """Yield attempts of a robot with fixed foot positions; a random goal is replaced once if needed."""
     legs, rest = standing
     for again in range(1 + (task.is_free and robot.model.nv <= TRIED_TWICE)):
         if task.is_free:
@@ -354,7 +354,7 @@ def _of_standing(robot: Robot, standing: tuple[Legs, Rest], task: Goals, seed: i
 
 
 def _of_driven(robot: Robot, task: Goals, least: str | None, seed: int) -> Iterator[_Attempt]:
-    """A robot whose every smooth motion can be driven: from each posture that keeps the goals, the best guess first."""
+    """Yield attempts of a fully driven robot, for each posture at the goals, the best guess first."""
     if least:
         _check_that_limits_bound_time(robot.model)
     space = Space.around(robot, task.avoid)
@@ -368,7 +368,7 @@ def _of_driven(robot: Robot, task: Goals, least: str | None, seed: int) -> Itera
 
 
 def _check_that_limits_bound_time(model: Model) -> None:
-    """InputError where joints are as fast as one likes: without limits of effort or of speed there is no least time."""
+    """Raise InputError if speed is unlimited: without effort or speed limits there is no least time."""
     fast = [v.name for v in model.contract.velocities if not v.lower < v.upper or np.isinf([v.lower, v.upper]).any()]
     strong = [u.name for u in model.contract.inputs if np.isinf([u.lower, u.upper]).any()]
     if model.inputs.commanded.any():
@@ -380,7 +380,7 @@ def _check_that_limits_bound_time(model: Model) -> None:
 
 
 def _guesses(space: Space, target: Array, seed: int) -> list[MotionGuess]:
-    """First guesses to `target` (nq,): those that touch nothing before others, then those within the effort limits."""
+    """Return guesses to `target` (nq,), first without overlaps, then within the effort limits."""
     robot, paths = space.robot, lines(space, target, seed)
     guesses = [along(robot, line) for line in paths]
     if len(paths) == 1:
@@ -389,13 +389,13 @@ def _guesses(space: Space, target: Array, seed: int) -> list[MotionGuess]:
 
 
 def _touched(space: Space, guess: MotionGuess) -> float:
-    """[m] how deep shapes overlap or what is used of an obstacle's margin along a guess; 0 where nothing is."""
+    """Return the overlap or the violation [m] of an obstacle's margin along a guess, or 0 if there is none."""
     depth = guess.depth if guess.depth > TOUCHING else 0.0
     return max(0.0, depth, float(np.max(space.lacking(guess.xs[:, : space.robot.model.nq]))))
 
 
 def _collocated(robot: Robot, task: Goals, guess: MotionGuess, least: str | None) -> _Attempt:
-    """The least effort, or the least time, by collocation."""
+    """Minimize the effort, or the time, by collocation."""
     model, x1 = guess.model, guess.xs[-1].copy()
     asked: dict[str, Any] = {"running_cost": _effort(model)}
     if least:
@@ -414,7 +414,7 @@ def _collocated(robot: Robot, task: Goals, guess: MotionGuess, least: str | None
 
 
 def _feasible(robot: Robot, task: Goals, guess: MotionGuess) -> _Attempt:
-    """Any motion to where the guess ends that keeps all limits: the guess itself, if it does."""
+    """Find any motion to the end of the guess within all limits; the guess itself if it is feasible."""
     problem = _problem(task, guess, guess.xs[-1])
     return _Attempt(guess.name, robot, problem, guess, {"method": "shooting", "time_limit": BUDGET})
 
@@ -428,9 +428,9 @@ def _problem(task: Goals, guess: MotionGuess, x_goal: Array, **asked: Any) -> Pr
 
 
 def _of_reachable(robot: Robot, task: Goals, seed: int) -> Iterator[_Attempt]:
-    """To the state that a controller reaches, which shows that it can be reached.
+    """Yield attempts to states that a controller reaches, which are therefore reachable.
 
-    As the file says; then on ways on which nothing touches; then from where it comes to rest.
+    The order is: the model as in the file, then paths without contact, then from a state of rest in contact.
     """
     random = np.random.default_rng([seed, 2])
     fractions = random.uniform(-1, 1, robot.model.nq)
@@ -462,7 +462,7 @@ def _of_reachable(robot: Robot, task: Goals, seed: int) -> Iterator[_Attempt]:
 
 
 def _elsewhere(robot: Robot, random: np.random.Generator) -> Robot:
-    """The robot in another posture to begin in: that of its file may be one in which it just touches something."""
+    """Return the robot with another start, since the file's posture may be one with a slight contact."""
     is_joint = of_joints(robot.model)
     for i in range(DRAWS):
         width = WIDTH * (i + 1) / DRAWS * (robot.upper - robot.lower)
@@ -474,13 +474,13 @@ def _elsewhere(robot: Robot, random: np.random.Generator) -> Robot:
 
 
 def _of_passive(robot: Robot, task: Goals) -> Iterator[_Attempt]:
-    """A robot with joints that no motor drives, to a goal of joints: all else ends where it began, at rest."""
+    """Yield attempts of an underactuated robot to joint goals; all other joints end at their start, at rest."""
     if task.frames:
         raise InputError("goal", got=", ".join(task.frames), expected="goals of joints: not every joint has a motor")
     model = robot.model
     x0 = np.concatenate([robot.q, np.zeros(model.nv)])
     goal, budget = x0.copy(), BUDGET
-    if model.file_facts.held_points:  # all else is where the loops have it
+    if model.file_facts.held_points:  # the loops determine all other coordinates
         goal[:], budget = np.nan, LONG_BUDGET
         places, rates = single_coordinates(model)
         goal[model.nq + rates[np.isin(places, list(task.joints))]] = 0.0
@@ -501,15 +501,15 @@ def _of_passive(robot: Robot, task: Goals) -> Iterator[_Attempt]:
 def _effort(model: Model) -> QuadraticCost:
     limits = model.effort_limits
     size = np.where(np.isfinite(limits) & (limits > 0), limits, 1.0)
-    size[model.inputs.commanded] = np.inf  # their efforts are no function of the inputs alone
+    size[model.inputs.commanded] = np.inf  # servo efforts are not a function of the inputs only
     speeds = np.concatenate([np.zeros(model.nq), np.full(model.nv, SPEED_WEIGHT)])
     return QuadraticCost(Q=np.diag(speeds), R=np.diag(1.0 / size**2))
 
 
 def _bounds(model: Model, near: Array | None = None) -> Bounds | None:
-    """The model's own limits, but for velocity limits of 0, which no motion can keep.
+    """Return the model's limits, without velocity limits of 0, which no motion satisfies.
 
-    With postures (K, nq) that a motion is to stay `near`, each joint stays within their range, and a little more.
+    With postures (K, nq) in `near`, each joint stays within their range plus a margin.
     """
     dead = np.array([v.lower >= v.upper for v in model.contract.velocities])
     if near is None and not np.any(dead):
@@ -524,7 +524,7 @@ def _bounds(model: Model, near: Array | None = None) -> Bounds | None:
 
 
 def _goes(guess: MotionGuess) -> bool:
-    """Whether the motion goes somewhere, and keeps the limits of its model, but for velocity limits of 0."""
+    """Return whether the motion is large enough and within the model's limits, except velocity limits of 0."""
     terms = [*guess.model.contract.positions, *guess.model.contract.velocities]
     low, high = np.array([t.lower for t in terms]), np.array([t.upper for t in terms])
     goes = np.max(np.ptp(guess.xs[:, : guess.model.nq], axis=0)) >= SMALLEST_WAY

@@ -1,6 +1,6 @@
-"""A stranger's file as a robot that can be planned for, in a posture to begin in.
+"""An untrusted file as a robot for planning, with its start posture.
 
-What the file leaves out is mended, each repair a sentence: motors, thrusters of what floats, a ground to stand on.
+Missing parts are added, each with a sentence: motors, thrusters of floating bodies, a ground to stand on.
 """
 
 import warnings
@@ -26,33 +26,33 @@ from drake_diff.model.plant import actuators, bodies, joints, labelled
 from drake_diff.model.step import advance, set_state
 
 TIME_STEP = 0.02  # [s] of a plan
-FEW = 0.5  # of all joints: where fewer have a motor, the file says nothing of motors, or forgot some
-TEXTBOOK = 6  # joints: a file of more is no cart-pole, and none of them is meant to be without a motor
-SMALLEST_DRIVE = 1e-9  # of the largest singular value: a velocity with less is not driven
-NAMED = 4  # of a long list of names
-# Where it begins.
-INSIDE = 0.05  # of a joint's range: a start is at least that far from both its limits
-TURN, SHIFT = 1.0, 0.2  # [rad], [m] the range on each side of 0 of a joint without limits
-WIDEST = 4 * np.pi  # a wider range is as good as none
-TOUCHING = 1e-4  # [m] of overlap: less is none
-HOLD_SHARE = 0.63  # of the effort limits: what a start may need to be held
-SEEN = 16  # postures in which a pair of shapes overlaps before it is said to do so always
-ROOM, BESIDE = 0.1, 6  # [rad or m] that all joints can move at once from a start, in so many ways at random
-ATTEMPTS, FINER = 60, 1000  # at a start: drawn ever farther from the file's, and near the best so far
-DEPTH = 0.01  # [m] of overlap that weighs as much as all that the motors have
-# Thrusters of what nothing else drives.
-STRENGTH = 1.5  # of the weight: what one thruster has, of the two along each axis
+FEW = 0.5  # of all joints: if fewer have a motor, the file does not describe motors or lacks some
+TEXTBOOK = 6  # joints: in a larger file, which is not a textbook model, every joint should have a motor
+SMALLEST_DRIVE = 1e-9  # of the largest singular value: a velocity with a smaller one is not driven
+NAMED = 4  # names shown of a long list
+# Start postures.
+INSIDE = 0.05  # of a joint's range: minimum distance of a start from both limits
+TURN, SHIFT = 1.0, 0.2  # [rad], [m] range on each side of 0 for a joint without limits
+WIDEST = 4 * np.pi  # a wider range counts as unlimited
+TOUCHING = 1e-4  # [m] tolerance of overlap
+HOLD_SHARE = 0.63  # of the effort limits: maximum effort for holding a start
+SEEN = 16  # postures in which a pair of shapes must overlap to count as always overlapping
+ROOM, BESIDE = 0.1, 6  # [rad or m] simultaneous motion of all joints from a start, in this number of random directions
+ATTEMPTS, FINER = 60, 1000  # start candidates: sampled at growing distance from the file's, and near the best candidate
+DEPTH = 0.01  # [m] overlap with the same weight as the full motor effort
+# Thrusters of floating bodies without actuators.
+STRENGTH = 1.5  # of the weight: the limit of one of the two thrusters along each axis
 SMALLEST_ARM = 0.01  # [m]
-GRAVITY = 9.81  # [m/s^2] that the weight is reckoned with, also where a model has none
-LIFTS = (0.1, 0.2, 0.5, 1.0, 2.0)  # [m] of a body that begins inside something
+GRAVITY = 9.81  # [m/s^2] for the weight, also for models without gravity
+LIFTS = (0.1, 0.2, 0.5, 1.0, 2.0)  # [m] attempts to lift a body that starts in collision
 Pair = tuple[str, str]
 
 
 @dataclass(frozen=True, eq=False)
 class StartPosture:
-    """A posture q (nq,), the sum of its overlaps [m] and what it takes of the effort limits.
+    """A posture q (nq,), the sum of its overlaps [m], and the share of the effort limits that it requires.
 
-    `always` are the pairs of shapes that overlap in every posture that was seen, which are not looked at.
+    `always` are the pairs of shapes that overlap in all sampled postures; they are ignored.
     """
 
     q: Array
@@ -63,13 +63,13 @@ class StartPosture:
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """A model that can be planned for, the posture it starts in, and what was mended in its file.
+    """A model for planning, its start posture, and the repairs of its file.
 
-    `lower` and `upper` (nq,) are where its coordinates may be: their limits, or a range around 0 where they have none.
-    `shapes` is the model with its collision shapes, in which overlap is looked for; None where there is nothing to
-    look for. `always` are the pairs of shapes that overlap in every posture, which is not looked at. `apart` is the
-    model without contact in its steps, for a way on which nothing touches, where `model` has contact. `standing`
-    tells how it stands on its feet, where it does; else what floats is welded.
+    `lower` and `upper` (nq,) are the limits of the coordinates, or a range around 0 for unlimited ones. `shapes` is the
+    model with collision shapes for checking overlaps, or None if overlaps are not checked. `always` are the pairs of
+    shapes that overlap in every posture, which are ignored. If `model` has contact, `apart` is the model without it
+    in its steps, for motions without contact. `standing` describes how the robot stands on its feet, if it does.
+    Otherwise, floating bases are welded.
     """
 
     model: Model
@@ -84,12 +84,12 @@ class Robot:
     apart: Model | None = None
 
     def overlap(self, q: Array) -> float:
-        """[m] how deep the deepest overlap of shapes is in posture q (nq,); 0 where nothing is looked for."""
+        """Return the deepest overlap [m] of shapes in posture q (nq,), or 0 if overlaps are not checked."""
         return 0.0 if self.shapes is None else deepest(self.shapes, q, self.always)
 
 
 class _Draft:
-    """A robot's file, the options that it is loaded with, the model, and a sentence on each repair."""
+    """A robot's file, its load options, the model, and a sentence for each repair."""
 
     def __init__(self, path: Path, options: dict[str, Any], repairs: Sequence[str] = ()):
         self.path, self.options, self.repairs = path, dict(options), list(repairs)
@@ -97,7 +97,7 @@ class _Draft:
 
     def read(self, **changes: Any) -> Model:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ModelWarning)  # what was mended is told at the end
+            warnings.simplefilter("ignore", ModelWarning)  # the repairs are reported at the end
             return load_model(self.path, **self.options | changes)
 
     def mend(self, repair: str, model: Model | None = None, **changes: Any) -> None:
@@ -111,10 +111,10 @@ class _Draft:
 
 
 def load_robot(path: Path, seed: int, weld: str = "", packages: Mapping[str, str | Path] | None = None) -> Robot:
-    """The robot in a file, mended where it has to be; ModelError where nothing in it can be driven.
+    """Load a robot file and repair it if necessary; raise ModelError if nothing in it can be driven.
 
-    What floats and can stand on feet does so, unless `weld` says why it is to be fixed to the world. `packages` are the
-    folders of packages by their names.
+    A floating robot that can stand on its feet does so, unless `weld` is a reason to weld it to the world. `packages`
+    are the folders of packages by name.
     """
     draft = _Draft(path, {"time_step": TIME_STEP, "packages": packages})
     _reduce_followers(draft)
@@ -143,7 +143,7 @@ def _reduce_followers(draft: _Draft) -> None:
 def _add_motors(draft: _Draft) -> None:
     count, had = _movable(draft.model), draft.model.nu
     if had and draft.model.file_facts.held_points:
-        return  # the other joints of a loop move by it
+        return  # the loop moves its other joints
     if had < (count if count > TEXTBOOK else FEW * count):
         driven = draft.read(actuators="all")
         if driven.nu > had:
@@ -160,7 +160,7 @@ def _weld_base(draft: _Draft, why: Refusal) -> None:
     try:
         welded = draft.read(base="weld")
     except ModelError:
-        return  # nothing can move then
+        return  # no joint could move
     if welded.nv < draft.model.nv:
         plant = draft.model.plant
         names = _few(plant.get_body(b).name() for b in sorted(plant.GetFloatingBaseBodies()))
@@ -168,7 +168,7 @@ def _weld_base(draft: _Draft, why: Refusal) -> None:
 
 
 def _fix_stuck(draft: _Draft) -> None:
-    """Fix the joints that have no way to go between their limits, and those that follow them."""
+    """Weld joints with equal lower and upper limits, and their followers."""
     model, (lower, upper) = draft.model, draft.model.position_limits
     names: list[str] = []
     for joint in joints(model.plant):
@@ -184,7 +184,7 @@ def _fix_stuck(draft: _Draft) -> None:
 
 
 def _fix_massless(draft: _Draft) -> None:
-    """Fix the joints on which nothing hangs that has a mass: Drake could take no step of them."""
+    """Weld joints that move no mass, since Drake cannot take a step with them."""
     model, why = draft.model, _why_not(draft.model)
     if not why:
         return
@@ -205,7 +205,7 @@ def _fix_massless(draft: _Draft) -> None:
 
 
 def _why_not(model: Model) -> str:
-    """What Drake says of a step from the model's own state; empty where it takes it."""
+    """Return Drake's error for a step from the model's default state, or "" if it succeeds."""
     try:
         advance(model.double, model.default_state, model.neutral_input(model.default_state))
     except SimulationError as error:
@@ -224,16 +224,16 @@ def _add_thrusters(draft: _Draft) -> None:
         raise ModelError(f"{draft.path}: nothing in it can be driven: {reason}")
 
 
-# Of a robot that stands: every shape is spheres, which a ground meets with derivatives, and only the ground is met.
+# Options for standing: all shapes are spheres, whose ground contact has derivatives; no other contact.
 ON_FEET: dict[str, Any] = {"base": "free", "meshes": "spheres", "contact_geometry": "corner_spheres"}
-# Drake's own values let light legs sink by millimetres, by how much depends on the step, and rise only in 0.2 s.
+# With Drake's defaults, light legs sink by millimetres, depending on the time step, and recover only in 0.2 s.
 GROUND: dict[str, Any] = {"ground": True, "contact": "ground", "near_rigid": 0.1, "relaxation_time": 0.02}
-STEPS_ON_FEET, MANY = (0.005, 0.01), 24  # [s], the second of robots of more velocities, each of whose steps costs more
-DRAWN = 16  # postures, to see which shapes always overlap
+STEPS_ON_FEET, MANY = (0.005, 0.01), 24  # [s], the second for robots with more velocities, whose steps are slower
+DRAWN = 16  # sampled postures, to find shapes that always overlap
 
 
 def _standing(read: _Draft, seed: int) -> Robot | Refusal:
-    """The robot on its feet on a ground; or why it does not stand."""
+    """Return the robot standing on a ground, or the reason why it cannot stand."""
     step = STEPS_ON_FEET[read.model.nv > MANY]
     random = np.random.default_rng(seed)
     try:
@@ -267,7 +267,7 @@ def _standing(read: _Draft, seed: int) -> Robot | Refusal:
 
 
 def _placed(draft: _Draft, random: np.random.Generator) -> Robot:
-    """The robot in the posture it starts in, and with the contact that its plan needs."""
+    """Return the robot in its start posture, with the contact that its plan needs."""
     model, repairs = draft.model, draft.repairs
     lower, upper = ranges(model)
     first = inside(model, lower, upper)
@@ -278,7 +278,7 @@ def _placed(draft: _Draft, random: np.random.Generator) -> Robot:
     if flies and shapes is not None:
         first = lifted(shapes, first)
     try:
-        if model.file_facts.held_points:  # others would open the loops
+        if model.file_facts.held_points:  # other postures would open the loops
             first = assembled(model, np.concatenate([first, np.zeros(model.nv)]))[: model.nq]
             posture = StartPosture(first, 0.0, 0.0, pairs_always([first], shapes))
         else:
@@ -305,14 +305,14 @@ def _placed(draft: _Draft, random: np.random.Generator) -> Robot:
 
 
 def _too_weak(model: Model, posture: StartPosture) -> tuple[str, ...]:
-    """The joints whose motors are too weak for the posture, and those that follow them."""
+    """Return the joints whose motors are too weak for the posture, and their followers."""
     over = np.flatnonzero(shares_to_hold(model, posture.q) > 1)
     moved = [actuator.joint().name() for actuator in actuators(model.plant)]
     return _with_followers(model, [moved[i] for i in model.inputs.actuator[over]])
 
 
 def _with_followers(model: Model, names: list[str]) -> tuple[str, ...]:
-    """The joints, and those that follow them."""
+    """Return the joints with their followers."""
     joint_names, mimics = list(names), () if model.coupling is None else model.coupling.mimics
     while more := [m.follower for m in mimics if m.leader in joint_names and m.follower not in joint_names]:
         joint_names += more
@@ -320,14 +320,14 @@ def _with_followers(model: Model, names: list[str]) -> tuple[str, ...]:
 
 
 def _few(names: Iterable[str]) -> str:
-    """The names with commas between, the first ones of many."""
+    """Join the names by commas, and shorten a long list."""
     every = list(names)
     more = f" and {len(every) - NAMED} more" if len(every) > NAMED + 1 else ""
     return ", ".join(every[:NAMED] if more else every) + more
 
 
 def drive(model: Model, q: Array) -> Array:
-    """(nv, nu) what each effort adds to the velocities in a step from posture q (nq,), as the step's equation says."""
+    """Return the velocity change (nv, nu) per effort in a step from posture q (nq,), from the step's equation."""
     set_state(model.double, np.concatenate([q, np.zeros(model.nv)]))
     h = model.time_step
     mass = model.double.mass_matrix() + h * np.diag(model.double.damping())
@@ -335,7 +335,7 @@ def drive(model: Model, q: Array) -> Array:
 
 
 def is_fully_driven(model: Model) -> bool:
-    """Whether the inputs can give any velocity, so that every smooth motion of the joints can be made."""
+    """Return whether the inputs can produce any velocity, so that every smooth joint motion is possible."""
     if model.nq != model.nv or model.nu < model.nv:
         return False
     size = np.linalg.svd(model.actuation, compute_uv=False)
@@ -345,10 +345,10 @@ def is_fully_driven(model: Model) -> bool:
 def start(
     shapes: Model | None, driven: Model | None, first: Array, lower: Array, upper: Array, random: np.random.Generator
 ) -> StartPosture:
-    """The posture `first` (nq,), or one that is better: where nothing overlaps, and which the motors of `driven` hold.
+    """Return the posture `first` (nq,) or a better one: without overlap, and within the motors' effort of `driven`.
 
-    It has room beside it where one of ATTEMPTS has, since searches go on from it in all directions.
-    `lower` and `upper` (nq,) are the ranges of all coordinates; those of a free body's pose are left alone.
+    If possible, it has free space in all directions, in which the searches continue.
+    `lower` and `upper` (nq,) are the ranges of all coordinates; poses of floating bodies do not change.
     """
     model = shapes or driven
     if model is None:
@@ -379,7 +379,7 @@ def start(
         if _badness(best) == 0:
             if has_room(best.q):
                 break
-            tight, best = tight or best, replace(best, overlap=np.inf)  # unless all others are worse
+            tight, best = tight or best, replace(best, overlap=np.inf)  # use it only if all others are worse
         if i < ATTEMPTS:
             fraction = (i + 1) / ATTEMPTS
             q = np.where(is_joint, first + fraction * (random.uniform(lower + margin, upper - margin) - first), first)
@@ -396,7 +396,7 @@ def _badness(candidate: StartPosture) -> float:
 
 
 def pairs_always(tried: list[Array], shapes: Model | None) -> frozenset[Pair]:
-    """The pairs of shapes that overlap in each of the postures (nq,)."""
+    """Return the pairs of shapes that overlap in all of the postures (nq,)."""
     if shapes is None:
         return frozenset()
     overlaps = [{pair for pair, depth in _overlaps(shapes, q).items() if depth > TOUCHING} for q in tried]
@@ -404,7 +404,7 @@ def pairs_always(tried: list[Array], shapes: Model | None) -> frozenset[Pair]:
 
 
 def deepest(shapes: Model, q: Array, besides: frozenset[Pair]) -> float:
-    """[m] the deepest overlap in posture q (nq,), that of the pairs `besides` apart."""
+    """Return the deepest overlap [m] in posture q (nq,), ignoring the pairs `besides`."""
     return max((depth for pair, depth in _overlaps(shapes, q).items() if pair not in besides), default=0.0)
 
 
@@ -414,39 +414,39 @@ def _overlaps(shapes: Model, q: Array) -> dict[Pair, float]:
 
 
 def share_to_hold(model: Model, q: Array) -> float:
-    """The share of its effort limits that a fully driven robot needs to hold posture q (nq,)."""
+    """Return the largest share of an effort limit that a fully driven robot needs to hold posture q (nq,)."""
     return float(np.max(shares_to_hold(model, q), initial=0.0))
 
 
 def shares_to_hold(model: Model, q: Array) -> Array:
-    """(nu,) the same of each input."""
+    """Return the share of each effort limit (nu,) that is needed to hold posture q (nq,)."""
     set_state(model.double, np.concatenate([q, np.zeros(model.nv)]))
     needed = model.double.inverse_dynamics(np.zeros(model.nv))
     return shares(model, np.linalg.lstsq(model.actuation, needed, rcond=None)[0])
 
 
 def shares(model: Model, efforts: Array) -> Array:
-    """(..., nu) of the effort limits, in efforts (..., nu); 0 where there is none."""
+    """Return efforts (..., nu) as shares of the effort limits, and 0 for inputs without a limit."""
     limits = model.effort_limits
     return np.asarray(np.abs(efforts) / np.where((limits > 0) & np.isfinite(limits), limits, np.inf))
 
 
 def ranges(model: Model) -> tuple[Array, Array]:
-    """(lower, upper) (nq,): the limits of each coordinate, or a range around 0 where it has none, or a wide one."""
+    """Return (lower, upper) (nq,): each coordinate's limits, or a range around 0 if it is unlimited or very wide."""
     lower = np.array([p.lower for p in model.contract.positions], dtype=float)
     upper = np.array([p.upper for p in model.contract.positions], dtype=float)
     reach = np.array([SHIFT if p.unit == "m" else TURN for p in model.contract.positions])
-    wide = upper - lower > WIDEST  # so is what has no limits
+    wide = upper - lower > WIDEST  # true also without limits
     low = np.where(wide, np.maximum(lower, -reach), lower)
     high = np.where(wide, np.minimum(upper, reach), upper)
-    beyond = low > high  # one limit alone, on the other side of 0
+    beyond = low > high  # a single limit on the other side of 0
     low = np.where(beyond & np.isfinite(upper), upper - 2 * reach, low)
     high = np.where(beyond & np.isfinite(lower), lower + 2 * reach, high)
     return low, high
 
 
 def of_joints(model: Model) -> NDArray[np.bool_]:
-    """(nq,) whether a coordinate is that of a joint, and no part of a free body's pose."""
+    """Return whether each coordinate (nq,) belongs to a joint and not to the pose of a floating body."""
     if model.nq == model.nv:
         return np.ones(model.nq, dtype=bool)
     mask = np.zeros(model.nq, dtype=bool)
@@ -457,7 +457,7 @@ def of_joints(model: Model) -> NDArray[np.bool_]:
 
 
 def inside(model: Model, lower: Array, upper: Array) -> Array:
-    """The file's posture; in the middle of a joint's limits where that is outside, and inside where it is at one."""
+    """Return the file's posture, with joints outside their limits at the middle, and joints at a limit moved inside."""
     q = model.default_state[: model.nq].copy()
     margin = INSIDE * (upper - lower)
     outside = (q < lower) | (q > upper)
@@ -466,10 +466,10 @@ def inside(model: Model, lower: Array, upper: Array) -> Array:
 
 
 def thrusters(model: Model) -> tuple[BodyForce, ...]:
-    """Six for each body that floats: two along each of its axes, on both sides of its centre of mass.
+    """Return six thrusters for each floating body: two along each axis, on both sides of its centre of mass.
 
-    Together they can push and turn it in any direction. Each is beside the centre of mass by the body's radius of
-    gyration.
+    Together they can produce any force and moment. The distance of each from the centre of mass is the body's radius
+    of gyration.
     """
     plant, forces = model.plant, list[BodyForce]()
     set_state(model.double, model.default_state)
@@ -493,7 +493,7 @@ def thrusters(model: Model) -> tuple[BodyForce, ...]:
 
 
 def lifted(shapes: Model, q: Array) -> Array:
-    """Posture q (nq,) with what floats as much higher as it takes to overlap with nothing; as it is if none helps."""
+    """Return posture q (nq,) with floating bodies lifted until nothing overlaps, or q itself if no lift helps."""
     for up in (0.0, *LIFTS):
         higher = q.copy()
         for i, (_, q_start, _) in enumerate(floating(shapes)):
@@ -504,6 +504,6 @@ def lifted(shapes: Model, q: Array) -> Array:
 
 
 def floating(model: Model) -> list[tuple[str, int, int]]:
-    """(name, where its quaternion and position begin in q, where its velocities begin in v) of what floats."""
+    """Return (name, start of the pose in q, start of the velocities in v) of each floating body."""
     free = [model.plant.get_body(index) for index in sorted(model.plant.GetFloatingBaseBodies())]
     return [(b.name(), int(b.floating_positions_start()), int(b.floating_velocities_start_in_v())) for b in free]
