@@ -1,1 +1,1 @@
-"""Iterative LQR with constraints, through contact too."""
+"""Iterative LQR with constraints, with or without contact."""

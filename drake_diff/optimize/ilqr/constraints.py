@@ -1,9 +1,9 @@
-"""A hard goal, waypoints, state bounds and other constraints as costs: the augmented Lagrangian.
+"""An augmented Lagrangian that turns goals, waypoints, state bounds and other constraints into costs.
 
-It is due to Hestenes, Powell and Rockafellar. An equality c = 0 with multiplier y costs y c + p c^2 / 2, an inequality
-c <= 0 costs (max(0, y + p c)^2 - y^2) / (2 p), where p is the penalty. After each minimization y becomes y + p c, or
-max(0, y + p c). Howell, Jackson and Manchester, "ALTRO", 2019, do the same with iLQR inside. Of the Hessian only
-p J'J of the rows that push is kept (Gauss-Newton), which no constraint can make indefinite.
+The method is due to Hestenes, Powell and Rockafellar. An equality c = 0 with multiplier y costs y c + p c^2 / 2, and an
+inequality c <= 0 costs (max(0, y + p c)^2 - y^2) / (2 p), where p is the penalty. After each minimization y becomes y +
+p c, or max(0, y + p c). Howell, Jackson and Manchester, "ALTRO", 2019, use it with iLQR. The Hessian is only p J'J of
+the active rows (Gauss-Newton), so that no constraint makes it indefinite.
 """
 
 from collections.abc import Callable
@@ -18,14 +18,14 @@ from drake_diff.optimize.program import UNSCALED, Scales
 
 FIRST_PENALTIES = (1.0, 1e6)  # the lowest and the highest
 LARGEST_PENALTY, GROWTH = 1e9, 10.0
-SMALLEST_SLOPE = 1e-8  # of a row: below it nothing says in what unit it is to be weighed
+SMALLEST_SLOPE = 1e-8  # slope of a row below which no scale is derived from it
 
 
 class PenalizedRows:
-    """Rows lower <= c <= upper, each weighed by its `scale`, with their multipliers and one penalty.
+    """Rows lower <= c <= upper with a `scale` for each row, their multipliers, and one penalty.
 
-    Multipliers are positive at an upper bound and negative at a lower one. All methods take what `values` takes: here
-    the values of the rows themselves, of the shape of `lower`.
+    Multipliers are positive at an upper bound and negative at a lower one. All methods take the arguments of `values`,
+    which in this class are the values of the rows, with the shape of `lower`.
     """
 
     def __init__(self, lower: Array, upper: Array, scale: Any = 1.0):
@@ -36,12 +36,12 @@ class PenalizedRows:
         self.is_equality = lower == upper
 
     def values(self, *given: Array) -> Array:
-        """c."""
+        """Return c."""
         return given[0]
 
     @property
     def forces(self) -> Array:
-        """The multipliers of the rows in their own units, whatever their scales are."""
+        """The multipliers in the rows' own units, without their scales."""
         return self.multipliers * self.scale
 
     @forces.setter
@@ -49,54 +49,54 @@ class PenalizedRows:
         self.multipliers = forces / self.scale
 
     def excess(self, *given: Array) -> Array:
-        """How far beyond a bound each row is, in its own unit."""
+        """Return how far each row lies beyond its bound, in the row's own unit."""
         values = self.values(*given)
         return np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0)
 
     def violation(self, *given: Array) -> float:
-        """The largest of these."""
+        """Return the largest `excess`."""
         return float(np.max(self.excess(*given), initial=0.0))
 
     def pushes(self, *given: Array) -> Array:
-        """y + p c of each bound that pushes, 0 elsewhere."""
+        """Return y + p c for each active bound, and 0 for the others."""
         above, below = self._sides(self.values(*given))
         return np.maximum(above, 0.0) + np.minimum(below, 0.0)
 
     def residual(self, *given: Array) -> float:
-        """The largest change of a multiplier by `update`, over the penalty: 0 at a KKT point."""
+        """Return the largest change of a multiplier in `update`, divided by the penalty. It is 0 at a KKT point."""
         return float(np.abs(self.pushes(*given) - self.multipliers).max(initial=0.0)) / self.penalty
 
     def unrest(self, *given: Array) -> float:
-        """How far the augmented cost is from being the same after an `update`."""
+        """Return how much an `update` of the multipliers would change the augmented cost."""
         return float(np.sum((self.pushes(*given) - self.multipliers) ** 2)) / (2 * self.penalty)
 
     def value(self, *given: Array) -> float:
-        """What the rows add to the cost."""
+        """Return the rows' part of the augmented cost."""
         return float(np.sum(self.pushes(*given) ** 2 - self.multipliers**2)) / (2 * self.penalty)
 
     def expand(self, *given: Array) -> tuple[Array, Array]:
-        """The gradient of `value` by each row, and the curvature of those that push, as equalities always do."""
+        """Return the gradient of `value` with respect to each row, and the curvature of equalities and active rows."""
         above, below = self._sides(self.values(*given))
         on = (above > 0) | (below < 0) | self.is_equality
         pushes = np.maximum(above, 0.0) + np.minimum(below, 0.0)
         return self.scale * pushes, np.where(on, self.penalty * self.scale**2, 0.0)
 
     def update(self, *given: Array) -> None:
-        """Take over the multipliers that the minimum of the augmented cost tells."""
+        """Set the multipliers to the estimate at the minimum of the augmented cost."""
         self.multipliers = self.pushes(*given)
 
     def _sides(self, values: Array) -> tuple[Array, Array]:
-        """y + p c of the upper bounds, which push where it is positive, and of the lower ones."""
+        """Return y + p c for the upper bounds, which are active where it is positive, and for the lower bounds."""
         weight = self.penalty * self.scale
         return self.multipliers + weight * (values - self.upper), self.multipliers + weight * (values - self.lower)
 
 
 class AugmentedLagrangian(PenalizedRows):
-    """What must hold of a motion xs (N+1, nx), us (N, nu), which all methods take.
+    """The constraints on a motion xs (N+1, nx), us (N, nu). All methods take xs and us.
 
-    First a row for every state coordinate at every knot, in its own unit (the bounds of x_0 are not here), then those
-    of the problem's constraints. These are divided by the largest slope |dc / d(x, u)| that they were seen to have at
-    any of their knots, so that newtons beside metres weigh as the metres do that change them. Where states, inputs and
+    The first rows are the state coordinates at every knot, in their own units, without the bounds of x_0. The rows of
+    the problem's constraints follow. These are divided by the largest slope |dc / d(x, u)| that they have had at any of
+    their knots, so that forces in newtons and positions in metres have comparable weights. Where states, inputs and
     cost have `scales`, a violation has no unit.
     """
 
@@ -111,13 +111,13 @@ class AugmentedLagrangian(PenalizedRows):
             np.concatenate([upper.ravel(), *(g.upper for g in self.groups)]),
         )
         self.scale[: lower.size] = np.tile(1 / self.spans[: problem.nx], len(lower))
-        self.slices = slices_of([lower.size, *(g.size for g in self.groups)])[1:]  # where the rows of each group are
+        self.slices = slices_of([lower.size, *(g.size for g in self.groups)])[1:]  # the slice of each group's rows
         self.any = bool(np.any(np.isfinite(self.lower) | np.isfinite(self.upper)))
 
     def start(self, xs: Array, us: Array, cost: float, gaps: float) -> None:
-        """Choose scales, and a first penalty that makes the guess as wrong as it is expensive: a good one is not left.
+        """Choose scales, and a penalty that makes the violation of the guess cost as much as its objective.
 
-        `gaps` is the sum of the squares of what else is wrong with the guess.
+        `gaps` is the sum of the squares of the guess's other violations.
         """
         self._choose_scales(xs, us)
         wrong = (gaps + float(np.sum((self.scale * self.excess(xs, us)) ** 2))) / 2
@@ -135,9 +135,9 @@ class AugmentedLagrangian(PenalizedRows):
         return np.concatenate([given[0].ravel(), *(group.values(*given) for group in self.groups)])
 
     def differentiate(self, xs: Array, us: Array) -> tuple[Array, Array]:
-        """(gradients (N+1, nx + nu), Hessians (N+1, nx + nu, nx + nu)) of `value` by each [x_k; u_k], as by `expand`.
+        """Return gradients (N+1, nx + nu) and Hessians (N+1, nx + nu, nx + nu) of `value` with respect to [x_k; u_k].
 
-        Raises GradientError if the derivative of a constraint is lost or not finite.
+        The Hessians are those of `expand`. Raises GradientError if a constraint's derivative is lost or not finite.
         """
         slopes, stiffness = self.expand(xs, us)
         (count, nx), n = xs.shape, xs.shape[1] + us.shape[1]
@@ -154,7 +154,7 @@ class AugmentedLagrangian(PenalizedRows):
         return gradients, hessians
 
     def update(self, *given: Array) -> None:
-        """Take over the multipliers, and look at the scales."""
+        """Update the multipliers and the scales."""
         forces = self.pushes(*given) * self.scale
         self._choose_scales(*given)
         self.forces = forces
@@ -165,7 +165,7 @@ class AugmentedLagrangian(PenalizedRows):
 
 
 class _Rows:
-    """One constraint at all its knots: (knots, its own rows) flattened; the last motion's numbers are kept."""
+    """One constraint at all its knots, flattened from (knots, rows). It caches the values for the last motion."""
 
     def __init__(self, problem: Problem, constraint: Constraint):
         self.constraint = constraint
@@ -177,15 +177,15 @@ class _Rows:
         self._kept: dict[str, tuple[bytes, Array]] = {}
 
     def values(self, xs: Array, us: Array) -> Array:
-        """(size,)"""
+        """Return the values (size,)."""
         return self._cached("values", xs, us, self.constraint.along).ravel()
 
     def jacobians(self, xs: Array, us: Array) -> Array:
-        """(knots, rows, nx + nu)"""
+        """Return the Jacobians (knots, rows, nx + nu)."""
         return self._cached("jacobians", xs, us, self.constraint.slopes)
 
     def scale(self, xs: Array, us: Array, spans: Array) -> Array:
-        """(size,): one over the largest slope so far of each row by (x, u) / `spans` (nx + nu,), 1 if it has none."""
+        """Return (size,) 1 / each row's largest slope so far with respect to (x, u) / `spans` (nx + nu,), or 1 if 0."""
         slopes = np.linalg.norm(self.jacobians(xs, us) * spans, axis=2).max(axis=0)
         self._steepest = np.maximum(self._steepest, slopes)
         steep = self._steepest > SMALLEST_SLOPE

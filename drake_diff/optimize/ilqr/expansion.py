@@ -1,7 +1,7 @@
-"""The linear-quadratic problem around a motion: Drake's step Jacobians, cost's derivatives and dynamics' curvature.
+"""The linear-quadratic problem around a motion: step Jacobians, derivatives of the cost, curvature of the dynamics.
 
-All in Drake's own coordinates, quaternions included: the discrete step lets a quaternion's norm grow, so that the norm
-is a state that inputs move, and on the rotations' tangent space the gradient would be wrong by what is left out.
+All derivatives are in Drake's own coordinates, quaternions included. The discrete step lets a quaternion's norm grow,
+so the norm is a state that depends on the inputs, and a gradient on the rotations' tangent space would omit this.
 """
 
 from collections.abc import Callable
@@ -23,15 +23,15 @@ from drake_diff.optimize.problem.constraint import Bounds
 from drake_diff.optimize.problem.cost import differentiate_final_cost, final_cost_hessian
 from drake_diff.optimize.problem.problem import Problem
 
-# Of a state, or of 1: Jacobians are known to 1e-12, so that this leaves 1e-6 of their derivative.
+# Relative to max(1, |state|). Jacobians have errors of 1e-12, so that their differences have errors of 1e-6.
 DIFFERENCE_STEP = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """xs (N+1, nx) and us (N, nu), a rollout where the gaps (N, nx), step(x_k, u_k) - x_(k+1), are zero.
+    """States xs (N+1, nx) and inputs us (N, nu), a rollout if the gaps (N, nx), step(x_k, u_k) - x_(k+1), are zero.
 
-    The steps are of the problem's `design` at the coordinates c (nc,).
+    The steps are those of the problem's `design` at the coordinates c (nc,).
     """
 
     xs: Array
@@ -41,17 +41,17 @@ class Motion:
 
     @classmethod
     def with_ends(cls, xs: Array, us: Array, ends: Array) -> "Motion":
-        """That of which the steps lead to `ends` (N, nx)."""
+        """Return the motion whose steps lead to `ends` (N, nx)."""
         return cls(xs, us, ends - xs[1:])
 
     @property
     def point(self) -> tuple[Array, Array]:
-        """(xs, us)."""
+        """The pair (xs, us)."""
         return self.xs, self.us
 
     @property
     def ends(self) -> Array:
-        """(N, nx): where the steps lead."""
+        """The ends of the steps (N, nx)."""
         return self.xs[1:] + self.gaps
 
     @property
@@ -60,14 +60,14 @@ class Motion:
 
     @property
     def distance(self) -> float:
-        """The sum of all |gaps|."""
+        """The sum of the absolute values of all gaps."""
         return float(np.abs(self.gaps).sum())
 
 
 def expand_costs(
     problem: Problem, motion: Motion, constraints: AugmentedLagrangian, time_step: float | None = None
 ) -> tuple[Array, Array]:
-    """Gradients (N+1, nx + nu) and Hessians (N+1, nx + nu, nx + nu) of the cost at each knot, with its constraints'."""
+    """Return the gradients (N+1, nx + nu) and Hessians (N+1, nx + nu, nx + nu) of the augmented cost at each knot."""
     from drake_diff.optimize.knots import costs_of  # loads CasADi
 
     gradients, hessians = costs_of(problem, *motion.point, time_step).expand(*motion.point)
@@ -78,16 +78,16 @@ def expand_costs(
 
 
 def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: AugmentedLagrangian) -> LinearQuadratic:
-    """`problem` around `motion`, the constraints being part of its cost.
+    """Expand `problem` around `motion`, with its constraints as part of the cost.
 
-    What may change beside states and inputs, c, is constant and part of the state: [x, c].
+    The coordinates c of the design do not change along the motion and are appended to the state: [x, c].
     """
     xs, us, nx, design = motion.xs, motion.us, problem.nx, problem.design
     h = design.time_step(design.values(motion.c))
     gradients, hessians = expand_costs(problem, motion, constraints, h)
     bounds, free = problem.bounds, problem.initial_state_mask
     lower, upper = bounds.u_lower - us, bounds.u_upper - us
-    if not problem.optimizes_controls:  # they stay: any curvature will do
+    if not problem.optimizes_controls:  # the inputs are fixed, so that any positive curvature will do
         lower, upper = np.zeros_like(us), np.zeros_like(us)
         gradients[:, nx:], hessians[:, nx:], hessians[:, :, nx:] = 0.0, 0.0, 0.0
         hessians[:-1, nx:, nx:] = np.eye(us.shape[1])
@@ -105,9 +105,9 @@ def expand(problem: Problem, motion: Motion, jacobians: Array, constraints: Augm
 
 
 def _with_design(problem: Problem, motion: Motion, model: LinearQuadratic, h: float) -> LinearQuadratic:
-    """The same with c as a part of the state; F has its columns already: (N, nx, nx + nc + nu)."""
+    """Append c to the state. F has the columns of c already: (N, nx, nx + nc + nu)."""
     design, c, (count, nx), nu = problem.design, motion.c, motion.gaps.shape, motion.us.shape[1]
-    nc, columns = len(c), np.r_[:nx, nx + len(c) : nx + len(c) + nu]  # where x and u are in [x, c, u]
+    nc, columns = len(c), np.r_[:nx, nx + len(c) : nx + len(c) + nu]  # columns of x and u in [x, c, u]
     F, gaps = np.zeros((count, nx + nc, nx + nc + nu)), np.zeros((count, nx + nc))
     F[:, :nx], gaps[:, :nx] = model.F, motion.gaps
     F[:, nx:, nx : nx + nc] = np.eye(nc)
@@ -146,10 +146,10 @@ def _with_design(problem: Problem, motion: Motion, model: LinearQuadratic, h: fl
 
 
 def jacobians_along(problem: Problem, motion: Motion) -> Array:
-    """(N, nx, nx + nc + nu): [A_k, C_k, B_k]; raises GradientError or SimulationError if one, or a step, is refused.
+    """Return [A_k, C_k, B_k] (N, nx, nx + nc + nu), or raise GradientError or SimulationError if a step is refused.
 
-    Those of an input on a bound are from inside it: a bound is often the actuator's limit, at which Drake's derivative
-    is 0, as beyond it, while a minimization needs to know what leaving the bound would do.
+    Derivatives with respect to an input on a bound are taken inside the bound. A bound is often the actuator's limit,
+    where Drake's derivative is 0, as it is beyond the limit, but a minimization needs the effect of leaving the bound.
     """
     design, us = problem.design, off_bounds(problem.bounds, motion.us)
     vector = design.at(motion.c)
@@ -161,22 +161,22 @@ def jacobians_along(problem: Problem, motion: Motion) -> Array:
 
 
 def off_bounds(bounds: Bounds, us: Array) -> Array:
-    """`us` with those on a bound moved inside it by rounding."""
+    """Return `us` with inputs on a bound moved to the next floating-point number inside it."""
     lower, upper = bounds.u_lower, bounds.u_upper
     return np.where(us == upper, np.nextafter(us, lower), np.where(us == lower, np.nextafter(us, upper), us))
 
 
 def curvature_along(problem: Problem, motion: Motion, v: Array) -> tuple[Array, NDArray[np.bool_]] | None:
-    """(K, nx + nu, nx + nu) sum_i v_i d2 step_i / d(x, u)2 for v (N, nx), and which K of the N steps (N,) have it.
+    """Return sum_i v_i d2 step_i / d(x, u)2 (K, nx + nu, nx + nu) for v (N, nx), and a mask (N,) of those K steps.
 
-    Those at a joint limit have none: what their Jacobians and those of free steps differ by is no second derivative. By
-    the second derivatives of inverse dynamics, or else by differences of the Jacobians along every state: in its inputs
-    alone a smooth step is linear. None where anything touches, a coupler acts, no Jacobians are to be had in one call,
-    or the motion is in continuous time. Raises what `linearize` raises.
+    Steps at a joint limit are omitted, because the difference between their Jacobians and those of free steps is no
+    second derivative. The curvature comes from the second derivatives of inverse dynamics, or from differences of the
+    Jacobians along every state, since a smooth step is linear in its inputs. Returns None if bodies touch, a coupler
+    acts, no analytic Jacobians exist, or the motion is in continuous time. Raises the errors of `linearize`.
     """
     model, xs, us = problem.model, motion.xs[:-1], off_bounds(problem.bounds, motion.us)
     if problem.design.vector.parameters or problem.motion != STEPS:
-        return None  # what is learned has the parameters in it
+        return None  # only a learned curvature includes parameters
     analytic = analytic_of(model)
     if isinstance(analytic, Refusal):
         return None
@@ -186,13 +186,13 @@ def curvature_along(problem: Problem, motion: Motion, v: Array) -> tuple[Array, 
     known = analytic(steps)[1]
     xs, us, v = xs[known], us[known], v[known]
     curvature = analytic.curvature(xs, us, v)
-    if curvature is None:  # no step is taken that might not be smooth
+    if curvature is None:  # this evaluates no step that might not be smooth
         curvature = _differences(lambda xs: analytic.differentiate(xs, us)[0], xs, v)
     return curvature, known
 
 
 def _differences(jacobians: Callable[[Array], Array], xs: Array, v: Array) -> Array:
-    """The same of `jacobians` (N, nx, nx + nu) of the states xs (N, nx)."""
+    """Compute the curvature from differences of `jacobians` (N, nx, nx + nu) at the states xs (N, nx)."""
     here, nx = jacobians(xs), xs.shape[1]
     curvature = np.zeros((len(xs), here.shape[2], here.shape[2]))
     for j in range(nx):

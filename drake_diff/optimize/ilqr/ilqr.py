@@ -1,9 +1,9 @@
-"""Multiple-shooting iLQR on Drake's own steps: a Riccati sweep back, a rollout with feedback forward.
+"""Multiple-shooting iLQR on Drake's own steps: a backward Riccati sweep and a forward rollout with feedback.
 
-Li and Todorov, "Iterative linear quadratic regulator design for nonlinear biological movement systems", 2004, and
-the feasibility-driven form of Mastalli et al., "Crocoddyl", 2020: the guess need not be a rollout, and a step of size a
-leaves 1 - a of each gap between step(x_k, u_k) and x_(k+1). What must hold is an augmented Lagrangian (`constraints`).
-The dynamics' second derivatives, which iLQR leaves out, are added where a smooth motion converges slowly (`expansion`).
+See Li and Todorov, "Iterative linear quadratic regulator design for nonlinear biological movement systems", 2004, and
+the feasibility-driven form of Mastalli et al., "Crocoddyl", 2020. The guess need not be a rollout, and a step of size a
+leaves 1 - a of each gap between step(x_k, u_k) and x_(k+1). Constraints are in an augmented Lagrangian (`constraints`).
+Second derivatives of the dynamics, which iLQR omits, are added where a smooth motion converges slowly.
 """
 
 import math
@@ -53,28 +53,28 @@ from drake_diff.optimize.program import (
 
 @dataclass(frozen=True)
 class IlqrOptions:
-    """What tunes the search."""
+    """Tuning parameters of the search."""
 
-    # Regularization, of the inputs' own curvature: the least at all, the first that is tried, the last, and the factor
-    # between two.
+    # Regularization relative to the inputs' own curvature: the smallest nonzero value, the first value, the largest
+    # value, and the factor between two values.
     smallest_regularization: float = 1e-4
     first_regularization: float = 1e-3
     largest_regularization: float = 1e8
     harder: float = 8.0
     sufficient_decrease: float = 1e-4
-    trials: int = 5  # sizes along one policy; then a shorter policy is asked for
-    longer: float = 2.0  # times a step that had been cut back: the first size that is tried after it
-    most_cut: float = 0.1  # of a size that was too long: the parabola's minimum is kept between this
-    least_cut: float = 0.5  # and this
-    long: float = 1 / 2  # from a step that long on less regularization will do
-    tiny: float = 1 / 100  # below that it takes more
-    short: float = 1 / 32  # several steps cut back to that,
-    little: float = 1e-2  # each of which gains so little of the cost: it crawls
-    rounding: float = 1e-13  # of the cost: a promise below this is lost in the rounding of the cost's sum
-    left_over: float = 3e-2  # of what the next update of the multipliers changes: what a minimization may leave
-    beside: float = 1e-14  # of a bound: an input that is no further from it is on it
-    slow: float = 1 / 2  # of what a step gained: where the next one gains more, the curvature is not the right one
-    same_motion: float = 1e-9  # of the largest state: what rounding of two forms of a step may come to under feedback
+    trials: int = 5  # step sizes along one policy, before the regularization is increased
+    longer: float = 2.0  # first size after a step that was cut back, as a multiple of that step
+    most_cut: float = 0.1  # the parabola's minimum is limited to at least this part of a size that was too long
+    least_cut: float = 0.5  # and to at most this part
+    long: float = 1 / 2  # the regularization decreases after a step of at least this size
+    tiny: float = 1 / 100  # the regularization increases after a step below this size
+    short: float = 1 / 32  # a step that was cut back to less than this is short
+    little: float = 1e-2  # a short step that gains less than this part of the cost counts towards a stall
+    rounding: float = 1e-13  # of the cost: predicted decreases below this are lost in the rounding of the cost's sum
+    left_over: float = 3e-2  # of the cost change by the next multiplier update: decrease that a minimization may leave
+    beside: float = 1e-14  # relative to a bound: an input within this distance is on the bound
+    slow: float = 1 / 2  # of the previous step's gain: above it, second derivatives of the dynamics are added
+    same_motion: float = 1e-9  # of the largest state: the rounding difference of two forms of a step under feedback
 
 
 OPTIONS = IlqrOptions()
@@ -82,13 +82,13 @@ _Solve = Callable[[LinearQuadratic, float], AffinePolicy | None]
 
 
 def check_problem(problem: Problem) -> None:
-    """Refuse what iLQR here cannot keep, naming what can."""
+    """Raise InputError for parts of the problem that iLQR does not support, and name a method that does."""
     for subject in _unkept(problem):
         raise InputError(subject, got="given", expected='method="shooting", as method="ilqr" does not support it')
 
 
 def takes(problem: Problem) -> bool:
-    """Whether iLQR can keep all that `problem` asks for."""
+    """Return whether iLQR supports all parts of `problem`."""
     return not list(_unkept(problem))
 
 
@@ -111,13 +111,13 @@ def solve_ilqr(
     values: Array | None = None,
     multipliers: Multipliers | None = None,
 ) -> tuple[NlpResult, Array, Array]:
-    """Solve `problem` from xs (N+1, nx), us (N, nu), a rollout or not; gives (result, xs, us), result.z being us flat.
+    """Solve `problem` from a guess xs (N+1, nx), us (N, nu). Return (result, xs, us), where result.z is us flattened.
 
-    After `patience` short steps in a row that gain little, with no better between them, the search ends as inaccurate:
-    it crawls along a jump. `least_penalty` weighs constraints from the start. The search starts from the
-    parameters `values` (np,), by default those of the problem's `design`, and from `multipliers`, those of a similar
-    search. A motion on the way that cannot be stepped or differentiated is a step that is too long, which the message
-    counts; raises GradientError or SimulationError if the guess is such a motion.
+    The guess need not be a rollout. After `patience` successive short steps that gain little, the search ends as
+    inaccurate, because it is stalled at a jump of the cost. `least_penalty` is a lower bound on the first penalty. The
+    search starts from the parameters `values` (np,), by default those of `design`, and from `multipliers` of a similar
+    search. A trial motion that cannot be simulated or differentiated is a step that is too long, and the message counts
+    these. Raises GradientError or SimulationError if the guess is such a motion.
     """
     search = _Search(problem, xs, us, limits, report, patience, values)
     search.constraints.penalty = max(search.constraints.penalty, least_penalty * search.constraints.unit)
@@ -133,7 +133,7 @@ def solve_ilqr(
 
 
 def _promise_at_most(solve: _Solve, models: tuple[LinearQuadratic, ...], limit: float) -> bool:
-    """Whether no model, regularized as little as it allows, promises more than `limit`, and one of them that much."""
+    """Return whether a model has a policy and all least-regularized policies predict a decrease of at most `limit`."""
     promises = False
     for model in models:
         policy = solve(model, 0.0) or solve(model, ROUNDING_OF_CURVATURE)
@@ -144,7 +144,7 @@ def _promise_at_most(solve: _Solve, models: tuple[LinearQuadratic, ...], limit: 
 
 
 def _smooth_roll(problem: Problem) -> SmoothRoll | None:
-    """What motions of the problem are tried by; None where that is Drake's step itself."""
+    """Return the compiled step for trial motions, or None if trial motions use Drake's own step."""
     if not problem.has_model or problem.motion != STEPS or problem.design.vector.parameters or problem.design.count:
         return None
     if not problem.optimizes_controls:
@@ -170,24 +170,24 @@ class _Search:
         begin = self.design.start if values is None else self.design.of_values(values)
         self.motion = self._take_in(xs, us, np.clip(begin, *self.design.limits))
         self.guess, self.tried_by = self.motion, _smooth_roll(problem)
-        self.policy: AffinePolicy | None = None  # that of the last step
+        self.policy: AffinePolicy | None = None  # of the last step
         self.cost = self._objective(self.motion)
         self.jacobians: Array | None = jacobians_along(problem, self.motion)
         self.constraints = AugmentedLagrangian(problem, self._scales(self.jacobians))
         self.constraints.start(*self.motion.point, self.cost, float(np.sum(self._gaps**2)))
         self.gap_weight = 0.0
-        self.regularization, self.ahead = 0.0, 1.0  # how far is tried first, as a part of a step not regularized
-        self.crawled = 0  # short steps that gained little, since the last better one
-        self.gains = math.inf, math.inf  # of the merit, by the last two steps of this minimization
+        self.regularization, self.ahead = 0.0, 1.0  # the first trial size, relative to a step without regularization
+        self.crawled = 0  # short steps with little gain since the last better step
+        self.gains = math.inf, math.inf  # decreases of the merit in the last two steps of this minimization
         self.stalled = False
-        self.refusals, self.refusal = 0, ""  # trial motions that could not be differentiated, and why the last
+        self.refusals, self.refusal = 0, ""  # rejected trial motions without derivatives, and the last reason
         self.rows = [Iteration(0, self.cost, self._infeasibility(), math.nan, math.nan)]
 
     def _scales(self, jacobians: Array) -> Scales:
-        """Those of the problem by the guess, and by the `jacobians` (N, nx, nx + nc + nu) along it.
+        """Return scales from the problem, the guess, and the `jacobians` (N, nx, nx + nc + nu) along the guess.
 
-        None in contact or with closed loops, whose stiffness says nothing of how far states go; that of a limit is met
-        at few knots.
+        Models with contact or closed loops are not scaled, because their stiffness says nothing about the range of the
+        states. Joint limits act at few knots and do not matter.
         """
         from drake_diff.optimize.knots import costs_of  # loads CasADi
 
@@ -214,9 +214,9 @@ class _Search:
         return f"; {count} trial motion{'s' * (count > 1)} backed off from: {self.refusal}" if count else ""
 
     def run(self, interrupted: threading.Event) -> Outcome:
-        """Search; where motions are tried by the compiled form of the step, what is found is rolled out by Drake's own.
+        """Run the search. If it used the compiled step for trials, roll out the result with Drake's own step.
 
-        Where that leads elsewhere, the search goes on from there with Drake's own step alone.
+        If the two motions differ, continue the search with Drake's own step alone.
         """
         self._report()
         outcome = self._stoppable(interrupted)
@@ -238,7 +238,7 @@ class _Search:
         return self._stoppable(interrupted)
 
     def _stoppable(self, interrupted: threading.Event) -> Outcome:
-        """Search; what ends it in the middle of a step leaves what was found before that step."""
+        """Run the search. If it is stopped within a step, keep the motion before that step."""
         try:
             with until_set(interrupted):
                 return self._search(interrupted)
@@ -246,7 +246,7 @@ class _Search:
             return Outcome.INTERRUPTED if interrupted.is_set() else Outcome.TIME_LIMIT
 
     def _search(self, interrupted: threading.Event) -> Outcome:
-        """Minimize once; if there are constraints, again and again for better multipliers."""
+        """Minimize once without constraints, or repeatedly with updated multipliers if there are constraints."""
         final = not self.constraints.any
         while True:
             outcome = self._minimize(final, interrupted)
@@ -266,13 +266,13 @@ class _Search:
                 self.constraints.penalty *= GROWTH
 
     def _minimize(self, final: bool, interrupted: threading.Event) -> Outcome:
-        """Take steps until little is left to gain: rounding if `final`, else a part of what the multipliers would."""
+        """Take steps until the possible decrease is rounding (`final`) or is small against an update of multipliers."""
         while True:
             model = self._expand()
             outcome = self._step(model, final)
             if outcome is not None:
                 return outcome
-            if self.crawled >= self.patience:  # along a jump
+            if self.crawled >= self.patience:  # stalled at a jump
                 self.stalled = True
                 return Outcome.INACCURATE
             if interrupted.is_set():
@@ -286,9 +286,9 @@ class _Search:
         return expand(self.problem, self.motion, self.jacobians, self.constraints)
 
     def _curved(self, model: LinearQuadratic) -> tuple[LinearQuadratic, ...]:
-        """The model with the dynamics' second derivatives, where a rollout converges slowly without and has them."""
+        """Return the model with second derivatives of the dynamics if they exist and a rollout converges slowly."""
         if not self.motion.is_rollout or self.gains[1] <= OPTIONS.slow * self.gains[0]:
-            return ()  # steps with gaps are short for these
+            return ()  # steps with gaps are short because of the gaps
         estimate = curvature_along(self.problem, self.motion, model.multipliers())
         if estimate is None:
             return ()
@@ -298,14 +298,14 @@ class _Search:
         return (replace(model, hessians=hessians),)
 
     def _step(self, model: LinearQuadratic, final: bool) -> Outcome | None:
-        """Take one step that lowers the merit; an outcome if there is none left to take."""
+        """Take one step that lowers the merit, or return an outcome if there is no such step."""
         merit = self._merit(self.motion, self.cost)
         scale = min(1.0, self.constraints.unit) + abs(merit)
         left_over = self.limits.tolerance**2 * scale
         if not final:
             left_over = max(left_over, OPTIONS.left_over * self.constraints.unrest(*self.motion.point))
         models = (*self._curved(model), model)
-        solve = cache(solve_riccati)  # no policy is sought twice
+        solve = cache(solve_riccati)  # computes each policy once
 
         def is_reached(limit: float) -> bool:
             return self.motion.is_rollout and _promise_at_most(solve, models, limit)
@@ -316,15 +316,15 @@ class _Search:
             return Outcome.ITERATION_LIMIT
         refusals = self.refusals
         while self.regularization <= OPTIONS.largest_regularization:
-            with np.errstate(all="ignore"):  # a policy that leads to infinity promises nothing
+            with np.errstate(all="ignore"):  # a policy that leads to infinity predicts no decrease
                 policies = (solve(candidate, self.regularization) for candidate in models)
                 policy = next((p for p in policies if p is not None and p.expected >= 0), None)
             if policy is not None and self._search_along(model, policy):
                 return None
             if is_reached(OPTIONS.rounding * scale):
-                return Outcome.SOLVED  # what is left to gain is less than the cost's rounding
+                return Outcome.SOLVED  # the possible decrease is below the cost's rounding
             if self.motion.is_rollout and policy is not None and policy.expected <= OPTIONS.rounding * scale:
-                break  # no step that can be told from none: the cost has a kink or a jump here, as contact makes them
+                break  # no step changes the cost beyond rounding: it has a kink or a jump, as from contact
             self.regularization = self._tightened()
         self.regularization = 0.0
         return Outcome.NO_GRADIENT if self.refusals > refusals else Outcome.INACCURATE
@@ -333,10 +333,10 @@ class _Search:
         return max(OPTIONS.harder * self.regularization, OPTIONS.first_regularization)
 
     def _search_along(self, model: LinearQuadratic, policy: AffinePolicy) -> bool:
-        """Take a step along `policy` that lowers the merit enough, if a few sizes find one.
+        """Return whether one of a few step sizes along `policy` lowers the merit enough, and take that step.
 
-        Tried first is the full one, or twice the last step where that had to be cut back; where a size is too long,
-        next is where the parabola through the slope and what was found has its minimum.
+        The first size is 1, or twice the last step if that was cut back. After a size that is too long, the next size
+        is at the minimum of the parabola through the slope and the merit found.
         """
         slope, distance = policy.slope, self.motion.distance
         if distance:
@@ -350,7 +350,7 @@ class _Search:
                 self.ahead = OPTIONS.longer * size / (1 + self.regularization) if trial else 1.0
                 crawls = size < OPTIONS.short and self.gains[1] < OPTIONS.little * abs(merit)
                 self.crawled = self.crawled + (trial > 0) if crawls else 0
-                is_smooth = math.isinf(self.patience)  # else the model may reach too far again: contact jumps
+                is_smooth = math.isinf(self.patience)  # otherwise contact jumps, and the model may be wrong again
                 if is_smooth or size >= OPTIONS.long:
                     relaxed = self.regularization / OPTIONS.harder
                     self.regularization = relaxed if relaxed > OPTIONS.smallest_regularization else 0.0
@@ -358,18 +358,18 @@ class _Search:
                     self.regularization = self._tightened()
                 return True
             excess = trial_merit - merit - slope * size
-            least = -slope * size**2 / (2 * excess) if excess > 0 else 0.0  # 0 where what was found is infinite
+            least = -slope * size**2 / (2 * excess) if excess > 0 else 0.0  # 0 for an infinite merit
             size = min(max(least, OPTIONS.most_cut * size), OPTIONS.least_cut * size)
         self.ahead = 1.0  # the next policy is shorter itself
         return False
 
     def _try(self, policy: AffinePolicy, size: float, merit: float, slope: float) -> float | None:
-        """None if the step was taken, as it lowers `merit` enough; else the merit there, infinite if it has none."""
+        """Take the step and return None if it lowers `merit` enough. Otherwise return the trial merit, or infinity."""
         try:
             motion = self._roll(policy, size)
         except SimulationError:
             return math.inf
-        with np.errstate(all="ignore"):  # a merit that is not finite is no decrease
+        with np.errstate(all="ignore"):  # a merit that is not finite is not accepted
             cost = self._objective(motion)
             trial_merit = self._merit(motion, cost)
         if not trial_merit <= merit + OPTIONS.sufficient_decrease * size * slope:
@@ -390,13 +390,13 @@ class _Search:
             self.report.row(self.rows[-1], self._iterates)
 
     def _iterates(self) -> tuple[Iterate, ...]:
-        """The motion, for callbacks."""
+        """Return the current motion for callbacks."""
         vector, xs, us = self.design.at(self.motion.c), frozen(self.motion.xs), frozen(self.motion.us)
         times = frozen(self.design.time_step(vector.values) * np.arange(len(xs)))
         return (Iterate(self.problem, times, xs, us, vector, by_steps=True),)
 
     def _roll(self, policy: AffinePolicy, size: float) -> Motion:
-        """Step from x_0 with feedback, each gap shrunk to 1 - `size` of itself."""
+        """Simulate from x_0 with feedback, where each gap shrinks to 1 - `size` times itself."""
         old, nx = self.motion, self.motion.xs.shape[1]
         xs, us = np.empty_like(old.xs), np.empty_like(old.us)
         gaps = (1 - size) * old.gaps
@@ -408,7 +408,7 @@ class _Search:
         if self.tried_by is not None:
             bounds = *self.inner, self.problem.bounds.u_lower, self.problem.bounds.u_upper
             rollout = self.tried_by(xs[0], old.xs, gaps, wanted, policy.feedback, bounds)
-            if rollout is not None:  # else a joint is at its limit, or something is not finite: Drake's step says it
+            if rollout is not None:  # None at a joint limit or if not finite: Drake's step reports it
                 return Motion(*rollout, gaps, c)
         with self.problem.intervals(self.design.at(c)) as intervals:
             for k, feedback in enumerate(policy.feedback[:, :, :nx]):
@@ -422,7 +422,7 @@ class _Search:
         return cost + self.problem.cost_of_parameters(self.design.own(values))
 
     def _take_in(self, xs: Array, us: Array, c: Array) -> Motion:
-        """The guess, its inputs taken inside their bounds and its first state the problem's, and its gaps."""
+        """Return the guess with inputs within bounds, the problem's initial state, and its gaps."""
         free = self.problem.initial_state_mask
         xs, us = np.array(xs), self._inside(us if self.problem.optimizes_controls else np.array(self.problem.us))
         xs[0] = self._inside_start(np.where(free, xs[0], self.problem.x0))
@@ -432,13 +432,13 @@ class _Search:
             for k, u in enumerate(us):
                 x_next = intervals.end(xs[k], u)
                 for quaternion in (slice(start, start + 4) for start in quaternions):
-                    if x_next[quaternion] @ xs[k + 1, quaternion] < 0:  # the same rotation, further off
+                    if x_next[quaternion] @ xs[k + 1, quaternion] < 0:  # the same rotation with the opposite sign
                         xs[k + 1, quaternion] *= -1
                 gaps[k] = x_next - xs[k + 1]
         return Motion(xs, us, gaps, c)
 
     def _inside(self, us: Array) -> Array:
-        """`us` (..., nu) within its bounds, and on a bound where rounding alone parts it from one; given ones stay."""
+        """Return `us` (..., nu) within bounds and snapped to a bound within rounding. Given inputs are unchanged."""
         if not self.problem.optimizes_controls:
             return us
         bounds, (lowest, highest) = self.problem.bounds, self.inner
@@ -449,7 +449,7 @@ class _Search:
         return np.where(self.problem.initial_state_mask, np.clip(x, bounds.x_lower, bounds.x_upper), x)
 
     def _merit(self, motion: Motion, cost: float) -> float:
-        """Cost, augmented by the constraints, plus the weighted sum of all gaps."""
+        """Return the cost plus the constraints' augmented terms and the weighted sum of all gaps."""
         return cost + self.constraints.value(*motion.point) + self.gap_weight * motion.distance
 
     def _infeasibility(self) -> float:

@@ -1,8 +1,8 @@
-"""The linear-quadratic problem around a motion, with gaps and boxes, and the Riccati recursion that solves it.
+"""The linear-quadratic problem around a motion, with gaps and bounds, and the Riccati recursion that solves it.
 
-Minimize sum_k g_k' z_k + z_k' H_k z_k / 2 + (the same of dx_N), z_k = [dx_k; du_k], where
-dx_(k+1) = F_k z_k + f_k and lower_k <= du_k <= upper_k. The gaps f_k are those of Mastalli et al., "Crocoddyl", 2020,
-the boxes those of Tassa, Mansard and Todorov, "Control-limited differential dynamic programming", 2014.
+Minimize sum_k g_k' z_k + z_k' H_k z_k / 2 + (the same terms of dx_N), where z_k = [dx_k; du_k], dx_(k+1) = F_k z_k +
+f_k and lower_k <= du_k <= upper_k. The gaps f_k follow Mastalli et al., "Crocoddyl", 2020, and the bounds follow Tassa,
+Mansard and Todorov, "Control-limited differential dynamic programming", 2014.
 """
 
 import math
@@ -17,17 +17,17 @@ from drake_diff._base.compiled import compiled, inner
 
 BOX_ITERATIONS = 30
 HALVINGS = 20
-ROUNDING_OF_CURVATURE = 1e-8  # of the inputs' curvature: makes one that is only just not positive definite so
-LEAST_SCALE = 1e-12  # of the largest diagonal entry: an input of no effect has a ridge too
+ROUNDING_OF_CURVATURE = 1e-8  # of the inputs' curvature: makes a Hessian positive definite that is singular by rounding
+LEAST_SCALE = 1e-12  # relative to the largest diagonal entry, so that an input without effect is regularized too
 
 
 @dataclass(frozen=True, eq=False)
 class LinearQuadratic:
-    """N steps of n states and m inputs; dx_0 lies in [start_lower, start_upper], which is 0 if it is given."""
+    """N steps with n states and m inputs. dx_0 lies in [start_lower, start_upper], both 0 for a given initial state."""
 
     F: Array  # (N, n, n + m)
     gaps: Array  # (N, n)
-    gradients: Array  # (N+1, n + m), whose last entries are those of x_N and zeros
+    gradients: Array  # (N+1, n + m), the last row is the gradient of x_N, followed by zeros
     hessians: Array  # (N+1, n + m, n + m)
     lower: Array  # (N, m)
     upper: Array  # (N, m)
@@ -40,21 +40,21 @@ class LinearQuadratic:
 
     @property
     def final_gradient(self) -> Array:
-        """(n,)"""
+        """The gradient (n,) with respect to dx_N."""
         return self.gradients[-1, : self.num_states]
 
     @property
     def final_hessian(self) -> Array:
-        """(n, n)"""
+        """The Hessian (n, n) with respect to dx_N."""
         return self.hessians[-1, : self.num_states, : self.num_states]
 
     def unbounded(self) -> "LinearQuadratic":
-        """The same without bounds of the inputs."""
+        """Return the same problem without bounds on the inputs."""
         wide = np.full_like(self.lower, np.inf)
         return replace(self, lower=-wide, upper=wide)
 
     def multipliers(self) -> Array:
-        """(N, n): v_k = d cost / d x_(k+1), all inputs as they are and all gaps kept."""
+        """Return v_k = d cost / d x_(k+1) (N, n), with the inputs and the gaps held constant."""
         n, v = self.num_states, np.empty_like(self.gaps)
         v[-1] = self.final_gradient
         for k in range(len(v) - 1, 0, -1):
@@ -64,12 +64,12 @@ class LinearQuadratic:
 
 @dataclass(frozen=True, eq=False)
 class AffinePolicy:
-    """du_k = feedforward_k + feedback_k dx_k from dx_0 = start; what it promises if all gaps are 0.
+    """A policy du_k = feedforward_k + feedback_k dx_k from dx_0 = start, and its predicted decrease if all gaps are 0.
 
-    What remains to be paid from knot k on is value_gradients_k' dx_k + dx_k' value_hessians_k dx_k / 2, and a constant.
-    `slope` and `curvature` are those of the quadratic model along the step: it changes the cost by
-    a slope + a^2 curvature / 2 at the step size a. `gradient` is the largest |d cost / d u| of an input, or
-    |d cost / d x_0|, that no bound holds.
+    The cost-to-go from knot k is value_gradients_k' dx_k + dx_k' value_hessians_k dx_k / 2 plus a constant. `slope` and
+    `curvature` are those of the quadratic model along the step, which changes the cost by a slope + a^2 curvature / 2
+    at the step size a. `gradient` is the largest |d cost / d u| or |d cost / d x_0| over the entries that are not on a
+    bound.
     """
 
     start: Array  # (n,)
@@ -83,20 +83,20 @@ class AffinePolicy:
 
     @property
     def expected(self) -> float:
-        """The decrease that a full step promises, as a positive number."""
+        """The predicted decrease of the cost over a full step, as a positive number."""
         return -(self.slope + self.curvature / 2)
 
 
 def solve_riccati(problem: LinearQuadratic, regularization: float) -> AffinePolicy | None:
-    """The best policy, `regularization` times its own diagonal added to the inputs' Hessian.
+    """Return the optimal policy, with `regularization` times the diagonal of the inputs' Hessian added to it.
 
-    None if that is not positive definite. So the step is about 1 + `regularization` times shorter, whatever the units.
+    Returns None if this Hessian is not positive definite. The step is about 1 + `regularization` times shorter.
     """
     n, (count, m) = problem.num_states, problem.lower.shape
-    P, s = np.empty((count + 1, n, n)), np.empty((count + 1, n))  # what remains to be paid
+    P, s = np.empty((count + 1, n, n)), np.empty((count + 1, n))  # cost-to-go
     P[-1], s[-1] = problem.final_hessian, problem.final_gradient
     K, free = np.empty((count, m, n + 1)), np.ones((count, m), dtype=bool)  # feedforward and feedback
-    gradients, hessians = np.empty((count, m)), np.empty((count, m, m))  # by the inputs
+    gradients, hessians = np.empty((count, m)), np.empty((count, m, m))  # with respect to the inputs
     names = ("F", "gaps", "gradients", "hessians", "lower", "upper")
     arrays: Any = [_contiguous(getattr(problem, name)) for name in names]
     if not _sweep(*[*arrays, float(regularization), P, s, K, free, gradients, hessians]):
@@ -110,19 +110,19 @@ def solve_riccati(problem: LinearQuadratic, regularization: float) -> AffinePoli
     along = (hessians @ d[:, :, None])[:, :, 0]
     curvature = float(np.sum(along * d) + start @ P[0] @ start)
     gradient = float(np.abs(gradients[free]).max(initial=left))
-    if not math.isfinite(slope + curvature):  # NaN passes for positive definite
+    if not math.isfinite(slope + curvature):  # a NaN can pass the test for positive definiteness
         return None
     return AffinePolicy(start, d, K[:, :, 1:], s, P, slope, curvature, gradient)
 
 
 def _contiguous(array: Array) -> Array:
-    """Itself, or a copy that is contiguous and may be written: of others the sweep would be compiled once more."""
+    """Return the array, or a contiguous writable copy. Numba would compile the sweep again for other layouts."""
     flags = array.flags
     return array if flags.c_contiguous and flags.writeable and array.dtype == float else own_array(array.astype(float))
 
 
 def _best_start(problem: LinearQuadratic, P: Array, s: Array, regularization: float) -> tuple[Array, float]:
-    """(dx_0 (n,), largest |s| of an entry that no bound holds)."""
+    """Return dx_0 (n,) and the largest |s| among the entries that are not on a bound."""
     start = np.zeros(len(s))
     moves = np.flatnonzero(problem.start_lower < problem.start_upper)
     if not len(moves):
@@ -135,9 +135,9 @@ def _best_start(problem: LinearQuadratic, P: Array, s: Array, regularization: fl
 
 
 def minimize_in_box(hessian: Array, gradient: Array, lower: Array, upper: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """(d, free): argmin of gradient' d + d' hessian d / 2 within [lower, upper], by projected Newton steps.
+    """Minimize gradient' d + d' hessian d / 2 within [lower, upper] by projected Newton steps. Return (d, free).
 
-    `free` is where d is not held by a bound. Raises LinAlgError if the Hessian is not positive definite.
+    `free` masks the entries of d that are not on a bound. Raises LinAlgError if the Hessian is not positive definite.
     """
     np.linalg.cholesky(hessian)
     d, free = np.empty(len(gradient)), np.ones(len(gradient), dtype=bool)
@@ -148,12 +148,12 @@ def minimize_in_box(hessian: Array, gradient: Array, lower: Array, upper: Array)
 
 
 def least_regularized(problem: LinearQuadratic) -> AffinePolicy | None:
-    """The best policy; None where the inputs' Hessian is not positive definite by more than rounding."""
+    """Return the optimal policy, or None if the inputs' Hessian is not positive definite beyond rounding."""
     return solve_riccati(problem, 0.0) or solve_riccati(problem, ROUNDING_OF_CURVATURE)
 
 
 def follow(problem: LinearQuadratic, policy: AffinePolicy, *, clipped: bool = False) -> tuple[Array, Array]:
-    """(dxs (N+1, n), dus (N, m)) of the full linear step, which closes the gaps; its inputs may be `clipped`."""
+    """Return dxs (N+1, n) and dus (N, m) of the full linear step, which closes the gaps. `clipped` bounds dus."""
     n, (count, m) = problem.num_states, problem.lower.shape
     dxs, dus = np.empty((count + 1, n)), np.empty((count, m))
     dxs[0] = policy.start
@@ -166,20 +166,20 @@ def follow(problem: LinearQuadratic, policy: AffinePolicy, *, clipped: bool = Fa
 
 
 def slope_along(problem: LinearQuadratic, dxs: Array, dus: Array) -> tuple[float, float]:
-    """(slope, curvature) of the cost along a step (N+1, n), (N, m)."""
+    """Return the slope and the curvature of the cost along the step dxs (N+1, n), dus (N, m)."""
     zs = np.hstack([dxs, np.vstack([dus, np.zeros((1, dus.shape[1]))])])
     bent = (problem.hessians @ zs[:, :, None])[:, :, 0]
     return float(np.sum(problem.gradients * zs)), float(np.sum(bent * zs))
 
 
-# What Numba compiles: plain loops over rows, which for the few states of a robot are faster than BLAS.
+# Functions compiled by Numba. For the few states of a robot, plain loops over rows are faster than BLAS.
 
 Flags = NDArray[np.bool_]
 
 
 @inner
 def _factor(A: Array, which: Indices, L: Array) -> bool:
-    """L D L' = A of the rows and columns `which`, D on L's diagonal; False if A is not positive definite there."""
+    """Factor A[which][:, which] = L D L' with D on L's diagonal. Return False if it is not positive definite."""
     for i in range(len(which)):
         for j in range(i + 1):
             total = A[which[i], which[j]]
@@ -187,7 +187,7 @@ def _factor(A: Array, which: Indices, L: Array) -> bool:
                 total -= L[i, k] * L[j, k] * L[k, k]
             if j < i:
                 L[i, j] = total / L[j, j]
-            elif total > 0 and total < np.inf:  # not where it is NaN
+            elif total > 0 and total < np.inf:  # false for NaN too
                 L[i, i] = total
             else:
                 return False
@@ -196,7 +196,7 @@ def _factor(A: Array, which: Indices, L: Array) -> bool:
 
 @inner
 def _solve(A: Array, B: Array, which: Indices, L: Array) -> bool:
-    """B = -A^-1 B of the rows and columns `which`; False if A is not positive definite there."""
+    """Set B = -A^-1 B for the rows and columns `which`. Return False if A is not positive definite there."""
     if not _factor(A, which, L):
         return False
     m, width = len(which), B.shape[1]
@@ -227,7 +227,7 @@ def _value(H: Array, g: Array, d: Array) -> float:
 
 @compiled
 def _minimize_in_box(H: Array, g: Array, lower: Array, upper: Array, d: Array, free: Flags, L: Array) -> bool:
-    """The d (m,) of least g' d + d' H d / 2 within bounds, and which are free; False if a part of H fails."""
+    """Minimize g' d + d' H d / 2 over d (m,) within bounds and set `free`. Return False if a part of H fails."""
     m = len(g)
     step, moved = np.empty((m, 1)), np.empty(m)
     for i in range(m):
@@ -259,7 +259,7 @@ def _minimize_in_box(H: Array, g: Array, lower: Array, upper: Array, d: Array, f
 
 @compiled
 def _add_ridge(hessian: Array, regularization: float) -> None:
-    """Add `regularization` times its diagonal, of entries far below the largest LEAST_SCALE of that, to a Hessian."""
+    """Add `regularization` times max(|H_aa|, LEAST_SCALE times the largest |H_bb|) to each diagonal entry H_aa."""
     m, largest = len(hessian), 0.0
     for a in range(m):
         largest = max(largest, abs(hessian[a, a]))
@@ -270,7 +270,7 @@ def _add_ridge(hessian: Array, regularization: float) -> None:
 
 @inner
 def _gains(H: Array, rows: Array, lower: Array, upper: Array, K: Array, free: Flags, L: Array) -> bool:
-    """The gain K (m, n+1) = -H^-1 rows whose feedforward keeps the bounds; False if there is none."""
+    """Compute the gain K (m, n+1) = -H^-1 rows with a feedforward within bounds. Return False if there is none."""
     m, leaves = len(rows), False
     K[:] = rows
     if not _solve(H, K, np.arange(m), L):
@@ -292,7 +292,7 @@ def _gains(H: Array, rows: Array, lower: Array, upper: Array, K: Array, free: Fl
 
 @inner
 def _add_product(A: Array, B: Array, out: Array) -> None:
-    """out += A' B."""
+    """Add A' B to `out`."""
     for k in range(len(A)):
         for i in range(A.shape[1]):
             for c in range(B.shape[1]):
@@ -315,19 +315,19 @@ def _sweep(
     by_input: Array,
     of_inputs: Array,
 ) -> bool:
-    """Fill P (N+1, n, n) and s (N+1, n) from their last on, the gains K (N, m, n+1) and which inputs are `free` (N, m).
+    """Fill P (N+1, n, n) and s (N+1, n) backward from the last knot, the gains K (N, m, n+1) and `free` (N, m).
 
-    And the gradients (N, m) and Hessians (N, m, m) of the inputs. False if no minimum is found.
+    Fill the gradients (N, m) and Hessians (N, m, m) with respect to the inputs. Return False if no minimum is found.
     """
     count, n, z = F.shape
     m = z - n
     PF, Q, L, hessian = np.empty((n, z + 1)), np.empty((z, z + 1)), np.empty((m, m)), np.empty((m, m))
     rows, T, added = np.empty((m, n + 1)), np.empty((m, n + 1)), np.empty((n + 1, n + 1))
     for k in range(count - 1, -1, -1):
-        PF[:, :z], PF[:, z] = 0.0, s[k + 1]  # P F, and s + P gap behind it
+        PF[:, :z], PF[:, z] = 0.0, s[k + 1]  # P F, and P gap + s in the last column
         _add_product(P[k + 1], F[k], PF)
         _add_product(P[k + 1], gaps[k].copy().reshape(n, 1), PF[:, z:])
-        Q[:, :z], Q[:, z] = hessians[k], gradients[k]  # by [x, u], and the gradient behind it
+        Q[:, :z], Q[:, z] = hessians[k], gradients[k]  # with respect to [x, u], with the gradient in the last column
         _add_product(F[k], PF, Q)
         by_input[k], of_inputs[k], hessian[:] = Q[n:, z], Q[n:, n:z], Q[n:, n:z]
         rows[:, 0], rows[:, 1:] = Q[n:, z], Q[n:, :n]

@@ -1,9 +1,9 @@
-"""Trajectory optimization through contact by iLQR on the true plant, whose step jumps.
+"""Trajectory optimization through contact by iLQR on the true plant, whose step is discontinuous.
 
-It jumps where two bodies just touch, and the least cost often lies at such a jump, where no gradient tells a minimum.
-So `solve_through_jumps` holds every beginning of a touch at its knot, by rows phi >= m before it and phi <= -m at it,
-phi being the signed distance and m a margin: under these the problem is smooth. What comes out is a minimum for its own
-sequence of contacts.
+The step jumps where the distance between two bodies is zero, and the least cost often lies at such a jump, where a
+gradient cannot verify a minimum. `solve_through_jumps` therefore fixes the knot at which each contact begins, by
+constraints phi >= m at the knot before it and phi <= -m at the knot itself, where phi is the signed distance and m a
+margin. Under these constraints the problem is smooth. The solution is a minimum for its own sequence of contacts.
 """
 
 from dataclasses import dataclass, replace
@@ -24,19 +24,19 @@ from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Limits, NlpResult, Outcome, Report
 
-MARGIN = 1e-5  # [m] that a held pair keeps from just touching: differences of 1e-6 then see no jump
-PRESSING = 1.01  # margins: nearer than that to just touching, a row is what holds the motion
-PATIENCE, MORE_PATIENCE = 3, 10  # short steps in a row are a stall; and where nothing new can be held
-HOLDING = 1e6  # the least penalty of held rows: a search that may cross them sees the jump again
-MOST_SEQUENCES = 30  # that are tried
-JUST_TOUCHING = 2e-5  # [m], beyond MARGIN; what rests on something presses further into it
+MARGIN = 1e-5  # [m], distance of a constrained pair from zero distance: differences of 1e-6 then cross no jump
+PRESSING = 1.01  # margins: a constraint within this distance of zero is active
+PATIENCE, MORE_PATIENCE = 3, 10  # short steps in a row that count as a stall, also without new constraints
+HOLDING = 1e6  # least penalty of the contact constraints: a search that may violate them meets the jump again
+MOST_SEQUENCES = 30  # the number of contact sequences to try
+JUST_TOUCHING = 2e-5  # [m], larger than MARGIN. A body at rest on another penetrates it more
 
-OF_SHAPES = ("offset", "radius")  # parameters that change where shapes are, or what they are
-Minimum = tuple[NlpResult, Array, Array]  # as from `solve_ilqr`
+OF_SHAPES = ("offset", "radius")  # parameters that change the pose or the size of shapes
+Minimum = tuple[NlpResult, Array, Array]  # as returned by `solve_ilqr`
 
 
 def cost_of(problem: Problem, result: NlpResult, xs: Array, us: Array) -> float:
-    """What xs (N+1, nx) under us (N, nu) cost with the parameters of `result`."""
+    """Return the cost of xs (N+1, nx) under us (N, nu) with the parameters of `result`."""
     design = problem.design
     values = design.vector.values if result.parameters is None else result.parameters
     cost = problem.objective(xs, us, design.time_step(values))
@@ -44,12 +44,12 @@ def cost_of(problem: Problem, result: NlpResult, xs: Array, us: Array) -> float:
 
 
 def where_it_jumps(problem: Problem, xs: Array) -> str:
-    """Where along xs (N+1, nx) two bodies are just touching, and what that means; empty if none are."""
+    """Describe the first knot along xs (N+1, nx) where two bodies have zero distance, or return "" if there is none."""
     for k, x in enumerate(xs[:-1]):
         set_state(problem.model.double, x)
         try:
             gaps = distances(problem.model.double)
-        except ModelError as error:  # Drake knows no distance of some pair
+        except ModelError as error:  # Drake cannot compute the distance of some pair
             return f", and Drake cannot tell which bodies just touch: {error}"
         for (a, b), distance in gaps.items():
             if abs(distance) < JUST_TOUCHING:
@@ -62,7 +62,7 @@ def where_it_jumps(problem: Problem, xs: Array) -> str:
 
 @dataclass(frozen=True)
 class ContactHold:
-    """A pair of bodies, numbered as in `separations`, that is `apart` at `knot`, or overlaps there."""
+    """A constraint that keeps a pair of bodies, indexed as in `separations`, `apart` or overlapping at `knot`."""
 
     pair: int
     names: tuple[str, str]
@@ -70,7 +70,7 @@ class ContactHold:
     apart: bool
 
     def constraint(self, model: Model) -> Constraint:
-        """The row that holds it: the pair's signed distance [m], of floats or AutoDiffXd, at the margin or beyond."""
+        """Return the constraint on the pair's signed distance [m], of floats or AutoDiffXd, bounded by the margin."""
 
         def distance(x: Any) -> Any:
             if x.dtype == float:
@@ -86,17 +86,17 @@ class ContactHold:
 
 
 def moves_shapes(problem: Problem) -> bool:
-    """Whether parameters change where the shapes are, or what they are: no touch can be held then."""
+    """Return whether parameters change the pose or size of shapes. Contacts cannot be fixed then."""
     return any(p.kind.quantity in OF_SHAPES for p in problem.parameters.parameters)
 
 
 def solve_through_jumps(
     problem: Problem, xs: Array, us: Array, *, limits: Limits, report: Report | None, values: Array | None = None
 ) -> Minimum:
-    """What `solve_ilqr` gives, from a search that holds beginnings of touches where it stalls at one.
+    """Solve with `solve_ilqr`, and fix the knots at which contacts begin if the search stalls at a jump.
 
-    Where they press, the result's note says which. `limits` are those of all sequences together. Raises as `solve_ilqr`
-    does.
+    If such constraints are active at the solution, the result's note lists them. `limits` apply to all sequences
+    together. Raises the errors of `solve_ilqr`.
     """
     deadline, rows = now() + limits.time_limit, list[Iteration]()
     holds, stuck = tuple[ContactHold, ...](), False
@@ -132,16 +132,16 @@ def solve_through_jumps(
 def _beginnings_or_none(problem: Problem, xs: Array, report: Report | None) -> tuple["ContactHold", ...]:
     try:
         return beginnings(problem, xs)
-    except ModelError as error:  # Drake knows no distance of some pair
+    except ModelError as error:  # Drake cannot compute the distance of some pair
         if report:
             report.say(f"no contact can be kept: {error}")
         return ()
 
 
 def beginnings(problem: Problem, xs: Array) -> tuple[ContactHold, ...]:
-    """Two holds for each beginning of a touch along xs (N+1, nx): apart at the knot before it, touching at its own.
+    """Return two constraints for each new contact along xs (N+1, nx): apart at one knot, overlapping at the next.
 
-    The first state is left out if it is given, as nothing moves it; so is the last, on which nothing acts.
+    A given initial state is omitted, because nothing changes it, and so is the last state, on which no force acts.
     """
     distances = []
     for x in xs[:-1]:

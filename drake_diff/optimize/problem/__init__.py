@@ -1,1 +1,1 @@
-"""What is asked for: costs, constraints, bounds, dynamics."""
+"""Definitions of optimization problems: costs, constraints, bounds, dynamics."""

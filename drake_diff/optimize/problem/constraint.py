@@ -1,4 +1,4 @@
-"""What a motion must keep: bounds of states and inputs, and constraints lower <= function <= upper at chosen knots."""
+"""Constraints of a motion: bounds of states and inputs, and constraints lower <= function <= upper at chosen knots."""
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -15,12 +15,12 @@ from drake_diff.exceptions import GradientError, InputError, ShapeError
 from drake_diff.model.assembly import single_coordinates
 from drake_diff.model.model import Model
 
-LOOKED_AT = 5  # states at which the slopes of a constraint are taken
+LOOKED_AT = 5  # number of states at which a constraint's slopes are computed
 FORM = "a function of x, or of x and u, in ordinary arithmetic that gives a number or numbers (m,)"
 
 
 class ShowsArrays:
-    """Shows the fields that are given, long arrays by their shapes."""
+    """A base class whose repr shows the fields that are not None, and long arrays by their shapes."""
 
     def __repr__(self) -> str:
         given = {name: value for name, value in vars(self).items() if value is not None}
@@ -28,15 +28,15 @@ class ShowsArrays:
 
 
 class Described:
-    """The base of frozen dataclasses of plain values, which a record keeps: `Kind(**values)` makes one again."""
+    """The base of frozen dataclasses of plain values that a record contains. `Kind(**values)` restores one."""
 
     def given(self) -> dict[str, Any]:
-        """The values that are not the defaults, as JSON has them."""
+        """Return the values that differ from the defaults, as JSON types."""
         pairs = ((f, plain_value(getattr(self, f.name))) for f in fields(self))  # type: ignore[arg-type]  # dataclasses
         return {f.name: value for f, value in pairs if f.default is MISSING or value != plain_value(f.default)}
 
     def to_dict(self) -> dict[str, Any]:
-        """The kind and the values that are not the defaults, for a record."""
+        """Return the class name and the values that differ from the defaults, for a record."""
         return {type(self).__name__: self.given()}
 
     def __repr__(self) -> str:
@@ -48,7 +48,7 @@ class Described:
 
 
 def plain_value(value: Any) -> Any:
-    """Tuples and arrays as lists, so that what is written to JSON is what is read again."""
+    """Convert tuples and arrays to lists, so that JSON restores the same values."""
     if isinstance(value, Described):
         return value.to_dict()
     if isinstance(value, np.ndarray):
@@ -84,15 +84,15 @@ class StateFunction:
     """A function x (nx,) -> (m,) with exact derivatives at many states at once."""
 
     def values(self, xs: Array) -> Array:
-        """(K, m) at states (K, nx)."""
+        """Return the values (K, m) at states (K, nx)."""
         raise NotImplementedError
 
     def linearize(self, xs: Array) -> tuple[Array, Array]:
-        """(K, m), and the derivatives (K, m, nx), at states (K, nx)."""
+        """Return the values (K, m) and the derivatives (K, m, nx) at states (K, nx)."""
         raise NotImplementedError
 
     def __call__(self, x: Any) -> Any:
-        """(m,) at one state, floats or AutoDiffXd."""
+        """Return the values (m,) at one state of floats or AutoDiffXd."""
         if x.dtype == float:
             return self.values(x[None])[0]
         values, slopes = self.linearize(ExtractValue(x.reshape(-1, 1)).T)
@@ -104,17 +104,17 @@ class Constraint:
     """A path constraint of a `Problem`: lower <= function(x) <= upper, or lower <= function(x, u) <= upper.
 
     Args:
-        function: takes x (nx,), and u (nu,) if it has a second argument, and returns one number or (m,) numbers, in
-            ordinary arithmetic and NumPy functions through which AutoDiffXd can flow.
-        lower: a number or (m,) numbers, in the unit of what `function` returns; no limit where None.
+        function: takes x (nx,), and u (nu,) if it has a second argument, and returns one number or (m,) numbers. It
+            uses ordinary arithmetic and NumPy functions that support AutoDiffXd.
+        lower: a number or (m,) numbers, in the unit of the function's values; no limit if None.
         upper: the same; one of the two must be given.
-        knots: the knots at which it holds, whole numbers 0 ... N, where negative ones count from the end. None is
-            every knot but a given first state; collocation then keeps it at its midpoints too. A discrete method has
-            no input at knot N, so that a function of u holds only up to N-1.
-        name: what it is called in messages; the function's own name where not given.
+        knots: the knots to which it applies, whole numbers 0 ... N, where negative ones count from the end. None means
+            every knot except a given first state; collocation then also constrains its midpoints. A discrete method has
+            no input at knot N, so that a function of u applies only up to N-1.
+        name: the name in messages; by default the function's own name.
 
     Raises:
-        InputError: no function, no limit, limits that cross or do not fit.
+        InputError: no function, no limit, or limits that cross or do not fit.
 
     Example:
         >>> dd.Constraint(lambda x: x[1], upper=1.5, name="speed")
@@ -153,7 +153,7 @@ class Constraint:
 
     @property
     def label(self) -> str:
-        """The name, or the function's own."""
+        """The name of the constraint, by default the function's own name."""
         return self.name or str(getattr(self.function, "__qualname__", type(self.function).__name__))
 
     @property
@@ -163,11 +163,11 @@ class Constraint:
 
     @property
     def whole(self) -> bool:
-        """Whether it holds between its knots too, from the first of them to the last."""
+        """Whether the constraint also applies between its knots, from the first to the last."""
         return self.knots is None
 
     def at_knots(self, count: int, first_is_given: bool) -> tuple[int, ...]:
-        """The knots out of 0 ... `count` at which it holds, in order; InputError where there is no such knot."""
+        """Return the knots out of 0 ... `count` to which it applies, in order, or raise InputError for other knots."""
         last = count - 1 if self.takes_input else count
         if self.knots is None:
             return tuple(range(int(first_is_given and not self.takes_input), last + 1))
@@ -180,15 +180,15 @@ class Constraint:
         return tuple(sorted({int(k) % (last + 1) for k in given}))
 
     def __call__(self, x: Any, u: Any) -> Array:
-        """(m,) the function's values at x (nx,), u (nu,)."""
+        """Return the function's values (m,) at x (nx,), u (nu,)."""
         return np.asarray(self._call(x, u), dtype=float)
 
     def differentiate(self, x: Array, u: Array) -> tuple[Array, Array]:
-        """(values (m,), Jacobian (m, nx + nu)); GradientError where it is lost or not finite."""
+        """Return (values (m,), Jacobian (m, nx + nu)). Raises GradientError if the Jacobian is lost or not finite."""
         if hasattr(self.function, "linearize"):
             return self.along(x[None], u[None])[0], self.slopes(x[None], u[None])[0]
         z = InitializeAutoDiff(np.concatenate([x, u])).ravel()
-        with np.errstate(all="ignore"):  # what is not finite is refused below
+        with np.errstate(all="ignore"):  # checked below
             result = self._call(z[: len(x)], z[len(x) :])
         plain, rows = carried(result, len(z), f"constraint {self.label}", f"{FORM}, without float()")
         if not (np.all(np.isfinite(plain)) and np.all(np.isfinite(rows))):
@@ -196,13 +196,13 @@ class Constraint:
         return plain, rows
 
     def along(self, xs: Array, us: Array) -> Array:
-        """(K, m) the function's values at xs (K, nx), us (K, nu)."""
+        """Return the function's values (K, m) at xs (K, nx), us (K, nu)."""
         if hasattr(self.function, "linearize"):
             return np.asarray(self.function.values(xs))  # type: ignore[attr-defined]
         return np.array([self(x, u) for x, u in zip(xs, us, strict=True)])
 
     def slopes(self, xs: Array, us: Array) -> Array:
-        """(K, m, nx + nu) the function's Jacobians at xs (K, nx), us (K, nu); GradientError as by `differentiate`."""
+        """Return the Jacobians (K, m, nx + nu) at xs (K, nx), us (K, nu). Raises GradientError like `differentiate`."""
         if not hasattr(self.function, "linearize"):
             return np.array([self.differentiate(x, u)[1] for x, u in zip(xs, us, strict=True)])
         by_x = self.function.linearize(xs)[1]
@@ -212,9 +212,9 @@ class Constraint:
         return np.concatenate([by_x, np.zeros((*by_x.shape[:2], us.shape[1]))], axis=2)
 
     def scales(self, xs: Array, us: Array, spans: Array) -> Array:
-        """(m,) how far the values go as each state and input goes its own way `spans` (nx + nu,), by their slopes.
+        """Return the change (m,) of the values, by their slopes, if states and inputs change by `spans` (nx + nu,).
 
-        At some of xs (K, nx), us (K, nu). Of a value without slopes it is the magnitude of its bound.
+        The slopes are those at some of xs (K, nx), us (K, nu). A value without slopes has the magnitude of its bound.
         """
         scales = np.zeros(len(self.lower))
         for k in np.unique(np.linspace(0, len(us) - 1, LOOKED_AT).astype(int)):
@@ -224,13 +224,13 @@ class Constraint:
         return np.where(scales > 0, scales, np.where(np.isfinite(bounds), bounds, 0.0))
 
     def excess(self, x: Array, u: Array) -> float:
-        """The largest excess over a bound at x (nx,), u (nu,); inf where a value is not a number."""
+        """Return the largest excess over a bound at x (nx,), u (nu,), or inf if a value is not a number."""
         values = self(x, u)
         worst = np.max(np.maximum(self.lower - values, values - self.upper), initial=0.0)
         return float("inf") if np.isnan(worst) else float(worst)
 
     def resolved(self, x: Array, u: Array) -> "Constraint":
-        """This constraint with bounds as many as the function's values; InputError where the two do not fit."""
+        """Return the constraint with one bound per function value. Raises InputError if their counts do not fit."""
         with np.errstate(all="ignore"):
             values = self._call(x, u)
         size = len(self.lower)
@@ -249,7 +249,7 @@ class Constraint:
 
 
 def several(subject: str, given: Any, kind: type | tuple[type, ...], expected: str) -> tuple[Any, ...]:
-    """One or several of a kind as a tuple; InputError of anything else."""
+    """Return one or several values of a kind as a tuple. Raises InputError for other types."""
     every = tuple(given) if isinstance(given, (tuple, list)) else (given,)
     for value in every:
         if not isinstance(value, kind):
@@ -258,17 +258,17 @@ def several(subject: str, given: Any, kind: type | tuple[type, ...], expected: s
 
 
 def arguments_of(function: Any) -> int:
-    """How many arguments without a default a function takes; 0 of one that does not say."""
+    """Return the number of arguments without a default, or 0 if the function has no signature."""
     try:
         parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):  # some that are built in
+    except (TypeError, ValueError):  # some built-in functions
         return 0
     kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     return sum(p.kind in kinds and p.default is p.empty for p in parameters)
 
 
 def carried(result: Array, width: int, subject: str, form: str) -> tuple[Array, Array]:
-    """The values (m,) of `result` (m,) and its Jacobian (m, width); GradientError where it carries no derivative."""
+    """Return the values (m,) of `result` and its Jacobian (m, width). Raises GradientError if it has no derivatives."""
     if not any(isinstance(v, AutoDiffXd) for v in result):
         raise GradientError(f"{subject} lost its derivatives: write it as {form}")
     full = np.array([v if isinstance(v, AutoDiffXd) else AutoDiffXd(float(v)) for v in result])
@@ -276,7 +276,7 @@ def carried(result: Array, width: int, subject: str, form: str) -> tuple[Array, 
 
 
 def short(values: Any) -> str:
-    """An array on one line: its numbers where they are few, else its shape and range."""
+    """Format an array on one line, by its numbers if they are few, and otherwise by its shape and range."""
     array = np.asarray(values)
     if array.size <= 8 or array.dtype.kind not in "fiu":
         return np.array2string(array, precision=4, separator=", ", max_line_width=1000).replace("\n", "")
@@ -286,7 +286,7 @@ def short(values: Any) -> str:
 def resolve_bounds(
     given: Bounds | None, defaults: Mapping[str, Array], state_names: Sequence[str], input_names: Sequence[str]
 ) -> Bounds:
-    """`given` with the limits of `defaults` (by the fields' names) where it has none; InputError where two cross."""
+    """Fill missing entries of `given` from `defaults` (by field name). Raises InputError if two limits cross."""
     if not (given is None or isinstance(given, Bounds)):
         raise InputError("bounds", got=type(given).__name__, expected="Bounds")
     resolved = {}
@@ -303,10 +303,10 @@ def resolve_bounds(
 
 
 def plant_limits(model: Model) -> dict[str, Array]:
-    """A model's own limits, by the fields' names of `Bounds`.
+    """Return a model's own limits by the field names of `Bounds`.
 
-    Without those of positions that no motor moves, where loops are closed: a finger's link may rest on its limit, and
-    Drake's force there is nearly rigid.
+    In models with closed loops, the limits of positions that no motor moves are omitted. A finger's link may rest on
+    its limit, and Drake's force there is nearly rigid.
     """
     (q_lower, q_upper), (v_lower, v_upper) = model.position_limits, model.velocity_limits
     if model.file_facts.held_points:
@@ -323,7 +323,7 @@ def plant_limits(model: Model) -> dict[str, Array]:
 
 
 def check_inside(subject: str, values: Array, lower: Array, upper: Array, names: Sequence[str]) -> None:
-    """Raise InputError where an entry of `values` (..., n), NaN where free, is beyond its limit (n,)."""
+    """Raise InputError if an entry of `values` (..., n), NaN where free, is beyond its limit (n,)."""
     rows = np.atleast_2d(values)
     for row, i in np.argwhere((rows < lower) | (rows > upper))[:1]:
         expected = f"within [{lower[i]:g}, {upper[i]:g}]"

@@ -1,8 +1,7 @@
-"""Costs of a state and an input, also ones that change in time, and their gradients.
+"""Costs of a state and an input, which may also depend on time, and their gradients.
 
-Of a cost that changes in time, what changes is `known_at(t)`, a few numbers p, and the cost is a function of x, u and
-p. A solver that visits many knots at once asks for the numbers of all of them; one that goes step by step takes
-`cost_at(cost, t)`.
+A cost that depends on time is a function of x, u and a few numbers p, which `known_at(t)` returns. A solver that
+evaluates many knots at once calls it for all of them. A solver that goes step by step calls `cost_at(cost, t)`.
 """
 
 import copy
@@ -27,18 +26,17 @@ FinalCost = Callable[[Any], Any]  # (x) -> scalar
 class QuadraticCost(ShowsArrays):
     """The cost (x - x_ref)' Q (x - x_ref) + (u - u_ref)' R (u - u_ref), without a factor of one half.
 
-    It serves as a running cost, called with x and u, and as a final cost, called with x alone. What is not given
-    is zero.
+    It can be a running cost, called with x and u, or a final cost, called with x alone. Omitted parts are zero.
 
     Args:
         Q: (nx, nx) weights of the states, symmetric and positive semidefinite.
         R: (nu, nu) weights of the inputs, symmetric and positive semidefinite.
-        x_ref: (nx,) state that costs nothing, in the states' units.
-        u_ref: (nu,) input that costs nothing, in the inputs' units.
+        x_ref: (nx,) state of zero cost, in the states' units.
+        u_ref: (nu,) input of zero cost, in the inputs' units.
 
     Raises:
-        InputError: a weight is not square, not symmetric or not positive semidefinite; ShapeError and
-            NonFiniteError where a size or a number is wrong.
+        InputError: a weight is not square, not symmetric or not positive semidefinite; ShapeError and NonFiniteError
+            for a wrong size or number.
 
     Example:
         >>> cost = dd.QuadraticCost(Q=[[2.0]], R=[[1.0]], x_ref=[1.0])
@@ -71,15 +69,15 @@ class QuadraticCost(ShowsArrays):
                 object.__setattr__(self, name, finite_array(name, getattr(self, name), (size,)))
 
     def check_sizes(self, name: str, nx: int, nu: int) -> None:
-        """Raise ShapeError where a part has not the size of the states (nx,) or inputs (nu,); `name` is the cost's."""
+        """Raise ShapeError if a part of the cost `name` does not have the size of the states (nx,) or inputs (nu,)."""
         for field, size in (("Q", nx), ("R", nu), ("x_ref", nx), ("u_ref", nu)):
             value = getattr(self, field)
             if value is not None and len(value) != size:
                 raise ShapeError(f"{name}.{field}", got=value.shape, expected=(size,) * value.ndim)
 
     def __call__(self, x: Any, u: Any = None) -> Any:
-        """The cost of x (nx,) and u (nu,), floats or AutoDiffXd; of floats also the costs (K,) of K rows of each."""
-        total = 0.0 * x[..., 0]  # NaN where that is
+        """Return the cost of x (nx,) and u (nu,), floats or AutoDiffXd, or the costs (K,) of K rows of floats."""
+        total = 0.0 * x[..., 0]  # NaN if x is NaN
         for weight, z, reference in ((self.Q, x, self.x_ref), (self.R, u, self.u_ref)):
             if weight is not None and z is not None:
                 d = z if reference is None else z - reference
@@ -89,7 +87,7 @@ class QuadraticCost(ShowsArrays):
 
 @dataclass(frozen=True)
 class ConstantCost:
-    """A running cost of `rate` [per s], so that the objective is `rate` times the horizon."""
+    """A running cost of `rate` [per s]. The objective is then `rate` times the horizon."""
 
     rate: float
 
@@ -99,9 +97,9 @@ class ConstantCost:
 
 @dataclass(frozen=True, eq=False)
 class CostToGo:
-    """gradient' d + d' hessian d / 2 with d = x - x_ref: a final cost that stands for all that comes after.
+    """A quadratic final cost gradient' d + d' hessian d / 2 with d = x - x_ref, which approximates a cost-to-go.
 
-    x_ref and gradient (nx,), hessian (nx, nx), symmetric; in the cost's unit.
+    x_ref and gradient have the shape (nx,). The hessian (nx, nx) is symmetric. All are in the cost's unit.
     """
 
     x_ref: Array
@@ -109,14 +107,14 @@ class CostToGo:
     hessian: Array
 
     def __call__(self, x: Any) -> Any:
-        """The cost of x (nx,): floats or AutoDiffXd."""
+        """Return the cost of x (nx,), floats or AutoDiffXd."""
         d = x - self.x_ref
         return self.gradient @ d + d @ (self.hessian @ d) / 2
 
 
 @dataclass(frozen=True, eq=False)
 class QuadraticForm:
-    """constant + slope' d + d' weight d, d being the distance of z = [x, u] from `reference`, all of (n,)."""
+    """constant + slope' d + d' weight d, where d is the distance of z = [x, u] from `reference`, all (n,)."""
 
     weight: Array  # (n, n)
     reference: Array
@@ -124,17 +122,17 @@ class QuadraticForm:
     constant: float = 0.0
 
     def values(self, z: Array) -> Array:
-        """(...) at z (..., n)."""
+        """Return the values (...) at z (..., n)."""
         d = z - self.reference
         return np.asarray(self.constant + d @ self.slope + ((d @ self.weight) * d).sum(axis=-1))
 
     def gradients(self, z: Array) -> Array:
-        """(..., n) at z (..., n)."""
+        """Return the gradients (..., n) at z (..., n)."""
         return self.slope + 2 * (z - self.reference) @ self.weight
 
 
 def quadratic_form(cost: Any, nx: int, nu: int) -> QuadraticForm | None:
-    """A cost of x and u as a quadratic form; None where it is none."""
+    """Return a cost of x and u as a quadratic form, or None if it is not quadratic."""
     n = nx + nu
     if isinstance(cost, ConstantCost):
         return QuadraticForm(np.zeros((n, n)), np.zeros(n), np.zeros(n), cost.rate)
@@ -152,26 +150,26 @@ def quadratic_form(cost: Any, nx: int, nu: int) -> QuadraticForm | None:
 
 
 def differentiate_cost(cost: RunningCost, x: Array, u: Array) -> tuple[float, Array, Array]:
-    """(value, gradient by x (nx,), gradient by u (nu,)) of a running cost."""
+    """Return the value and the gradients with respect to x (nx,) and u (nu,) of a running cost."""
     value, gradient = _gradient(_of_knot(cost, len(x)), quadratic_form(cost, len(x), len(u)), np.concatenate([x, u]))
     return value, gradient[: len(x)], gradient[len(x) :]
 
 
 def differentiate_final_cost(cost: FinalCost, x: Array) -> tuple[float, Array]:
-    """(value, gradient (nx,)) of a final cost."""
+    """Return the value and the gradient (nx,) of a final cost."""
     return _gradient(cost, quadratic_form(cost, len(x), 0), x)
 
 
 def running_cost_hessian(cost: RunningCost, x: Array, u: Array) -> Array:
-    """(nx+nu, nx+nu): the Hessian by [x; u], exact for a quadratic form, else made positive semidefinite.
+    """Return the Hessian (nx+nu, nx+nu) with respect to [x; u], exact for a quadratic form, else made semidefinite.
 
-    Any other cost's Hessian is the central difference of its exact gradient, its negative eigenvalues cut to 0.
+    The Hessian of any other cost is the central difference of its exact gradient, with negative eigenvalues set to 0.
     """
     return _hessian(_of_knot(cost, len(x)), quadratic_form(cost, len(x), len(u)), np.concatenate([x, u]))
 
 
 def final_cost_hessian(cost: FinalCost, x: Array) -> Array:
-    """(nx, nx): like `running_cost_hessian`, by x."""
+    """Return the Hessian (nx, nx) with respect to x, like `running_cost_hessian`."""
     return _hessian(cost, quadratic_form(cost, len(x), 0), x)
 
 
@@ -192,47 +190,47 @@ def _hessian(f: FinalCost, form: QuadraticForm | None, z: Array) -> Array:
     return np.asarray((vectors * np.maximum(values, 0)) @ vectors.T)
 
 
-SAMPLES = 1001  # of a trajectory of Drake's, which is linear in between then
+SAMPLES = 1001  # samples of a Drake trajectory, which is interpolated linearly in between
 
 
 class TimedCost:
-    """The base of running costs that depend on the time [s] from the first state on."""
+    """The base of running costs that depend on the time [s] since the first state."""
 
     def known_at(self, times: Array) -> Array:
-        """(K, p) what the cost needs to know at `times` (K,) [s]."""
+        """Return the parameters (K, p) of the cost at `times` (K,) [s]."""
         raise NotImplementedError
 
     def of(self, x: Any, u: Any, known: Any) -> Any:
-        """The cost of x (nx,) and u (nu,), floats, AutoDiffXd or expressions, with `known` (p,)."""
+        """Return the cost of x (nx,) and u (nu,), floats, AutoDiffXd or expressions, with parameters `known` (p,)."""
         raise NotImplementedError
 
     def at(self, time: float) -> RunningCost:
-        """The cost at a time [s], as a function of x and u."""
+        """Return the cost at a time [s] as a function of x and u."""
         known = self.known_at(np.array([time]))[0]
         return lambda x, u: self.of(x, u, known)
 
     def followed(self, times: Array) -> tuple[Array, Array | None] | None:
-        """The states (K, nx), and inputs (K, nu) if any, that are followed at `times`, NaN where none is; or None."""
+        """Return the tracked states (K, nx) and inputs (K, nu) or None at `times`, NaN if free, or None without any."""
         return None
 
     def check_sizes(self, name: str, nx: int, nu: int) -> None:
-        """Raise ShapeError where a part has not the size of the states (nx,) or inputs (nu,)."""
+        """Raise ShapeError if a part does not have the size of the states (nx,) or inputs (nu,)."""
 
 
 def cost_at(cost: Any, time: float) -> Any:
-    """A running cost at a time [s]; itself where it does not change."""
+    """Return a running cost at a time [s], or the cost itself if it does not depend on time."""
     return cost.at(time) if isinstance(cost, TimedCost) else cost
 
 
 @dataclass(frozen=True, eq=False)
 class FunctionOfTime(TimedCost):
-    """A function (x, u, t) -> scalar, in ordinary arithmetic."""
+    """A cost (x, u, t) -> scalar in ordinary arithmetic."""
 
     f: Callable[[Any, Any, Any], Any]
 
     def __post_init__(self) -> None:
         name = getattr(self.f, "__qualname__", type(self.f).__name__)
-        object.__setattr__(self, "__qualname__", name)  # which a record tells of a user's function
+        object.__setattr__(self, "__qualname__", name)  # a record shows this name for a user's function
 
     def known_at(self, times: Array) -> Array:
         return np.asarray(times, dtype=float)[:, None]
@@ -243,19 +241,19 @@ class FunctionOfTime(TimedCost):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TrackingCost(TimedCost):
-    """(x - x_ref(t))' Q (x - x_ref(t)) + (u - u_ref(t))' R (u - u_ref(t)): a running cost that follows a reference.
+    """A running cost (x - x_ref(t))' Q (x - x_ref(t)) + (u - u_ref(t))' R (u - u_ref(t)) that tracks a reference.
 
-    The reference is a table, linear in between and constant after its ends. Its time [s] counts from the first state.
+    The reference is a table with linear interpolation, constant beyond its ends. Its time [s] is 0 at the first state.
 
     Args:
         reference: A Solution, a pair of Drake's trajectories (state, input) or one of the state, or arrays: times (M,)
-            [s], xs (M, nx) and, where inputs are followed too, us (M, nu). Drake's are sampled at 1,001 times.
-        Q: (nx, nx) weights of the states, as those of a `QuadraticCost`.
-        R: (nu, nu) weights of the inputs. Without a reference for them it is u' R u.
+            [s], xs (M, nx) and, to track inputs too, us (M, nu). Drake's trajectories are sampled at 1,001 times.
+        Q: (nx, nx) weights of the states, as in a `QuadraticCost`.
+        R: (nu, nu) weights of the inputs. Without an input reference the term is u' R u.
 
     Raises:
-        InputError: It is no such reference, or its times do not increase, or a weight is none.
-        ShapeError: Sizes do not fit each other, or, by the Problem, not the model.
+        InputError: The reference or a weight is invalid, or the times do not increase.
+        ShapeError: Sizes do not fit each other, or do not fit the model of the Problem.
 
     Example:
         >>> times = np.linspace(0.0, 1.0, 11)
@@ -316,13 +314,13 @@ class TrackingCost(TimedCost):
         return self._with(self.known_at(np.array([time]))[0])
 
     def along(self, times: Array) -> QuadraticCost:
-        """The cost at `times` (K,) [s], of K rows of states and inputs."""
+        """Return the cost at `times` (K,) [s] for K rows of states and inputs."""
         return self._with(self.known_at(times))
 
     def _with(self, known: Any) -> QuadraticCost:
-        """The cost with the references `known` (p,), or with those (K, p) of K rows."""
+        """Return the cost with the references `known` (p,), or (K, p) for K rows."""
         nx = self.reference[1].shape[1]
-        cost = copy.copy(self._form)  # type: ignore[attr-defined]  # whose weights were checked
+        cost = copy.copy(self._form)  # type: ignore[attr-defined]  # its weights are already checked
         object.__setattr__(cost, "x_ref", known[..., :nx] if self.Q is not None else None)
         held = self.reference[2] is not None and self.R is not None
         object.__setattr__(cost, "u_ref", known[..., nx:] if held else None)
@@ -330,7 +328,7 @@ class TrackingCost(TimedCost):
 
 
 def quadratic_along(cost: Any, times: Array) -> QuadraticCost | None:
-    """A running cost at `times` (K,) [s] as one QuadraticCost, its references of all or of each; None if it is none."""
+    """Return a running cost at `times` (K,) [s] as a QuadraticCost with one or K references, or None for others."""
     if isinstance(cost, TrackingCost):
         return cost.along(times)
     return cost if isinstance(cost, QuadraticCost) else None
@@ -338,7 +336,7 @@ def quadratic_along(cost: Any, times: Array) -> QuadraticCost | None:
 
 @dataclass(frozen=True, eq=False)
 class SumOfCosts(TimedCost):
-    """The sum of running costs, some of which change in time."""
+    """The sum of running costs, some of which may depend on time."""
 
     costs: tuple[Any, ...]
 
@@ -370,7 +368,7 @@ class SumOfCosts(TimedCost):
 
 
 def running_cost_of(given: Any) -> Any:
-    """What a Problem's `running_cost` means: a function of three variables is one of time, a sequence a sum."""
+    """Convert a Problem's `running_cost`. A function of three variables depends on time, and a sequence is a sum."""
     if isinstance(given, (list, tuple)):
         if not given:
             raise InputError("running_cost", got="an empty list", expected="costs")
@@ -381,8 +379,8 @@ def running_cost_of(given: Any) -> Any:
 
 
 def _table(reference: Any) -> tuple[Any, Any, Any]:
-    """(times, xs, us or None) of what `TrackingCost` takes."""
-    if hasattr(reference, "inputs_at_knots"):  # a Solution, which stands above this module
+    """Return (times, xs, us or None) of the reference of a `TrackingCost`."""
+    if hasattr(reference, "inputs_at_knots"):  # a Solution, whose module imports this one
         us = np.asarray(reference.inputs_at_knots)
         rows = us if len(us) == len(reference.xs) else np.vstack([us, us[-1:]])
         return reference.times, reference.xs, rows

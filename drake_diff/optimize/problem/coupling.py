@@ -1,9 +1,9 @@
-"""What joins several knots of a motion: functions of their states and inputs, motions that repeat, limits of rates.
+"""Constraints that join several knots of a motion: general couplings, periodic motions, and limits of rates.
 
-`Coupling.bound` gives a `BoundCoupling`: one `Constraint` on the states, and inputs, of its knots side by side, so that
-each method takes it as it takes any constraint. A limit of how fast inputs or accelerations change bounds, of a motion
-in continuous time, the slopes of its input and of x' within each interval. Held inputs change from one step to the
-next, and a discrete motion accelerates by (v_(k+1) - v_k) / h.
+`Coupling.bound` returns a `BoundCoupling`, one `Constraint` on the concatenated states, and inputs, of its knots, so
+that every method can treat it as an ordinary constraint. A limit on the rate of inputs or accelerations bounds the
+slopes of the input and of x' within each interval of a motion in continuous time. In discrete motions, inputs change
+from one step to the next, and the acceleration is (v_(k+1) - v_k) / h.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -23,21 +23,21 @@ FORM = "a function of the states at its knots, or of these and of the inputs the
 
 
 class Couples(Described):
-    """The base of all that joins several knots: plain values and functions, which hold no problem."""
+    """The base of all constraints that join several knots. It holds plain values and functions, and no problem."""
 
     name: str
 
     @property
     def label(self) -> str:
-        """What it is called in messages."""
+        """The name in messages."""
         return self.name
 
 
 class Joins(Couples):
-    """The base of what joins chosen knots."""
+    """The base of constraints that join selected knots."""
 
     def bound(self, num_steps: int, nx: int, nu: int, *, input_at_end: bool) -> "BoundCoupling":
-        """What has to hold of a motion of `num_steps` intervals; InputError where there are no such knots or entries.
+        """Return the constraint on a motion of `num_steps` intervals. Raises InputError for absent knots or entries.
 
         A discrete method has no input at the last knot, collocation has one (`input_at_end`).
         """
@@ -46,9 +46,9 @@ class Joins(Couples):
 
 @dataclass(frozen=True, eq=False)
 class BoundCoupling:
-    """lower <= rows(x, u) <= upper at each of some places: x the states at its knots side by side, u the inputs there.
+    """lower <= rows(x, u) <= upper at K places, where x are the concatenated states and u the inputs at its knots.
 
-    `knots` (K, n) are those of each of K places, 0 ... N, with the last of a place at its end.
+    `knots` (K, n) are the knots of each place, from 0 to N, with the last knot of a place in the last column.
     """
 
     rows: Constraint
@@ -56,20 +56,20 @@ class BoundCoupling:
 
     @property
     def label(self) -> str:
-        """What it is called in messages."""
+        """The name in messages."""
         return self.rows.label
 
     @property
     def takes_input(self) -> bool:
-        """Whether it joins the inputs too."""
+        """Whether it also joins inputs."""
         return self.rows.takes_input
 
     def packed(self, xs: Array, us: Array, knots: Indices) -> tuple[Array, Array]:
-        """(x, u) that `rows` takes at the rows `knots` (n,) of a motion xs (M+1, nx), us (M, nu) or (M+1, nu)."""
+        """Return the (x, u) of `rows` at the rows `knots` (n,) of a motion xs (M+1, nx), us (M, nu) or (M+1, nu)."""
         return xs[knots].ravel(), us[np.minimum(knots, len(us) - 1)].ravel()
 
     def excess(self, xs: Array, us: Array, where: Indices) -> tuple[float, int]:
-        """The largest excess over a bound, and the row of the last knot of its place; inf where a value is no number.
+        """Return the largest excess over a bound and the row of its place's last knot. It is inf if a value is NaN.
 
         The rows `where` (N+1,) of the motion are the problem's knots.
         """
@@ -81,7 +81,7 @@ class BoundCoupling:
             )
 
     def scales(self, xs: Array, us: Array, spans: Array) -> Array:
-        """(m,) how far the values go as states and inputs go their way `spans` (nx + nu,) along a motion."""
+        """Return the change (m,) of the values if states and inputs change by `spans` (nx + nu,) along a motion."""
         if not len(self.knots):
             return np.zeros(len(self.rows.lower))
         states, inputs = zip(*(self.packed(xs, us, knots) for knots in self.knots), strict=True)
@@ -90,7 +90,7 @@ class BoundCoupling:
         return self.rows.scales(np.array(states), np.array(inputs), np.concatenate(sides))
 
     def reach(self, xs: Array, us: Array) -> float:
-        """The largest range of a value as the last knot of a place moves along a motion: a tolerance's scale."""
+        """Return a tolerance's scale, the largest range of a value as the last knot of a place moves along a motion."""
         values = []
         with np.errstate(all="ignore"):
             if len(self.knots) > 1:
@@ -105,20 +105,20 @@ class BoundCoupling:
 class Coupling(Joins):
     """A constraint of a `Problem` that joins several knots: lower <= function(x_a, x_b, ...) <= upper.
 
-    Collocation and shooting keep it. A first state, input or waypoint that is given is no variable in it.
+    Collocation and shooting support it. A given first state, input or waypoint is a constant in it.
 
     Args:
         function: Takes the states (nx,) at the `knots`, in their order, and returns a number or (m,) numbers. With
-            twice as many arguments it takes the inputs (nu,) at the knots too, after the states. In ordinary arithmetic
-            and NumPy functions, through which AutoDiffXd can flow.
+            twice as many arguments it also takes the inputs (nu,) at the knots, after the states. It uses ordinary
+            arithmetic and NumPy functions that support AutoDiffXd.
         knots: Two or more whole numbers 0 ... N, where negative ones count from the end. A discrete method has no input
-            at knot N: of a function of inputs, -1 is knot N-1 there.
-        lower: A number or (m,) numbers; no limit where None.
+            at knot N, so that for a function of inputs -1 means knot N-1.
+        lower: A number or (m,) numbers; no limit if None.
         upper: The same; one of the two must be given.
-        name: What it is called in messages; the function's own name where not given.
+        name: The name in messages; by default the function's own name.
 
     Raises:
-        InputError: No function, no limit, or limits that cross; or, by the Problem, knots that it has not.
+        InputError: No function, no limit, limits that cross, or knots that the Problem does not have.
 
     Example:
         >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
@@ -144,7 +144,7 @@ class Coupling(Joins):
         knots = np.asarray(self.knots)
         if knots.ndim != 1 or len(knots) < 2 or not np.issubdtype(knots.dtype, np.integer):
             raise InputError("Coupling.knots", got=repr(self.knots), expected="two or more whole numbers")
-        limits = Constraint(lambda x: x, self.lower, self.upper, name=self.label)  # checks them
+        limits = Constraint(lambda x: x, self.lower, self.upper, name=self.label)  # checks the limits
         self._set(knots=tuple(knots.tolist()), lower=limits.lower, upper=limits.upper)
         if arguments_of(self.function) not in (0, len(knots), 2 * len(knots)):  # 0: *states
             got = f"{arguments_of(self.function)} arguments for {len(knots)} knots"
@@ -161,7 +161,7 @@ class Coupling(Joins):
 
     @property
     def takes_input(self) -> bool:
-        """Whether the function takes the inputs too."""
+        """Whether the function also takes the inputs."""
         return arguments_of(self.function) == 2 * len(self.knots)
 
     def bound(self, num_steps: int, nx: int, nu: int, *, input_at_end: bool) -> BoundCoupling:
@@ -179,7 +179,7 @@ class Coupling(Joins):
             return function(*np.split(x, count), *np.split(u, count))
 
         packed: Any = of_both if self.takes_input else of_states
-        packed.func = function  # by which messages name it
+        packed.func = function  # messages show the name of this function
         rows = Constraint(packed, self.lower, self.upper, name=self.label)
         return BoundCoupling(rows.resolved(np.zeros(count * nx), np.zeros(count * nu)), np.array([knots]))
 
@@ -191,19 +191,19 @@ class Coupling(Joins):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Periodic(Joins):
-    """A motion that repeats: x_N = M x_0 + offset, in all entries of the state or in some.
+    """A periodic motion: x_N = M x_0 + offset, for all or some entries of the state.
 
-    The first state is usually free, `optimize=("controls", "initial_state")`: a mask then says in which entries. With
-    an `offset` a motion repeats further on, such as a step of a walk, or a full turn. Collocation and shooting keep it.
+    The first state is usually free, `optimize=("controls", "initial_state")`, in all entries or those of a mask. An
+    `offset` displaces the repetition, as in a step of a walk or a full turn. Collocation and shooting support it.
 
     Args:
-        M: (n, nx) what of the first state the entries of the last one are; where None, each is its own. A mirror image
+        M: (n, nx) the map from the first state to the entries of the last one; the identity if None. A mirror image
             swaps left and right.
-        offset: (n,) what is added, in the states' units; 0 where None.
-        entries: The n entries of the state that repeat, as whole numbers; all nx of them where None.
+        offset: (n,) the displacement, in the states' units; 0 if None.
+        entries: The n periodic entries of the state, as whole numbers; all nx entries if None.
 
     Raises:
-        InputError: Values that are none; or, by the Problem, entries that its state has not.
+        InputError: Invalid values, or entries that the Problem's state does not have.
         ShapeError: Sizes that do not fit.
 
     Example:
@@ -245,7 +245,7 @@ class Periodic(Joins):
         M = np.eye(nx)[entries] if self.M is None else finite_array("Periodic.M", self.M, (len(entries), nx))
 
         def apart(first: Any, last: Any) -> Any:
-            """Sums over nonzeros alone, so that each row is one of the entries that it needs."""
+            """Sum over nonzero entries only, so that each row depends only on the entries that it needs."""
             moved = [sum(M[i, j] * first[j] for j in np.flatnonzero(M[i])) for i in range(len(entries))]
             return np.array([last[e] - m - offset[i] for i, (e, m) in enumerate(zip(entries, moved, strict=True))])
 
@@ -254,7 +254,7 @@ class Periodic(Joins):
 
 
 def excess_of(couplings: Sequence[BoundCoupling], xs: Array, us: Array, where: Indices) -> dict[str, tuple[float, int]]:
-    """The largest excess of each by its label, and the row of its last knot; see `BoundCoupling.excess`."""
+    """Return the largest excess by label and the row of its last knot; see `BoundCoupling.excess`."""
     excesses: dict[str, tuple[float, int]] = {}
     for c in couplings:
         worst = c.excess(xs, us, where)
@@ -266,7 +266,7 @@ System = Model | Dynamics
 
 
 class RateLimit(Couples):
-    """The base of both; `limit` is a number [per s], or a mapping from names to such numbers."""
+    """The base of `InputRate` and `Jerk`. `limit` is a number [per s], or a mapping from names to such numbers."""
 
     limit: Any
     of_inputs: bool
@@ -277,11 +277,11 @@ class RateLimit(Couples):
             self._set(limit=positive_float(f"{subject} [per s]", limit))
         elif not limit:
             raise InputError(subject, got="no names", expected="a limit for each name")
-        else:  # in the order that a record has
+        else:  # in the order of a record
             self._set(limit={str(name): positive_float(f"{subject} of {name}", limit[name]) for name in sorted(limit)})
 
     def entries(self, system: System) -> tuple[Indices, Array]:
-        """The inputs, or the entries of the state whose x' changes, that have a limit, and the limits."""
+        """Return the limited inputs, or the limited entries of x', and their limits."""
         kind = type(self).__name__
         if isinstance(system, DiscreteMap):
             raise InputError(kind, got="a DiscreteMap", expected="a system in time")
@@ -295,7 +295,7 @@ class RateLimit(Couples):
         return np.array(list(limits)), np.array(list(limits.values()))
 
     def of_steps(self, system: System, num_steps: int, time_step: float) -> BoundCoupling:
-        """What has to hold of a motion in `num_steps` steps of `time_step` [s]."""
+        """Return the constraint on a motion of `num_steps` steps of `time_step` [s]."""
         places, limits = self.entries(system)
 
         def change_of_input(x: Any, u: Any) -> Any:
@@ -317,16 +317,16 @@ class RateLimit(Couples):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class InputRate(RateLimit):
-    """How fast inputs may change: |du/dt| <= limit, or |u_(k+1) - u_k| <= limit * h where they are held over steps.
+    """A limit on the rate of inputs: |du/dt| <= limit, or |u_(k+1) - u_k| <= limit * h for inputs held over steps.
 
-    In collocation it bounds the slope at every moment, that of a parabola too. Collocation and shooting keep it.
+    Collocation bounds the slope at every time, also of a quadratic input. Collocation and shooting support it.
 
     Args:
-        limit: [input's unit per s], of all inputs; or a mapping from names of inputs to limits.
+        limit: [input's unit per s], for all inputs; or a mapping from names of inputs to limits.
 
     Raises:
-        InputError: A limit that is not above 0.
-        UnknownNameError: By the Problem: it has no such input.
+        InputError: A limit that is not positive.
+        UnknownNameError: The Problem has no such input.
 
     Example:
         >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
@@ -349,18 +349,18 @@ class InputRate(RateLimit):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Jerk(RateLimit):
-    """How fast accelerations may change: |dv'/dt| <= limit, or |v_(k+2) - 2 v_(k+1) + v_k| <= limit * h^2 in steps.
+    """A limit on the rate of accelerations: |dv'/dt| <= limit, or |v_(k+2) - 2 v_(k+1) + v_k| <= limit * h^2 in steps.
 
-    In collocation v' is the polynomial of its scheme, whose slope is bounded at every moment. The verdict rests on the
-    accelerations of the dynamics between the knots. Collocation and shooting keep it.
+    In collocation v' is the polynomial of its scheme, whose slope is bounded at every time. The verdict uses the
+    accelerations of the dynamics between the knots. Collocation and shooting support it.
 
     Args:
-        limit: [velocity's unit per s^2], of all velocities of a model; or a mapping to limits from names of velocities,
-            or of joints with one velocity. Of plain dynamics the names are those of the states whose x' it is of.
+        limit: [velocity's unit per s^2], for all velocities of a model; or a mapping to limits from names of
+            velocities, or of joints with one velocity. For plain dynamics, a name is that of a state with a limited x'.
 
     Raises:
-        InputError: A limit that is not above 0.
-        UnknownNameError: By the Problem: it has no such velocity.
+        InputError: A limit that is not positive.
+        UnknownNameError: The Problem has no such velocity.
 
     Example:
         >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
@@ -382,6 +382,6 @@ class Jerk(RateLimit):
         indices = {name: system.nq + i for i, name in enumerate(system.velocity_names)}
         for name, joint in labelled(joints(system.plant)).items():
             _, velocities = system.places(joint)
-            if joint.num_velocities() == 1 and len(velocities) == 1:  # none of a joint that follows another
+            if joint.num_velocities() == 1 and len(velocities) == 1:  # excludes a joint that is coupled to another
                 indices.setdefault(name, system.nq + velocities[0])
         return indices

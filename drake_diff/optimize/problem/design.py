@@ -1,7 +1,7 @@
-"""What a search through discrete steps may move beside states and inputs: parameters, and the length of a step.
+"""The variables of a search through discrete steps besides states and inputs: parameters, and the length of a step.
 
-Where a horizon is asked for, the length h = T / N of a step is one more parameter, `model.time_step`, behind the
-problem's own: a model with that step stands in for the model.
+If the problem has a horizon, the step length h = T / N is an additional parameter, `model.time_step`, after the
+problem's own parameters. A model with this step replaces the model.
 """
 
 from dataclasses import replace
@@ -18,13 +18,13 @@ from drake_diff.motion.intervals import roll
 
 
 class Design:
-    """The parameters of discrete steps, (np,) values, and coordinates c (nc,) of those that may change.
+    """The parameters of discrete steps as values (np,), and coordinates c (nc,) of the ones that may change.
 
     Args:
         model: the problem's model.
-        own: the problem's own parameters, with `bounds` (lower, upper) of their values, `free` to change or not.
-        horizon: (lower, upper) [s] of all steps where one is asked for, `start` where a search begins.
-        num_steps: how many there are.
+        own: the problem's own parameters, with `bounds` (lower, upper) of their values, and whether they are `free`.
+        horizon: (lower, upper) [s] of all steps, if given, with `start` as its initial value.
+        num_steps: the number of steps.
     """
 
     def __init__(
@@ -56,17 +56,17 @@ class Design:
 
     @property
     def count(self) -> int:
-        """nc: how many numbers may change."""
+        """The number nc of variables."""
         return len(self.moved)
 
     @property
     def start(self) -> Array:
-        """(nc,) the coordinates where a search begins."""
+        """The initial coordinates (nc,)."""
         return self.of_values(np.array(self.vector.values))
 
     @property
     def limits(self) -> tuple[Array, Array]:
-        """(lower (nc,), upper (nc,)) of the coordinates."""
+        """The bounds (lower (nc,), upper (nc,)) of the coordinates."""
         return self.of_values(self.lower), self.of_values(self.upper)
 
     @property
@@ -75,17 +75,17 @@ class Design:
         return self.has_step and self.own_count in self.moved
 
     def of_values(self, values: Array) -> Array:
-        """(nc,) the coordinates of values (np,)."""
+        """Return the coordinates (nc,) of values (np,)."""
         return self.coordinates.from_values(np.asarray(values, dtype=float)[self.moved])
 
     def values(self, c: Array) -> Array:
-        """(np,) the values at coordinates c (nc,)."""
+        """Return the values (np,) at coordinates c (nc,)."""
         values = np.array(self.vector.values)
         values[self.moved] = self.coordinates.to_values(c)
         return values
 
     def own_at(self, c: Any) -> Any:
-        """The problem's own parameters at coordinates c (nc,), which may be AutoDiffXd."""
+        """Return the problem's own parameters at coordinates c (nc,), which may be AutoDiffXd."""
         count = len(self.moved) - self.moves_step
         if not count:
             return self.vector.values[: self.own_count]
@@ -93,29 +93,29 @@ class Design:
         return self.coordinates.to_values(np.concatenate([c[:count], tail]))[:count]
 
     def at(self, c: Array) -> ParameterVector:
-        """The parameters at coordinates c (nc,)."""
+        """Return the parameters at coordinates c (nc,)."""
         return self.vector.at(self.values(c))
 
     def whole(self, values: Array, time_step: float) -> Array:
-        """(np,) the `values` of the problem's own parameters and the length of a step [s]."""
+        """Return all values (np,): those of the problem's own parameters, and the step length [s] if it is one."""
         return np.append(values, time_step) if self.has_step else np.asarray(values, dtype=float)
 
     def own(self, values: Array) -> Array:
-        """Those of the problem's own parameters among all values (np,)."""
+        """Return the problem's own parameters from all values (np,)."""
         return np.asarray(values)[: self.own_count]
 
     def time_step(self, values: Array) -> float:
-        """[s] the length of a step at the values (np,)."""
+        """Return the length of a step [s] at the values (np,)."""
         return float(values[self.own_count]) if self.has_step else self.model.time_step
 
     def pull_back(self, c: Array, by_values: Array) -> Array:
-        """(..., nc) the derivative by the coordinates from that by all values (..., np)."""
+        """Convert a derivative with respect to all values (..., np) to the coordinates (..., nc)."""
         if not self.count:
             return np.zeros((*by_values.shape[:-1], 0))
         return self.coordinates.pull_back(c, by_values[..., self.moved])
 
     def of_model(self, model: Model) -> "Design":
-        """The same of another model with the same parameters."""
+        """Return the same design for another model with the same parameters."""
         design: Any = object.__new__(Design)
         design.__dict__.update(self.__dict__)
         design.model, design.vector = model, replace(self.vector, model=model)
@@ -125,7 +125,7 @@ class Design:
 class ShootingVariables:
     """z = [free entries of the first state; us; parameters in their coordinates] and its rollout of N steps.
 
-    Given `around` (N+1, nx), the states are these instead of a rollout. Steps are linearized once for each z.
+    With `around` (N+1, nx), the states are these instead of a rollout. Steps are linearized once for each z.
     """
 
     def __init__(self, problem: Any, *, around: Array | None = None):
@@ -133,25 +133,25 @@ class ShootingVariables:
         self.free = np.flatnonzero(problem.initial_state_mask)
         self.shape = (problem.num_steps, problem.model.nu)
         num_inputs = self.shape[0] * self.shape[1] if problem.optimizes_controls else 0
-        self.inputs = slice(len(self.free), len(self.free) + num_inputs)  # where in z they are
+        self.inputs = slice(len(self.free), len(self.free) + num_inputs)  # the slice of z
         self.size = self.inputs.stop + self.design.count
         self._at: bytes | None = None
         self._linearization: list[StepDerivatives] = []
 
     def pack(self, x0: Array, us: Array, parameters: Array | None = None) -> Array:
-        """z (size,) from the first state x0 (nx,), us (N, nu) and parameter values (np,), the problem's where None."""
+        """Return z (size,) from x0 (nx,), us (N, nu) and parameter values (np,), by default the problem's."""
         inputs = us.ravel() if self.problem.optimizes_controls else np.zeros(0)
         values = self.design.vector.values if parameters is None else parameters
         return np.concatenate([x0[self.free], inputs, self.design.of_values(values)])
 
     def limits(self) -> tuple[Array, Array]:
-        """(lower, upper), each (size,): the bounds of the variables."""
+        """Return the bounds (lower, upper) of the variables, each (size,)."""
         b, count = self.problem.bounds, self.shape[0]
         lower = self.pack(b.x_lower, np.tile(b.u_lower, (count, 1)), self.design.lower)
         return lower, self.pack(b.x_upper, np.tile(b.u_upper, (count, 1)), self.design.upper)
 
     def unpack(self, z: Array) -> tuple[Array, Array]:
-        """x0 (nx,) and us (N, nu) from z (size,)."""
+        """Return x0 (nx,) and us (N, nu) from z (size,)."""
         x0 = np.array(self.problem.x0)
         x0[self.free] = z[: len(self.free)]
         if not self.problem.optimizes_controls:
@@ -159,19 +159,19 @@ class ShootingVariables:
         return x0, z[self.inputs].reshape(self.shape)
 
     def parameters(self, z: Array) -> ParameterVector:
-        """Those of the problem's `design` at z (size,)."""
+        """Return the parameters of the problem's `design` at z (size,)."""
         return self.design.at(z[self.inputs.stop :])
 
     def time_step(self, z: Array) -> float:
-        """[s] the length of a step at z (size,)."""
+        """Return the length of a step [s] at z (size,)."""
         return self.design.time_step(self.design.values(z[self.inputs.stop :]))
 
     def pull_back(self, z: Array, by_parameters: Array) -> Array:
-        """(..., nc) the derivative by the coordinates of the design in z."""
+        """Return the derivative (..., nc) with respect to the coordinates of the design in z."""
         return self.design.pull_back(z[self.inputs.stop :], by_parameters)
 
     def linearization(self, z: Array) -> list[StepDerivatives]:
-        """The step derivatives along the states of z."""
+        """Return the step derivatives along the states of z."""
         if z.tobytes() != self._at:
             (x0, us), vector = self.unpack(z), self.parameters(z)
             with self.problem.intervals(vector) as intervals:
@@ -181,7 +181,7 @@ class ShootingVariables:
         return self._linearization
 
     def states(self, z: Array) -> Array:
-        """(N+1, nx) the states of the rollout of z, or those given."""
+        """Return the states (N+1, nx) of the rollout of z, or the states `around`."""
         if self.around is not None:
             return self.around
         x0, us = self.unpack(z)
@@ -192,9 +192,9 @@ class ShootingVariables:
 
 
 def final_sensitivity(variables: ShootingVariables, z: Array) -> Array:
-    """(nx, size): d x_n / d z, backward: d x_n / d x_k from the last k on, in time and memory that grow as n.
+    """Return d x_n / d z (nx, size) by a backward recursion from the last step, in time and memory that grow as n.
 
-    Forward, all inputs' columns are carried through every step, which takes n^2.
+    A forward recursion would carry the columns of all inputs through every step, which costs n^2.
     """
     steps, nu = variables.linearization(z), variables.shape[1]
     jacobian, after = np.zeros((variables.problem.model.nx, variables.size)), np.eye(variables.problem.model.nx)

@@ -1,7 +1,7 @@
-"""Dynamics x' = f(x, u) at many knots at once, with exact derivatives: a plain function, or a model's equations.
+"""Dynamics x' = f(x, u) at many knots at once, with exact derivatives, from a plain function or a model's equations.
 
-A knot is a row [x, u] of (K, nx + nu), or [x, u, p] where there are parameters p. A function that also takes columns,
-x (nx, K) and u (nu, K), is called once for all knots; whether it does is tried once, against single calls.
+A knot is a row [x, u] of (K, nx + nu), or [x, u, p] if there are parameters p. A function that also accepts columns, x
+(nx, K) and u (nu, K), is called once for all knots, as found by a comparison with single calls.
 """
 
 import copy
@@ -29,18 +29,18 @@ from drake_diff.model.parameters import (
 from drake_diff.model.plant import joints, labelled, radius_of_gyration
 from drake_diff.optimize.problem.constraint import Bounds, arguments_of, carried, plant_limits, resolve_bounds
 
-SMALLEST_TRIED = 1e-3  # of a parameter's first value: where a smaller one's derivatives are certified
+SMALLEST_TRIED = 1e-3  # of a parameter's first value: a smaller one's derivatives are certified at this value
 SIDES = ("lower", "upper")
-UNKNOWN = "unknown"  # the unit of a number of plain dynamics
-SAME_VALUES = 1e-9  # of the largest: by what a function of numbers with derivatives may differ from that of plain ones
-PROBED = 3  # knots at which a function is tried before it is used
+UNKNOWN = "unknown"  # the unit of plain dynamics' states and inputs
+SAME_VALUES = 1e-9  # of the largest: allowed difference of a function's values with AutoDiffXd and floats
+PROBED = 3  # number of knots at which a function is checked before its use
 ORDINARY = "a function of x and u in ordinary arithmetic and NumPy functions, without float()"
 
 
 class Pointwise:
     """A function (x (nx,), u (nu,)) -> `shape`, () or (r,), in ordinary arithmetic, evaluated at many knots.
 
-    `probe` (3, nx + nu) are knots to try it at. Raises InputError or ShapeError where it is no such function.
+    `probe` (3, nx + nu) are knots for a first check. Raises InputError or ShapeError if the function fails it.
     """
 
     def __init__(self, subject: str, f: Callable[[Any, Any], Any], nx: int, shape: tuple[int, ...], probe: Array):
@@ -52,7 +52,7 @@ class Pointwise:
         with np.errstate(all="ignore"):
             single = self.values(probe)
             carried_values, slopes = self.linearize(probe)
-        terms = np.einsum("kri,ki->kr", np.abs(slopes), np.abs(probe))  # they may cancel, and be infinite at a root
+        terms = np.einsum("kri,ki->kr", np.abs(slopes), np.abs(probe))  # terms may cancel, or be infinite at a root
         largest = SAME_VALUES * float(np.max(np.nan_to_num([np.abs(single), terms], posinf=0.0), initial=0.0))
         if not np.allclose(carried_values, single, rtol=0, atol=largest, equal_nan=True):
             i = np.unravel_index(int(np.nanargmax(np.abs(carried_values - single))), single.shape)
@@ -62,19 +62,19 @@ class Pointwise:
             self.takes_columns = True
             together, _ = self.linearize(probe)
             self.takes_columns = bool(np.allclose(together, single, rtol=1e-12, atol=1e-12, equal_nan=True))
-        except Exception:  # whatever it is that f cannot do with columns: it need not
+        except Exception:  # f need not support columns, whatever the error is
             self.takes_columns = False
 
     def values(self, knots: Array) -> Array:
-        """(K, r) at `knots` (K, nx + nu)."""
+        """Return the values (K, r) at `knots` (K, nx + nu)."""
         if self.takes_columns:
             return np.asarray(self._call(knots.T, len(knots)), dtype=float).reshape(self.rows, -1).T
         return np.array([np.asarray(self._call(k), dtype=float).reshape(self.rows) for k in knots])
 
     def linearize(self, knots: Array) -> tuple[Array, Array]:
-        """(K, r) and the Jacobian (K, r, nx + nu) by AutoDiffXd at `knots` (K, nx + nu).
+        """Return the values (K, r) and, by AutoDiffXd, the Jacobian (K, r, nx + nu) at `knots` (K, nx + nu).
 
-        Raises GradientError where the result carries no derivative.
+        Raises GradientError if the result has no derivatives.
         """
         count, width = knots.shape
         if not self.takes_columns:
@@ -89,7 +89,7 @@ class Pointwise:
         return carried(self._call(z, *count).ravel(), width, self.subject, ORDINARY)
 
     def _call(self, z: Any, *count: int) -> Any:
-        with np.errstate(all="ignore"):  # a solver's trial point may leave the domain; it is told by NaN
+        with np.errstate(all="ignore"):  # a solver's trial point may leave the domain, which results in NaN
             result = np.array(self.f(z[: self.nx], z[self.nx :]))
         if result.shape != (*self.shape, *count) and not (self.shape == () and not count and result.shape == (1,)):
             raise ShapeError(f"{self.subject}: its result", got=result.shape, expected=(*self.shape, *count))
@@ -97,26 +97,26 @@ class Pointwise:
 
 
 class Dynamics:
-    """Plain dynamics x' = f(x, u), with exact derivatives: what a `Problem` takes where there is no model.
+    """Plain dynamics x' = f(x, u) with exact derivatives, as the system of a `Problem` without a model.
 
     Args:
         f: a function of x (nx,) and u (nu,) that returns the nx rates, in the states' units per second. Write it with
-            ordinary arithmetic and NumPy functions, without float() and without branches on the numbers: AutoDiffXd
-            has to flow through it. An object with its own `values(knots)` and `linearize(knots)` will do as well,
-            with the shapes of the methods of the same names here.
+            ordinary arithmetic and NumPy functions, without float() and without branches on the numbers, so that it
+            supports AutoDiffXd. An object with the methods `values(knots)` and `linearize(knots)` is also accepted,
+            with the shapes of the methods of the same names in this class.
         nx: number of states.
         nu: number of inputs.
-        x_lower, x_upper: (nx,) limits of the states; infinite where not given or NaN.
-        u_lower, u_upper: (nu,) limits of the inputs; infinite where not given or NaN.
-        state_names: nx names; x0, x1, ... where not given.
-        input_names: nu names; u0, u1, ... where not given.
-        parameters: mapping from names to values of numbers that a `Problem` may optimize, or set to others. `f` then is
-            a function of x, u and p (np,), in the mapping's order.
+        x_lower, x_upper: (nx,) limits of the states; infinite if not given or NaN.
+        u_lower, u_upper: (nu,) limits of the inputs; infinite if not given or NaN.
+        state_names: nx names; x0, x1, ... by default.
+        input_names: nu names; u0, u1, ... by default.
+        parameters: mapping from names to values of numbers that a `Problem` may optimize or change. `f` then is a
+            function of x, u and p (np,), in the mapping's order.
 
     Raises:
-        InputError: `f` is not such a function, or a limit or name does not fit; says what `f` did.
+        InputError: `f` is not such a function, with a description of the fault, or a limit or name does not fit.
         ShapeError: `f` does not return nx rates.
-        GradientError: the result of `f` carries no derivatives.
+        GradientError: the result of `f` has no derivatives.
 
     Example:
         >>> block = dd.Dynamics(lambda x, u: [x[1], u[0] - 0.5 * x[1]], nx=2, nu=1, u_lower=[-5], u_upper=[5])
@@ -140,7 +140,7 @@ class Dynamics:
         parameters: Mapping[str, Any] | ParameterVector | None = None,
     ):
         self.nx, self.nu = positive_int("nx", nx), positive_int("nu", nu)
-        self.model: Model | None = None  # whose states these are, where they are a model's
+        self.model: Model | None = None  # the model that defines the states, if any
         self.default_state = frozen(np.zeros(self.nx))
         self.state_names = _names("state_names", state_names, "x", self.nx)
         self.input_names = _names("input_names", input_names, "u", self.nu)
@@ -165,22 +165,22 @@ class Dynamics:
         return f"Dynamics of the states {states} under the inputs {inputs}{named}"
 
     def __call__(self, x: Any, u: Any) -> Array:
-        """(nx,) the rates at `x` (nx,), `u` (nu,)."""
+        """Return the rates (nx,) at `x` (nx,), `u` (nu,)."""
         return np.asarray(self.values(self._knot(x, u))[0])
 
     def derivatives(self, x: Any, u: Any) -> tuple[Array, Array, Array]:
-        """f (nx,), A = df/dx (nx, nx) and B = df/du (nx, nu) at `x` (nx,), `u` (nu,)."""
+        """Return f (nx,), A = df/dx (nx, nx) and B = df/du (nx, nu) at `x` (nx,), `u` (nu,)."""
         values, rows = self.linearize(self._knot(x, u))
         return values[0], rows[0][:, : self.nx], rows[0][:, self.nx :]
 
     def at(self, values: Any) -> "Dynamics":
-        """The same dynamics with their parameters at `values` (np,)."""
+        """Return the same dynamics with the parameter values `values` (np,)."""
         moved = copy.copy(self)
         moved.parameters = self.parameters.at(values)
         return moved
 
     def with_parameters(self, given: Any) -> "Dynamics":
-        """These dynamics of the parameters that `given` names alone, or also sets; the others stay as they are."""
+        """Return the dynamics with only the parameters in `given`, at its values if any. Others become constant."""
         parameters = self.parameters
         if isinstance(given, ParameterVector):
             given = given.to_dict()
@@ -204,7 +204,7 @@ class Dynamics:
 
     @property
     def of_no_parameters(self) -> "Dynamics":
-        """These dynamics with all parameters at their values."""
+        """The dynamics with all parameters as constants."""
         dynamics = copy.copy(self)
         dynamics.parameters, values = plain_parameters({}), self.parameters.values
         dynamics.form = self._chosen(lambda p: values)
@@ -215,7 +215,7 @@ class Dynamics:
         return list(zip(self.parameters.names, self.parameters.values.tolist(), strict=True))
 
     def _chosen(self, whole: Callable[[Any], Any]) -> Any:
-        """The form of other parameters p, where `whole` makes all of these dynamics' of p."""
+        """Return the form for other parameters p, where `whole` computes all parameters of these dynamics from p."""
         f, nu = self.form.f, self.nu
         form = copy.copy(self.form)
         form.takes_columns = False
@@ -223,25 +223,25 @@ class Dynamics:
         return form
 
     def values(self, knots: Array) -> Array:
-        """(K, nx) the rates at `knots` (K, nx + nu), rows [x, u]."""
+        """Return the rates (K, nx) at `knots` (K, nx + nu), rows [x, u]."""
         return np.asarray(self.form.values(self.whole(knots)))
 
     def linearize(self, knots: Array) -> tuple[Array, Array]:
-        """(K, nx) the rates and (K, nx, nx + nu) their Jacobians [A, B] at `knots` (K, nx + nu)."""
+        """Return the rates (K, nx) and their Jacobians [A, B] (K, nx, nx + nu) at `knots` (K, nx + nu)."""
         values, rows = self.form.linearize(self.whole(knots))
         return values, rows[:, :, : self.nx + self.nu]
 
     def whole(self, knots: Array) -> Array:
-        """(K, nx + nu + np) `knots` (K, nx + nu) with the parameters' values at their end."""
+        """Append the parameters' values to `knots` (K, nx + nu), which results in (K, nx + nu + np)."""
         values = self.parameters.values
         return np.hstack([knots, np.tile(values, (len(knots), 1))]) if len(values) else knots
 
     def probe(self) -> Array:
-        """(3, nx + nu) some knots within the bounds, to try a function at."""
+        """Return knots (3, nx + nu) within the bounds, to check a function at."""
         return probe_within(self.bounds)
 
     def limits(self, given: Bounds | None) -> Bounds:
-        """`given` with this dynamics' own bounds where it has none, checked."""
+        """Return `given`, checked, with these dynamics' own bounds for missing entries."""
         return resolve_bounds(given, vars(self.bounds), self.state_names, self.input_names)
 
     def _knot(self, x: Any, u: Any) -> Array:
@@ -251,12 +251,12 @@ class Dynamics:
 class DiscreteMap(Dynamics):
     """A map x_(k+1) = f(x_k, u_k), or f(x_k, u_k, k), with exact derivatives, as the system of a `Problem`.
 
-    Its time counts steps: the cost is sum_k running_cost(x_k, u_k) + final_cost(x_N), or running_cost(x, u, t) at
-    t = k. Events at known steps, such as a reset, are part of `f`: k is a plain whole number there.
+    Its time is the step index. The cost is sum_k running_cost(x_k, u_k) + final_cost(x_N), or running_cost(x, u, t) at
+    t = k. `f` may include events at known steps, such as a reset, because k is a plain whole number.
 
     Args:
         f: a function of x (nx,), u (nu,) and, if it has a third argument, the step k, that returns the nx next states.
-            Write it as that of `Dynamics`; it may branch on k.
+            The rules for the `f` of `Dynamics` apply; it may branch on k.
         nx, nu: numbers of states and inputs.
         x_lower, x_upper, u_lower, u_upper, state_names, input_names: as for `Dynamics`.
 
@@ -279,7 +279,7 @@ class DiscreteMap(Dynamics):
         return super().__repr__().replace("Dynamics", "DiscreteMap", 1)
 
     def at_step(self, k: int) -> Any:
-        """The map of step `k` alone, with the methods `values` and `linearize`."""
+        """Return the map of step `k`, with the methods `values` and `linearize`."""
         if not self.counts:
             return self.form
         if k not in self.steps:
@@ -289,7 +289,7 @@ class DiscreteMap(Dynamics):
         return self.steps[k]
 
     def values(self, knots: Array, steps: Any = None) -> Array:
-        """(K, nx) the next states at `knots` (K, nx + nu), rows [x, u], of the `steps` (K,); of step 0 where None."""
+        """Return the next states (K, nx) at `knots` (K, nx + nu), rows [x, u], for `steps` (K,), by default step 0."""
         knots = np.asarray(knots, dtype=float)
         states = np.empty((len(knots), self.nx))
         for k, rows in self._by_step(len(knots), steps):
@@ -297,7 +297,7 @@ class DiscreteMap(Dynamics):
         return states
 
     def linearize(self, knots: Array, steps: Any = None) -> tuple[Array, Array]:
-        """(K, nx) the next states and (K, nx, nx + nu) their Jacobians [A, B], as `values`."""
+        """Return the next states (K, nx) and their Jacobians [A, B] (K, nx, nx + nu); see `values`."""
         knots = np.asarray(knots, dtype=float)
         states, slopes = np.empty((len(knots), self.nx)), np.empty((len(knots), self.nx, self.nx + self.nu))
         for k, rows in self._by_step(len(knots), steps):
@@ -305,7 +305,7 @@ class DiscreteMap(Dynamics):
         return states, slopes
 
     def _by_step(self, count: int, steps: Any) -> Iterator[tuple[int, Any]]:
-        """Each step and its rows."""
+        """Yield each step and its rows."""
         if steps is None or not self.counts:
             yield 0, slice(None)
             return
@@ -315,18 +315,18 @@ class DiscreteMap(Dynamics):
 
 
 class MovedDynamics:
-    """x' = f(x, u, p) at knots [x, u, c], c (np,) the coordinates in which a solver moves the parameters."""
+    """x' = f(x, u, p) at knots [x, u, c], where c (np,) are a solver's coordinates of the parameters."""
 
     def __init__(self, dynamics: Dynamics, coordinates: ParameterCoordinates):
         self.dynamics, self.coordinates = dynamics, coordinates
         self.width = dynamics.nx + dynamics.nu
 
     def values(self, knots: Array) -> Array:
-        """(K, nx) the rates at `knots` (K, nx + nu + np)."""
+        """Return the rates (K, nx) at `knots` (K, nx + nu + np)."""
         return np.asarray(self.dynamics.form.values(self._by_values(knots)))
 
     def linearize(self, knots: Array) -> tuple[Array, Array]:
-        """(K, nx) the rates and (K, nx, nx + nu + np) their Jacobians."""
+        """Return the rates (K, nx) and their Jacobians (K, nx, nx + nu + np)."""
         values, rows = self.dynamics.form.linearize(self._by_values(knots))
         rows = np.array(rows)
         for k, c in enumerate(knots[:, self.width :]):
@@ -334,15 +334,15 @@ class MovedDynamics:
         return values, rows
 
     def probe(self) -> Array:
-        """(3, nx + nu + np) some knots to try a function at."""
+        """Return knots (3, nx + nu + np) to check a function at."""
         knots, start = self.dynamics.probe(), self.coordinates.start
         tail = self.coordinates.from_values(np.array(start.values))
         return np.hstack([knots, tail + 0.1 * np.linspace(0, 1, len(knots))[:, None] * np.where(tail == 0, 1.0, tail)])
 
     def tried_at(self, c: Array) -> tuple[Array, Array]:
-        """Coordinates (np,) near `c` whose derivatives can be told by differences, and how large each counts.
+        """Return coordinates (np,) near `c` at which differences verify derivatives, and the scale of each.
 
-        A parameter that Drake takes no negative value of is moved by parts of its own value, which is above 0.
+        A parameter that must not be negative in Drake varies in proportion to its own positive value.
         """
         coordinates, sizes = np.array(c), np.maximum(1.0, np.abs(c))
         for parameter, s in self.coordinates.start.pairs:
@@ -356,18 +356,18 @@ class MovedDynamics:
 
 
 def plant_dynamics(model: Model, parameters: Any = ()) -> Dynamics:
-    """A model's equations of motion in continuous time, with its own limits of positions, velocities and efforts.
+    """Return a model's equations of motion in continuous time, with its limits of positions, velocities and efforts.
 
     Args:
-        model: a model without PD control and without constraints. Contact is left out.
-        parameters: names of the model's parameters, or a mapping from names to values, that the dynamics have.
+        model: a model without PD control and without constraints. Contact is omitted.
+        parameters: the parameters of the dynamics: names of the model's parameters, or a mapping from names to values.
 
     Returns:
         `Dynamics` of x = [q; v] (nx,) under the actuation u (nu,), in the model's units.
 
     Raises:
         ModelError: the model has no continuous form.
-        InputError: a parameter is one of contact, which is left out.
+        InputError: a parameter belongs to contact, which is omitted.
 
     Example:
         >>> dynamics = dd.optimize.plant_dynamics(dd.load_model("models/pendulum.urdf", time_step=0.01))
@@ -391,10 +391,10 @@ def plant_dynamics(model: Model, parameters: Any = ()) -> Dynamics:
 
 
 class PlantKnots:
-    """`EquationsOfMotion` at many knots: with r the residual by inverse dynamics at the solved acceleration a,
+    """The equations of motion at many knots, with exact derivatives.
 
-    da = -M^-1 dr, which a tree of hinges and slides gives for all knots in one call, and AutoDiffXd knot by knot. Knots
-    [x, u, p] where the model has parameters p, all knots the same or not.
+    With r the residual of inverse dynamics at acceleration a, da = -M^-1 dr. A tree of revolute and prismatic joints
+    gives this for all knots in one call, AutoDiffXd for others. Knots [x, u, p] have parameters p, equal or not.
     """
 
     def __init__(self, model: Model, vector: ParameterVector):
@@ -413,7 +413,7 @@ class PlantKnots:
         return values
 
     def _alike(self, knots: Array) -> Iterator[tuple[Any, ParameterVector]]:
-        """The knots that have the same parameters; those with none that Drake takes are left out."""
+        """Yield the rows of knots with equal parameters, without knots whose parameters Drake rejects."""
         every, group = np.unique(knots[:, self.width :], axis=0, return_inverse=True)
         for i, values in enumerate(every):
             lower = np.concatenate([np.full(len(p.value), p.lower) for p in self.vector.parameters])
@@ -442,7 +442,7 @@ class PlantKnots:
         return values, rows
 
     def _linearize(self, knot: Array) -> tuple[Array, Array]:
-        """At a knot [x, u, p]; its parameters are applied."""
+        """Linearize at a knot [x, u, p], whose parameters are applied."""
         variables, nx = InitializeAutoDiff(knot).ravel(), self.model.nx
         if len(knot) > self.width:
             write_autodiff(self.vector, self.model, variables[self.width :])
@@ -457,18 +457,18 @@ def _names(subject: str, given: Sequence[str] | None, letter: str, count: int) -
     return names
 
 
-# Coordinates by name: what a user calls them, and where they are in the state and the input.
+# Functions for coordinates by name: users' names and their places in the state and the input.
 
 
 def coordinates(system: Model | Dynamics, subject: str, given: Mapping[str, Any]) -> dict[int, Any]:
-    """`given` by the places in the state that its names are of; see `places_of` and `by_place`."""
+    """Convert names to places in the state; see `places_of` and `by_place`."""
     return by_place(subject, places_of(system), given)
 
 
 def by_place(subject: str, known: Mapping[str, int], given: Mapping[str, Any]) -> dict[int, Any]:
-    """`given` by the places that its names are `known` at.
+    """Convert the names of `given` to the places that are `known` for them.
 
-    Raises UnknownNameError of a name that is none, InputError where two are of the same place.
+    Raises UnknownNameError for an unknown name, and InputError if two names have the same place.
     """
     values = dict[int, Any]()
     for name, value in given.items():
@@ -484,19 +484,19 @@ def by_place(subject: str, known: Mapping[str, int], given: Mapping[str, Any]) -
 
 
 def places_of(system: Model | Dynamics) -> dict[str, int]:
-    """The place in the state of each of its names, and of joints with one position by the joint's own name."""
+    """Return the place in the state of each state name, and of the name of each joint with one position."""
     places = {name: i for i, name in enumerate(system.state_names)}
     model = system if isinstance(system, Model) else system.model
     if model is not None:
         for name, joint in labelled(joints(model.plant)).items():
             positions, _ = model.places(joint)
-            if joint.num_positions() == 1 and len(positions) == 1:  # none of a joint that follows another
+            if joint.num_positions() == 1 and len(positions) == 1:  # excludes a joint that is coupled to another
                 places.setdefault(name, positions[0])
     return places
 
 
 def state_of(system: Model | Dynamics, subject: str, given: Any, elsewhere: Array) -> Any:
-    """A mapping from names to values as a state (nx,), as `elsewhere` in its other entries; anything else as it is."""
+    """Convert a mapping from names to values to a state (nx,), with `elsewhere` for other entries, or return it."""
     if not isinstance(given, Mapping):
         return given
     state = np.array(elsewhere, dtype=float)
@@ -506,9 +506,9 @@ def state_of(system: Model | Dynamics, subject: str, given: Any, elsewhere: Arra
 
 
 def bounds_of(system: Model | Dynamics, given: Any) -> Any:
-    """A mapping from names to (lower, upper), None where there is none, as `Bounds`; anything else as it is.
+    """Convert a mapping from names to (lower, upper), with None for no bound, to `Bounds`. Return other values as is.
 
-    A name is that of a coordinate or, where there is no such, of an input.
+    A name belongs to a coordinate or, if no such coordinate exists, to an input.
     """
     if not isinstance(given, Mapping):
         return given
@@ -532,10 +532,10 @@ def bounds_of(system: Model | Dynamics, given: Any) -> Any:
 
 
 def vectors_of(model: Model) -> list[tuple[Indices, Indices, float, bool]]:
-    """Where a model's state has the translation or rotation of each joint and its rate, and whether it is a rotation.
+    """Return each joint's places of translation or rotation and of its rate, its size, and whether it rotates.
 
-    The entries of each are one quantity: which of them moves depends on the axes. Before the last is its natural
-    size: a radian, or the radius of gyration [m] of the body that the joint moves.
+    The entries of each are one quantity, whose moving entries depend on the axes. The natural size is a radian, or the
+    radius of gyration [m] of the body that the joint moves.
     """
     vectors, units = list[tuple[Indices, Indices, float, bool]](), [c.unit for c in model.contract.positions]
     rates = [c.unit for c in model.contract.velocities]
@@ -551,13 +551,13 @@ def vectors_of(model: Model) -> list[tuple[Indices, Indices, float, bool]]:
 
 
 def probe_within(b: Bounds) -> Array:
-    """(3, nx + nu) some knots within bounds, to try a function at."""
+    """Return knots (3, nx + nu) within bounds, to check a function at."""
     lower, upper = np.concatenate([b.x_lower, b.u_lower]), np.concatenate([b.x_upper, b.u_upper])
     return np.clip(np.random.default_rng(0).uniform(0.5, 1.5, (PROBED, len(lower))), lower, upper)
 
 
 def units_of(problem: Any) -> tuple[str, ...]:
-    """(nx + nu,) the units of the states and inputs of a `Problem`."""
+    """Return the units (nx + nu,) of the states and inputs of a `Problem`."""
     if problem.moved is None:
         return (UNKNOWN,) * (problem.nx + problem.nu)
     contract = problem.moved.contract

@@ -1,4 +1,4 @@
-"""A model whose points the world holds while a phase lasts: a foot that stands, a hand that holds on."""
+"""A model with points fixed to the world during a phase, such as a foot in stance or a hand on a handle."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,26 +17,25 @@ from drake_diff.optimize.problem.constraint import Constraint, plant_limits
 from drake_diff.optimize.problem.dynamics import Dynamics
 
 AXES = "xyz"
-STAYS = 1e-3  # [m] how far a held point may drift from its place
-STAYS_CLOSED = 1e-5  # [m, N s] of the gap and the impulses of an impact, as of every constraint of a plan
+STAYS = 1e-3  # [m], the allowed drift of a fixed point from its place
+STAYS_CLOSED = 1e-5  # [m, N s], for the gap and the impulses of an impact, as for every constraint of a plan
 
 
 class FixedContacts(Dynamics):
-    """The equations of motion of a model with points that are held in place, as the system of a `Problem`.
+    """The equations of motion of a model with points that are fixed to the world, as the system of a `Problem`.
 
-    The forces that hold them are part of the motion: see `forces`, and `kept` for what a foot asks of them. The
-    equations hold the points' accelerations; a start at rest, and that they stay, are constraints that `kept` gives.
+    The forces that fix them are part of the motion: see `forces`, and `kept` for limits on a foot's forces. The
+    equations constrain the points' accelerations. The constraints of `kept` make them start at rest and stay in place.
     Between a flight and a stance, `impact` is the reset of a rigid, inelastic impact.
 
     Args:
-        model: A tree of hinges and slides without contact, PD control and constraints.
-        points: The frame, or body, that carries the point at its origin; or a mapping from frames to points (3,) [m]
-            in them.
-        axes: Which coordinates of the world are held. What no joint moves, such as y of a planar leg, is left out.
+        model: A tree of revolute and prismatic joints without contact, PD control and constraints.
+        points: The frame, or body, whose origin is fixed; or a mapping from frames to points (3,) [m] in these frames.
+        axes: The world coordinates that are fixed, without those that no joint moves, such as y of a planar leg.
 
     Raises:
-        ModelError: The model is no such tree, or the coordinates depend on each other.
-        UnknownNameError: There is no such frame.
+        ModelError: The model is not such a tree, or the coordinates depend on each other.
+        UnknownNameError: A frame does not exist.
 
     Example:
         >>> model = dd.load_model("models/hopper.sdf", time_step=0.01, contact=False)
@@ -81,41 +80,41 @@ class FixedContacts(Dynamics):
         return [AXES.index(axis) for axis in self.axes]
 
     def to_dict(self) -> dict[str, Any]:
-        """The points and axes, for a record."""
+        """Return the points and axes, for a record."""
         return {"points": {name: point.tolist() for name, point in self.points.items()}, "axes": self.axes}
 
     def forces(self, x: Any, u: Any) -> Any:
-        """(m,) [N] the forces on the model that hold the points, one for each of `rows`, in any arithmetic."""
+        """Return the forces [N] (m,) on the model at the fixed points, one for each of `rows`, in any arithmetic."""
         return self.plant.expressions["forces"](np.concatenate([np.asarray(x), np.asarray(u)]))
 
     def places(self, x: Any) -> Any:
-        """(m,) [m] the coordinates that are fixed."""
+        """Return the fixed coordinates [m] (m,)."""
         return np.asarray(self.plant.places(x))[self.plant.rows]
 
     def speeds(self, x: Any) -> Any:
-        """(m,) [m/s] the velocities of these."""
+        """Return the velocities [m/s] (m,) of the fixed coordinates."""
         return np.asarray(self.plant.speeds(x))[self.plant.rows]
 
     @property
     def impact(self) -> "Impact":
-        """The reset of a rigid, inelastic impact that stops the points: from the state before, the state after."""
+        """The reset of a rigid, inelastic impact that stops the points, from the state before to the state after."""
         return Impact(self)
 
     def kept(self, at: Any = None, *, friction: float | None = None, tolerance: float = STAYS) -> list[Constraint]:
-        """What a stance keeps: it begins at rest, its points stay, the ground only pushes, and no foot slides.
+        """Return a stance's constraints: it starts at rest, points stay in place, the ground only pushes, feet stick.
 
         Args:
-            at: (m,) [m] where the points are, one for each of `rows`, NaN where any place will do; a number is the
-                height z of all, and None asks for no place.
-            friction: The ground's coefficient, with its normal along z: forces up, and within the friction cone.
-                None asks nothing of the forces: a hand that holds on.
-            tolerance: [m] how far a point may drift from its place.
+            at: (m,) [m] the coordinates of the points, one for each of `rows`, NaN where free; a number is the height z
+                of all points, and None leaves all coordinates free.
+            friction: The ground's coefficient, with its normal along z: forces point up and lie within the friction
+                cone. None leaves the forces free, as for a hand on a handle.
+            tolerance: [m] the allowed drift of a point from its place.
 
         Returns:
             Constraints of a `Problem` of this system.
 
         Raises:
-            InputError: Something does not fit.
+            InputError: An argument does not fit.
 
         Example:
             >>> model = dd.load_model("models/hopper.sdf", time_step=0.01, contact=False)
@@ -154,7 +153,7 @@ class FixedContacts(Dynamics):
                 yield Constraint(cone, lower=cone_limits(along), name=f"{name} does not slide")
 
     def normals(self) -> Iterator[tuple[str, int, list[int]]]:
-        """Of each point its name, and which of `rows` are its z, and its x and y."""
+        """Yield the name of each point, and the indices in `rows` of its z and of its x and y."""
         for name in self.points:
             rows = {row[-1]: i for i, row in enumerate(self.rows) if row[:-2] == name}
             if "z" not in rows:
@@ -164,7 +163,7 @@ class FixedContacts(Dynamics):
 
 @dataclass(frozen=True, eq=False)
 class _Stacked:
-    """The chosen coordinates of several functions of the state, one after the other."""
+    """Selected coordinates of several functions of the state, concatenated."""
 
     functions: Sequence[Any]
     columns: list[int]
@@ -174,25 +173,25 @@ class _Stacked:
 
 
 class Impact:
-    """A rigid impact of points that the world holds, or throws back, as the reset between two phases.
+    """A rigid impact that stops or reflects points at the world, as the reset between two phases.
 
         [M  -J'] [v+]   [M v-    ]
         [J   0 ] [P ] = [-e J v- ]
 
-    With J v the velocities of the fixed coordinates and e the restitution. All of these coordinates are in the impact:
-    with axes="z" a point slides without friction, with all axes it sticks. Given `at`, the impact comes where the gap
-    closes, also in the chain of all phases, and its feedback is led back through the saltation matrix
-    dR/dx + (f+ - dR/dx f-) g' / (g' f-), with R the reset, f the rates, and g the gap.
+    Here J v are the velocities of the fixed coordinates and e is the restitution. The impact acts on all of these
+    coordinates: with axes="z" a point slides without friction, with all axes it sticks. With `at`, the impact occurs
+    when the gap closes, also in the chain of all phases, and its feedback uses the saltation matrix dR/dx + (f+ - dR/dx
+    f-) g' / (g' f-), with R the reset, f the rates, and g the gap.
 
     Args:
         contacts: The points.
         restitution: e, from 0 (the points stop) to 1.
-        at: Where the points meet the world: the height z of all, or (m,) places of `contacts.rows`, NaN where there is
-            no gap. None where the plan alone says when the impact comes.
-        friction: The coefficient within which the impulses have to stay; None asks nothing of them.
+        at: The place of the points in the impact: the height z of all, or (m,) places of `contacts.rows`, NaN where
+            there is no gap. With None, the plan alone determines the time of the impact.
+        friction: The friction coefficient that limits the impulses; None leaves them free.
 
     Raises:
-        InputError: A number does not fit.
+        InputError: An argument does not fit.
 
     Example:
         >>> model = dd.load_model("models/hopper.sdf", time_step=0.01, contact=False)
@@ -213,46 +212,46 @@ class Impact:
         self.where = contacts._where(at)
         self.gap_rows = np.flatnonzero(~np.isnan(self.where))
         self.friction = None if friction is None else positive_float("friction", friction)
-        self.__qualname__ = f"the impact of {', '.join(contacts.rows)}"  # by which a problem in phases tells it
+        self.__qualname__ = f"the impact of {', '.join(contacts.rows)}"  # the name in a problem with phases
 
     def __repr__(self) -> str:
         return f"Impact of {', '.join(self.contacts.rows)}: restitution {self.restitution:g}"
 
     @property
     def has_gap(self) -> bool:
-        """Whether the impact comes where a gap closes, and not when the plan says."""
+        """Whether the impact occurs when a gap closes rather than at the time of the plan."""
         return len(self.gap_rows) > 0
 
     def __call__(self, x: Any) -> Any:
-        """(nx,) the state after the impact, from the state `x` (nx,) before, in any arithmetic."""
+        """Return the state (nx,) after the impact from the state `x` (nx,) before it, in any arithmetic."""
         x, nq = np.asarray(x), self.contacts.plant.model.nq
         jump = self.contacts.plant.expressions["jump"](np.concatenate([x, np.zeros(self.contacts.nu)]))
         return np.concatenate([x[:nq], x[nq:] + (1 + self.restitution) * jump])
 
     def impulses(self, x: Any) -> Any:
-        """(m,) [N s] on the points, one for each of `contacts.rows`, in any arithmetic."""
+        """Return the impulses [N s] (m,) on the points, one for each of `contacts.rows`, in any arithmetic."""
         impulses = self.contacts.plant.expressions["impulses"](
             np.concatenate([np.asarray(x), np.zeros(self.contacts.nu)])
         )
         return (1 + self.restitution) * impulses
 
     def gaps(self, x: Any) -> Any:
-        """[m] how far the points are from where they meet the world, in any arithmetic."""
+        """Return the distances [m] of the points from their places in the impact, in any arithmetic."""
         return self.contacts.places(x)[self.gap_rows] - self.where[self.gap_rows]
 
     def first_gap(self, x: Array) -> float:
-        """[m] the smallest of the gaps."""
+        """Return the smallest of the gaps [m]."""
         return float(np.min(self.gaps(x)))
 
     def by_drake(self, x: Array) -> Array:
-        """(nx,) the state after, by Drake's mass matrix and velocities."""
+        """Return the state (nx,) after the impact from Drake's mass matrix and velocities."""
         jump, _ = self.contacts.plant.jump_at(np.asarray(x, dtype=float))
         after = np.array(x, dtype=float)
         after[self.contacts.plant.model.nq :] += (1 + self.restitution) * jump
         return after
 
     def broken_rules(self, x: Array) -> list[str]:
-        """What of the impact at `x` (nx,) the world does not do: a gap that is open, a pull, a slide."""
+        """List physical violations of the impact at `x` (nx,): an open gap, a pull, or sliding."""
         faults = [
             f"{self.contacts.rows[i]} has a gap of {gap:.3g} m"
             for i, gap in zip(self.gap_rows, self.gaps(x), strict=True)
@@ -270,7 +269,7 @@ class Impact:
         return faults
 
     def saltation(self, x: Array, rates: Array, rates_after: Array) -> Array:
-        """(nx, nx) of the rates (nx,) before and after; the reset's own derivative where no single gap closes."""
+        """Return the saltation matrix (nx, nx) for rates (nx,) before and after, or dR/dx if no single gap closes."""
         nx, nq = self.contacts.nx, self.contacts.plant.model.nq
         reset = np.eye(nx)
         slopes = self.contacts.plant.expressions["jump"].jacobian(np.concatenate([x, np.zeros(self.contacts.nu)]))[
@@ -286,10 +285,10 @@ class Impact:
         return np.asarray(reset + np.outer(rates_after - reset @ rates, row) / closing)
 
     def kept(self) -> list[Constraint]:
-        """What the phase before ends with: the gaps are closed, and with friction the impulses push and do not slide.
+        """Return constraints on the end of the previous phase: closed gaps and, with friction, pushing and no sliding.
 
         Returns:
-            Constraints at its last knot.
+            Constraints at the last knot of that phase.
 
         Example:
             >>> model = dd.load_model("models/hopper.sdf", time_step=0.01, contact=False)
@@ -312,13 +311,13 @@ class Impact:
         return constraints
 
     def to_dict(self) -> dict[str, Any]:
-        """What a record tells of it."""
+        """Return the values for a record."""
         positions = [None if np.isnan(position) else float(position) for position in self.where]
         return self.contacts.to_dict() | {"restitution": self.restitution, "at": positions, "friction": self.friction}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any], model: Model) -> "Impact":
-        """The same again; InputError where `values` are none."""
+        """Create an impact from a record. Raises InputError for invalid `values`."""
         try:
             contacts = FixedContacts(model, values["points"], axes=values["axes"])
             positions = [np.nan if position is None else position for position in values["at"]]
@@ -328,7 +327,7 @@ class Impact:
 
 
 def friction_cone(f: Any, z: int, along: list[int], friction: float) -> Any:
-    """friction f_z - f_t and friction f_z + f_t, or of two directions friction^2 f_z^2 - f_x^2 - f_y^2."""
+    """Return friction f_z - f_t and friction f_z + f_t, or for two directions friction^2 f_z^2 - f_x^2 - f_y^2."""
     if len(along) == 1:
         most, t = friction * f[z], f[along[0]]
         return np.array([most - t, most + t])
@@ -336,11 +335,11 @@ def friction_cone(f: Any, z: int, along: list[int], friction: float) -> Any:
 
 
 def cone_limits(along: list[int]) -> Any:
-    """The lower limits of a friction cone: of one direction it is two half planes."""
+    """Return the lower limits of a friction cone, which is two half planes for one direction."""
     return np.zeros(2) if len(along) == 1 else 0.0
 
 
-# What the constraints of a stance and, of the state before, of an impact limit; by the names that a record has.
+# The constrained quantities of a stance, and of the state before an impact, by their names in a record.
 QUANTITIES: dict[str, Any] = {
     "FixedSpeeds": lambda contacts: lambda x: contacts.speeds(x),
     "FixedPositions": lambda contacts, rows: lambda x: contacts.places(x)[rows],
@@ -355,13 +354,13 @@ QUANTITIES: dict[str, Any] = {
 
 
 def quantity(source: FixedContacts | Impact, kind: str, **values: Any) -> Any:
-    """One of the QUANTITIES, which a record knows by its `kind` and `values`."""
+    """Return one of the QUANTITIES, which a record stores by its `kind` and `values`."""
     described = {"impact": source.to_dict()} if isinstance(source, Impact) else {}
     return recorded(QUANTITIES[kind](source, **values), kind, **described, **values)
 
 
 def recorded_quantity(system: Any, kind: str, values: dict[str, Any]) -> Any:
-    """The quantity that a record has, on a model or on fixed contacts."""
+    """Return the quantity of a record, on a model or on fixed contacts."""
     given = dict(values)
     if "impact" in given:
         model = system.plant.model if isinstance(system, FixedContacts) else system

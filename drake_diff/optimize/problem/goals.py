@@ -1,11 +1,11 @@
-"""What a robot is to do, in its own words: a hand at a target, joints at angles, a tray kept level.
+"""Goals of a robot in task space: a hand at a target, joints at angles, a tray kept level.
 
-A goal is a few plain values and holds no model. The `Problem` binds it to its own: names are checked there, and what
-comes out are `GoalConstraint`s, which every method takes as it takes any `Constraint`. A record has the values, and
-`verify` binds them again. `marks` is what a page draws.
+A goal is a few plain values and refers to no model. The `Problem` binds it to its model, which checks the names and
+returns `GoalConstraint`s, which every method treats as ordinary `Constraint`s. A record contains the values, and
+`verify` binds them again. `marks` returns the shapes that a page draws.
 
-A plan aims at the middle of a goal's tolerance (see AIMED), and each replay on which the verdict rests has all of it:
-steps of another length end a little elsewhere.
+A plan aims at the middle of a goal's tolerance (see AIMED). Each replay that the verdict uses has the whole tolerance,
+because steps of another length lead to slightly different states.
 """
 
 import math
@@ -32,12 +32,12 @@ from drake_diff.optimize.problem.constraint import Constraint, Described
 from drake_diff.optimize.problem.dynamics import coordinates
 
 LAST = (-1,)
-AIMED = 0.1  # of a tolerance: what a plan may use of it; the rest is for what steps of other lengths do to it
-STAYED = 0.5  # the same of a goal that stays so for a while
+AIMED = 0.1  # of a tolerance: part for the plan; the rest is for deviations in steps of other lengths
+STAYED = 0.5  # the same for a goal that holds over a time interval
 ROUNDED = 1e-9  # of an interval
-USED = 0.9  # the same of a tolerance that is there to be used
-SAME_ROTATION = 1e-3  # of a quaternion's norm from 1: typed by hand, it is made one
-SMALLEST_BALL = 0.015  # [m] the radius of what is drawn
+USED = 0.9  # the same for a tolerance that a plan may use almost fully
+SAME_ROTATION = 1e-3  # largest deviation of a quaternion's norm from 1, as typed by users; it is normalized
+SMALLEST_BALL = 0.015  # [m] the smallest radius of a drawn ball
 GREEN = (0.18, 0.49, 0.2, 0.8)  # red, green, blue, opacity
 
 FREE = (None, None, None)
@@ -45,7 +45,7 @@ FREE = (None, None, None)
 
 @dataclass(frozen=True)
 class Mark:
-    """What a page draws of a goal: a shape of a size [m], posed in a frame of the model; plain values.
+    """A shape of a size [m] that a page draws for a goal, posed in a frame of the model; plain values.
 
     `shape` and its `size`: "sphere" (radius), "box" (edges x, y, z), "axes" (length of each), "arrow" (x, y, z).
     """
@@ -56,23 +56,23 @@ class Mark:
     position: tuple[float, ...] = (0.0, 0.0, 0.0)  # [m] in `frame`
     rotation: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     frame: str = "world"
-    in_world: bool = False  # whether `rotation` and the arrow are those of the world's axes, wherever the frame turns
+    in_world: bool = False  # whether `rotation` and the arrow refer to the world's axes rather than the frame's
     colour: tuple[float, float, float, float] = GREEN
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GoalConstraint(Constraint):
-    """A constraint of the state that a goal comes to.
+    """A constraint on the state that represents a goal.
 
-    A plan keeps its bounds, a replay may `miss` what is wanted by `tolerance`; both are in `unit`. `norm` is the order
-    of the norm of several rows.
+    A plan satisfies its bounds. A replay may deviate (`miss`) from the wanted values by `tolerance`. Both are in
+    `unit`. `norm` is the order of the norm of several rows.
     """
 
     tolerance: float = 0.0
     unit: str = "m"
     norm: float = 2.0
-    dwells: bool = False  # whether it holds all along between its knots
-    measured: Any = None  # a function of the state whose norm the miss is, where the bounded one is another
+    dwells: bool = False  # whether it also applies between its knots
+    measured: Any = None  # a function of the state whose norm is the miss, if it differs from the bounded function
 
     @property
     def whole(self) -> bool:
@@ -80,20 +80,20 @@ class GoalConstraint(Constraint):
 
     @property
     def wanted(self) -> Array:
-        """(m,) the middle of the bounds, NaN of a row that has one at most."""
+        """The middle of the bounds (m,), or NaN for a row with at most one bound."""
         both = np.isfinite(self.lower) & np.isfinite(self.upper)
         return np.where(both, np.where(both, self.lower, 0.0) / 2 + np.where(both, self.upper, 0.0) / 2, np.nan)
 
     def residuals(self, x: Any) -> Any:
-        """What is missed at x (nx,), of floats, AutoDiffXd or symbols, where something in the middle is wanted."""
+        """Return the residuals at x (nx,), of floats, AutoDiffXd or symbols, of the rows with a wanted value."""
         if self.measured is not None:
             return self.measured(x)
         return (np.asarray(self.function(x)) - self.wanted)[~np.isnan(self.wanted)]
 
     def miss(self, x: Array) -> float:
-        """How far x (nx,) is from what is wanted; inf where it is no number.
+        """Return the deviation of x (nx,) from the goal, or inf if it is not a number.
 
-        The distance from the middle of the bounds, and from the one that there is where there is one.
+        It is the distance from the middle of the bounds, or the excess over the bound of a row with one bound.
         """
         if self.measured is not None:
             off = self.measured(x)
@@ -105,13 +105,13 @@ class GoalConstraint(Constraint):
         return size if np.isfinite(size) else float("inf")
 
     def told(self, miss: float) -> str:
-        """A clause about a motion whose largest `miss` this is: "hand position is 0.3 mm off"."""
+        """Return a clause about a motion with the largest miss `miss`: "hand position is 0.3 mm off"."""
         return f"{self.label} is {in_words(miss, self.unit)} off"
 
 
 def in_words(value: float, unit: str) -> str:
-    """A length, an angle or a speed as people write it: 0.31 mm, 0.002 rad."""
-    if unit in ("m", "m/s") and abs(value) < 0.0995:  # which two digits would make 1e+02 mm
+    """Format a length, an angle or a speed for people, such as 0.31 mm or 0.002 rad."""
+    if unit in ("m", "m/s") and abs(value) < 0.0995:  # two digits would print 1e+02 mm above this
         return f"{1000 * value:.2g} m{unit}"
     return f"{value:.2g} {unit}"
 
@@ -119,7 +119,7 @@ def in_words(value: float, unit: str) -> str:
 class Goal(Described):
     """The base of all goals, which a `Problem` binds to its model.
 
-    One that has a `weight` is not kept: the weighted square of what it misses is added to the cost instead.
+    A goal with a `weight` is not a constraint. The weighted square of its residuals is added to the cost instead.
     """
 
     weight: float | None = None
@@ -137,30 +137,30 @@ class Goal(Described):
         self._check()
 
     def _check(self) -> None:
-        """Refuse values that do not go together."""
+        """Raise InputError for values that do not fit each other."""
 
     def targets(self, model: Model) -> Iterator["Target"]:
-        """What has to be where; UnknownNameError where a model has no such frame or joint."""
+        """Yield the targets on a model. Raises UnknownNameError if the model does not have a frame or joint."""
         raise NotImplementedError
 
     def bind(self, model: Model) -> tuple[GoalConstraint, ...]:
-        """What has to hold of a motion of `model`."""
+        """Return the constraints on a motion of `model`."""
         return tuple(target.constraint(self.knots) for target in self.targets(model))
 
     def bind_to(self, problem: Any) -> tuple[GoalConstraint, ...]:
-        """The same of a motion that a `Problem` asks for, where more than its model matters."""
+        """Return the constraints on a motion of a `Problem`, for goals that depend on more than its model."""
         return self.bind(problem.model)
 
     def marks(self) -> tuple[Mark, ...]:
-        """What a page draws of it."""
+        """Return the shapes that a page draws for the goal."""
         return ()
 
 
 @dataclass(frozen=True)
 class Target:
-    """`function` (m,) of the state within `tolerance` of `wanted` (m,), None or NaN where free, by a `norm`.
+    """`function` (m,) of the state within `tolerance` of `wanted` (m,), None or NaN where free, in a `norm`.
 
-    A plan uses a part of it (AIMED): its rows have bounds of their own, the largest cube within that distance.
+    A plan uses a part of the tolerance (AIMED): the bounds of its rows are the largest cube within that distance.
     """
 
     function: Callable[[Any], Any]
@@ -180,25 +180,25 @@ class Target:
 
 @dataclass(frozen=True, repr=False)
 class FrameGoal(Goal):
-    """A point of a robot is at a position, or a frame turned as wanted, or both: at the end, or at other knots.
+    """A target for the position of a robot's point, the rotation of a frame, or both, at the end or at other knots.
 
-    The end of a motion is to be at rest as well where nothing says otherwise: give the velocities in `x_goal`, or a
+    The motion ends at rest only if the problem requires it: give the velocities in `x_goal`, or add a
     `FrameVelocityGoal`.
 
     Args:
-        frame: The frame that is to get there; a body's name will do.
-        position: (3,) [m] in the world, where `point` is to be; None or NaN where an entry is free.
-        rotation: The frame's own in the world: a rotation matrix (3, 3), or a quaternion (4,) as w, x, y, z.
-        point: (3,) [m] in `frame`, what is at `position`: its origin, or a tool that it carries.
-        tolerance: [m] how far from `position` it may be; free entries do not count.
-        rotation_tolerance: [rad] how far it may be turned away.
-        knots: The knots at which it holds, as those of a `Constraint`; the last one where not given, None for all.
-        weight: With one, it is no longer kept: weight times the square of what is missed [m, rad] is added to the cost,
-            at the last knot, or with knots=None per second all along.
+        frame: The frame, or a body's name.
+        position: (3,) [m] the position of `point` in the world; None or NaN for free entries.
+        rotation: The frame's rotation in the world: a rotation matrix (3, 3), or a quaternion (4,) as w, x, y, z.
+        point: (3,) [m] in `frame`, the point at `position`: its origin, or a tool that it carries.
+        tolerance: [m] the largest distance from `position`, without the free entries.
+        rotation_tolerance: [rad] the largest angle from `rotation`.
+        knots: The knots at which it applies, as in a `Constraint`; by default the last one, None for all.
+        weight: If given, the goal is a cost instead of a constraint: weight times the squared residual [m, rad] is
+            added to the cost, at the last knot, or with knots=None per second along the motion.
 
     Raises:
-        InputError: Neither a position nor a rotation, or values that are none.
-        UnknownNameError: By the Problem: its model has no such frame; the message lists those that exist.
+        InputError: Neither a position nor a rotation, or invalid values.
+        UnknownNameError: The Problem's model has no such frame; the message lists the frames that exist.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.05)
@@ -241,19 +241,19 @@ class FrameGoal(Goal):
 
 @dataclass(frozen=True, repr=False)
 class FrameVelocityGoal(Goal):
-    """A point of a robot moves at a velocity: at the end, or at other knots. With nothing but a frame: it stands.
+    """A target velocity of a robot's point, at the end of a motion or at other knots. The default is rest.
 
     Args:
-        frame: The frame that carries the point; a body's name will do.
-        velocity: (3,) [m/s] in the world; None or NaN where an entry is free.
-        angular_velocity: (3,) [rad/s] of the frame in the world; free where it or an entry is None.
-        point: (3,) [m] in `frame`, what moves at `velocity`.
-        tolerance: [m/s] how far from `velocity` it may be; free entries do not count.
-        angular_tolerance: [rad/s] the same of `angular_velocity`.
-        knots, weight: As those of a `FrameGoal`.
+        frame: The frame that carries the point, or a body's name.
+        velocity: (3,) [m/s] in the world; None or NaN for free entries.
+        angular_velocity: (3,) [rad/s] of the frame in the world; None, or None entries, are free.
+        point: (3,) [m] in `frame`, the point that moves at `velocity`.
+        tolerance: [m/s] the largest deviation from `velocity`, without the free entries.
+        angular_tolerance: [rad/s] the largest deviation from `angular_velocity`.
+        knots, weight: As in a `FrameGoal`.
 
     Raises:
-        InputError, UnknownNameError: As of a `FrameGoal`.
+        InputError, UnknownNameError: As for a `FrameGoal`.
 
     Example:
         >>> dd.FrameVelocityGoal("hand", [0.5, None, None])
@@ -291,18 +291,18 @@ class FrameVelocityGoal(Goal):
 
 @dataclass(frozen=True, repr=False)
 class JointGoal(Goal):
-    """Joints are at positions, or move at speeds: at the end, or at other knots.
+    """Target positions or speeds of joints, at the end of a motion or at other knots.
 
-    At the last knot `x_goal` says the same as a hard equality; this one has a tolerance, in the plan and its replays.
+    `x_goal` is the same at the last knot as a hard equality. This goal has a tolerance, in the plan and in its replays.
 
     Args:
-        values: The value wanted of each coordinate by its name: one of the model's `state_names`, or a joint's name
-            where the joint has one position, which it then is. In the coordinates' units: m, rad, m/s, rad/s.
-        tolerance: How far from its value each may be, in its own unit.
-        knots, weight: As those of a `FrameGoal`.
+        values: The value of each coordinate by its name: one of the model's `state_names`, or the name of a joint with
+            one position, which then means this position. In the coordinates' units: m, rad, m/s, rad/s.
+        tolerance: The largest deviation of each coordinate from its value, in its own unit.
+        knots, weight: As in a `FrameGoal`.
 
     Raises:
-        InputError, UnknownNameError: As of a `FrameGoal`.
+        InputError, UnknownNameError: As for a `FrameGoal`.
 
     Example:
         >>> dd.JointGoal({"elbow": 1.0})
@@ -318,7 +318,7 @@ class JointGoal(Goal):
     def _check(self) -> None:
         if not isinstance(self.values, Mapping) or not self.values:
             raise InputError("JointGoal", got=repr(self.values)[:80], expected="a value for each name")
-        values = sorted(self.values.items(), key=lambda item: str(item[0]))  # a record has them so
+        values = sorted(self.values.items(), key=lambda item: str(item[0]))  # a record has the same order
         self._set(values={name_of("JointGoal", n): float(finite_array(f"JointGoal {n}", v, ())) for n, v in values})
 
     def targets(self, model: Model) -> Iterator[Target]:
@@ -334,16 +334,16 @@ class JointGoal(Goal):
 
 @dataclass(frozen=True, repr=False)
 class CenterOfMassGoal(Goal):
-    """The centre of mass of all bodies of the model is at a position: at the end, or at other knots.
+    """A target position of the centre of mass of all bodies of the model, at the end of a motion or at other knots.
 
     Args:
-        position: (3,) [m] in the world; None or NaN where an entry is free.
-        tolerance: [m] how far from it it may be; free entries do not count.
-        knots, weight: As those of a `FrameGoal`.
+        position: (3,) [m] in the world; None or NaN for free entries.
+        tolerance: [m] the largest distance from `position`, without the free entries.
+        knots, weight: As in a `FrameGoal`.
 
     Raises:
-        InputError: Values that are none.
-        ModelError: By the Problem: its model's bodies have no mass.
+        InputError: Invalid values.
+        ModelError: The bodies of the Problem's model have no mass.
 
     Example:
         >>> dd.CenterOfMassGoal([0.0, None, None], knots=None)
@@ -369,16 +369,16 @@ class CenterOfMassGoal(Goal):
 
 @dataclass(frozen=True, repr=False)
 class KeepLevel(Goal):
-    """An axis of a frame stays upright, as that of a tray with a full glass on it: at all knots, or at some.
+    """An upright axis of a frame, such as that of a tray with a full glass, at all knots or at some.
 
     Args:
-        frame: The frame; a body's name will do.
-        axis: (3,) what points up, along the world's z, in `frame`; of any length.
-        tolerance: [rad] how far it may lean.
-        knots, weight: As those of a `FrameGoal`; all knots where not given.
+        frame: The frame, or a body's name.
+        axis: (3,) the axis in `frame` that points up, along the world's z; of any length.
+        tolerance: [rad] the largest tilt.
+        knots, weight: As in a `FrameGoal`; all knots by default.
 
     Raises:
-        InputError, UnknownNameError: As of a `FrameGoal`.
+        InputError, UnknownNameError: As for a `FrameGoal`.
 
     Example:
         >>> dd.KeepLevel("tray", tolerance=0.1)
@@ -417,19 +417,19 @@ class KeepLevel(Goal):
 
 @dataclass(frozen=True, repr=False)
 class Dwell(Goal):
-    """A goal holds at every moment of at least so many seconds: before the end, or before another knot.
+    """A goal that holds at every time of an interval of at least some seconds, before the end or before another knot.
 
-    It begins at the last knot that is early enough. A plan uses half of the goal's tolerance, and is looked at between
-    its knots too; the replays have all of it at each of their steps. Every method keeps it.
+    The interval starts at the last knot that is early enough. A plan uses half of the goal's tolerance, and is also
+    checked between its knots. The replays have the whole tolerance at each of their steps. Every method supports it.
 
     Args:
-        goal: What holds, such as a `FrameGoal` or a `JointGoal`; its own `knots` are not used.
-        seconds: [s] for how long at least.
-        end: The knot at which it ends; negative ones count from the end.
+        goal: The goal, such as a `FrameGoal` or a `JointGoal`; its own `knots` are not used.
+        seconds: [s] the least duration.
+        end: The last knot of the interval; negative ones count from the end.
 
     Raises:
-        InputError: Values that are none; or, by the Problem, a horizon that is free or too short. With a free one, a
-            `PhasedProblem` has a phase for the stay.
+        InputError: Invalid values, or a horizon of the Problem that is free or too short. For a free horizon, use a
+            `PhasedProblem` with a phase for the interval.
 
     Example:
         >>> model = dd.load_model("models/cart_pole.urdf", time_step=0.05)
@@ -461,7 +461,7 @@ class Dwell(Goal):
         return tuple(_held(c) for c in replace(goal, knots=knots).bind_to(problem))
 
     def knots_in(self, problem: Any) -> tuple[int, ...]:
-        """The knots of a Problem at which it holds."""
+        """Return the knots of a Problem at which the goal applies."""
         count, horizon = problem.num_steps, problem.horizon
         if not -count - 1 <= self.end <= count:
             raise InputError("Dwell.end", got=self.end, expected=f"a whole number from {-count - 1} to {count}")
@@ -481,7 +481,7 @@ class Dwell(Goal):
 
 
 def _held(c: GoalConstraint) -> GoalConstraint:
-    """`c` all along between its knots, with the part of its tolerance that a stay may use."""
+    """Return `c` also between its knots, with the part of its tolerance for a goal over an interval."""
     fraction = STAYED / AIMED if c.measured is None else 1.0
     middle = np.nan_to_num(c.wanted)
     lower, upper = (
@@ -492,7 +492,7 @@ def _held(c: GoalConstraint) -> GoalConstraint:
 
 @dataclass(frozen=True)
 class _Entries:
-    """x (nx,) -> those of its entries."""
+    """A function x (nx,) -> the selected entries."""
 
     which: tuple[int, ...]
 
@@ -502,7 +502,7 @@ class _Entries:
 
 @dataclass(frozen=True)
 class _Squared:
-    """x (nx,) -> the square of the length of `vector`, over `unit`: smooth where that is 0, of slope 2 at `unit`."""
+    """A function x (nx,) -> |`vector`|^2 / `unit`, which is smooth where `vector` is 0 and has slope 2 at `unit`."""
 
     vector: Callable[[Any], Any]
     unit: float
@@ -514,7 +514,7 @@ class _Squared:
 
 @dataclass(frozen=True, eq=False)
 class WithGoals:
-    """A cost with the weighted squares of what goals miss, of x (nx,) and, as a running cost, of u (nu,)."""
+    """A cost plus the weighted squares of goals' residuals, of x (nx,) and, as a running cost, of u (nu,)."""
 
     own: Any  # the user's cost, or None
     goals: tuple[tuple[float, GoalConstraint], ...]
@@ -528,7 +528,7 @@ class WithGoals:
 
 
 def _target_marks(label: str, position: Any, tolerance: float) -> tuple[Mark, ...]:
-    """A ball at a position, or a slab where some of its entries are free."""
+    """Return a ball at a position, or a slab if some of its entries are free."""
     centre, free = _filled(position), [p is None for p in position]
     if any(free):
         return (Mark(label, "box", tuple(1.0 if f else 2 * tolerance for f in free), centre),)
@@ -540,12 +540,12 @@ def _filled(numbers: Any) -> tuple[float, ...]:
 
 
 def vector(subject: str, values: Any) -> tuple[float, ...]:
-    """(3,) finite numbers as a tuple."""
+    """Convert (3,) finite numbers to a tuple."""
     return tuple(finite_array(subject, values, (3,)).tolist())
 
 
 def _with_gaps(subject: str, values: Any) -> tuple[float | None, ...]:
-    """(3,) finite numbers as a tuple, None where they are None or NaN; None is nothing but gaps."""
+    """Convert (3,) finite numbers to a tuple, with None for None or NaN. None means that all entries are free."""
     array = array_with_gaps(subject, FREE if values is None else values, (3,))
     if np.any(np.isinf(array)):
         raise InputError(subject, got=array.tolist(), expected="finite numbers, None where free")
@@ -553,21 +553,21 @@ def _with_gaps(subject: str, values: Any) -> tuple[float | None, ...]:
 
 
 def name_of(subject: str, given: Any) -> str:
-    """`given` where it is a name; InputError of anything else."""
+    """Return `given` if it is a name, or raise InputError."""
     if not isinstance(given, str) or not given:
         raise InputError(subject, got=repr(given)[:80], expected="a name")
     return given
 
 
 def names_of(subject: str, given: Any) -> tuple[str, ...]:
-    """Names of bodies as a tuple."""
+    """Return names of bodies as a tuple."""
     if isinstance(given, str) or not len(given):
         raise InputError(subject, got=repr(given)[:80], expected="names of bodies, or None for all")
     return tuple(name_of(subject, name) for name in given)
 
 
 def _knots(subject: str, given: Any) -> tuple[int, ...] | None:
-    """Whole numbers as a tuple; None, which is all knots, as it is."""
+    """Convert whole numbers to a tuple. None means all knots and is returned unchanged."""
     if given is None:
         return None
     array = np.atleast_1d(np.asarray(given))
@@ -577,7 +577,7 @@ def _knots(subject: str, given: Any) -> tuple[int, ...] | None:
 
 
 def _rotation(subject: str, given: Any) -> tuple[tuple[float, ...], ...]:
-    """The rows of a rotation that is given as a matrix (3, 3) or as a quaternion w, x, y, z."""
+    """Return the rows of a rotation matrix from a matrix (3, 3) or a quaternion w, x, y, z."""
     if np.shape(given) != (4,):
         return tuple(map(tuple, finite_array(subject, given, (3, 3)).tolist()))
     quaternion = finite_array(subject, given, (4,))

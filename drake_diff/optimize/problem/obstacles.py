@@ -1,9 +1,9 @@
-"""What a robot keeps clear of: balls and boxes in the world, and itself.
+"""Collision avoidance: balls and boxes in the world, and self-collision.
 
-An obstacle is a goal as any other: plain values, bound to the model by the `Problem`. Each of the robot's capsules (see
-`mechanics.cover`) is a row of one constraint, its signed distance at least `margin`; no minimum over them is taken, so
-that each has its own slope. A plan keeps the margin at every knot and in between. A replay may use the margin up, since
-steps of another length lead a little elsewhere, but it may not enter the obstacle.
+An obstacle is a goal with plain values that the `Problem` binds to the model. Each of the robot's capsules (see
+`mechanics.cover`) is a row of one constraint, with a signed distance of at least `margin`. The rows are not reduced to
+their minimum, so that each has its own slope. A plan keeps the margin at every knot and between knots. A replay may use
+up the margin, since steps of another length lead to slightly different states, but it must not penetrate the obstacle.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -27,14 +27,14 @@ from drake_diff.optimize.problem.constraint import Constraint
 from drake_diff.optimize.problem.goals import Goal, GoalConstraint, Mark, names_of
 
 MARGIN = 0.01  # [m]
-TOLERANCE_PART, SMALLEST_TOLERANCE = 0.1, 1e-4  # of the margin, and [m]: what a plan may be nearer between its knots
-PARTS = 10  # in which a step is looked at, at least
-MOST_SEEN, MOST_HALVINGS = 20_000, 30  # states, and halvings of the time between two of them
-ARC = 1.05  # over its chord: the way of a point while all joints together turn by TURN
+TOLERANCE_PART, SMALLEST_TOLERANCE = 0.1, 1e-4  # of the margin, and [m]: allowed violation by a plan between knots
+PARTS = 10  # least number of parts of a step that are checked
+MOST_SEEN, MOST_HALVINGS = 20_000, 30  # states, and bisections of the time between two of them
+ARC = 1.05  # length of a point's path relative to its chord, while all joints together turn by TURN
 TURN = 1.0  # [rad]
 RED = (0.78, 0.2, 0.16, 0.55)  # red, green, blue, opacity
-EXACT = 0.05  # [m] beyond the margin: nearer, the distance of two links is exact
-LOOKED_AT = 1000  # random states in which two links that always overlap are found
+EXACT = 0.05  # [m] beyond the margin: below this distance, the distance of two links is exact
+LOOKED_AT = 1000  # random states that find links that always overlap
 UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 Motion = Callable[[Array], Array]  # the states (S, nx) at times (S,) [s]
@@ -42,7 +42,7 @@ Motion = Callable[[Array], Array]  # the states (S, nx) at times (S,) [s]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ClearanceConstraint(GoalConstraint):
-    """That every row of a `clearance` is at least the margin, which is `lower`; `thing` is what is kept clear of."""
+    """A constraint that each row of `clearance` is at least the margin, `lower`. `thing` names the obstacle."""
 
     thing: str = ""
 
@@ -54,28 +54,28 @@ class ClearanceConstraint(GoalConstraint):
 
     @property
     def margin(self) -> float:
-        """[m]"""
+        """The margin [m]."""
         return float(self.lower[0])
 
     @property
     def between(self) -> float:
-        """[m] how much nearer than the margin a plan may be between its knots."""
+        """How much [m] a plan may violate the margin between its knots."""
         return max(TOLERANCE_PART * self.margin, SMALLEST_TOLERANCE)
 
     def seen(self, times: Array, motion: Motion, allowed: float) -> tuple[Array, Array]:
-        """`times` (K,) [s], and as many between them that nothing of a motion that lacks more than `allowed` is missed.
+        """Refine `times` (K,) [s] until no violation of a motion by more than `allowed` can be missed between them.
 
-        Between two states that are clear by a and b while a piece moves by s, it is clear by (a + b - s) / 2 at least.
-        Where that is too little, the middle is looked at, until it is not, or the piece moves by less than `allowed`.
+        A piece with the clearances a and b at two states that moves by s between them is clear by at least (a + b - s)
+        / 2. If this is too small, the middle is checked, until it is enough or the piece moves by less than `allowed`.
 
         Returns:
-            Times (S,), and the states (S, nx) that `motion` gives there.
+            Times (S,) [s], and the states (S, nx) of `motion` at these times.
         """
         xs, least = motion(times), self.margin - allowed
         for halvings in range(MOST_HALVINGS + 1):
             values, ways = self.clearance.values(xs), ARC * self.clearance.moved(xs)
             clear = np.min((values[:-1] + values[1:] - ways) / 2, axis=1) >= least
-            known = np.min(values, axis=1) < least  # and told anyway
+            known = np.min(values, axis=1) < least  # reported in any case
             short = (np.max(ways, axis=1) <= allowed) | known[:-1] | known[1:]
             turns = np.sum(np.abs(np.diff(xs[:, : self.clearance.model.nq], axis=0)), axis=1) > TURN
             unseen = np.flatnonzero(~(clear | short) | turns)
@@ -83,29 +83,29 @@ class ClearanceConstraint(GoalConstraint):
                 break
             middle = (times[unseen] + times[unseen + 1]) / 2
             times, xs = np.insert(times, unseen + 1, middle), np.insert(xs, unseen + 1, motion(middle), axis=0)
-        xs[unseen] = np.nan  # a motion too wild to be looked at: nobody knows what it enters
+        xs[unseen] = np.nan  # the motion is too fast to be checked, so that its clearance is unknown
         return times, xs
 
     def nearest(self, times: Array, motion: Motion, allowed: float) -> Check:
-        """What a motion lacks most of the margin, of `allowed` [m], at `times` (K,) [s] or in between."""
+        """Return a check of the largest violation of the margin by a motion at or between `times` (K,) [s]."""
         times, xs = self.seen(times, motion, allowed)
         worst = int(np.argmax(self.lacking(xs)))
         return self.check_at(xs[worst], f"{times[worst]:.4g} s", allowed)
 
     def check_at(self, x: Array, time: str, allowed: float) -> Check:
-        """What the nearest pair lacks of the margin at x (nx,), of `allowed` [m]."""
+        """Return a check of the nearest pair's violation of the margin at x (nx,), with `allowed` [m] as its limit."""
         values = self.clearance.values(x[None])[0]
         who, lacking = self.clearance.labels[int(np.argmin(values))], float(self.lacking(x[None])[0])
         where = f"{who} and {self.thing}" if self.thing else who
         return check("clearance", f"{where} at {time}", lacking, allowed, "m")
 
     def lacking(self, xs: Array) -> Array:
-        """(K,) [m] by how much the nearest row at each of xs (K, nx) is nearer than the margin; inf of no number."""
+        """Return the violation [m] (K,) of the margin by the nearest row at each of xs (K, nx), inf if it is NaN."""
         values = self.clearance.values(xs)
         return np.where(np.all(np.isfinite(values), axis=1), self.margin - np.min(values, axis=1), np.inf)
 
     def check(self, subject: str, x: Array) -> None:
-        """Raise InputError where x (nx,) is nearer than the margin by more than that."""
+        """Raise InputError if x (nx,) violates the margin by more than `between`."""
         if float(self.lacking(x[None])[0]) > self.between:
             raise InputError(
                 subject,
@@ -115,13 +115,13 @@ class ClearanceConstraint(GoalConstraint):
 
 
 class Obstacle(Goal):
-    """The base of what is kept clear of, at all knots."""
+    """The base of obstacles, which apply at all knots."""
 
     margin: float
     links: Any
 
     def kept_clear(self, clearance: Clearance, name: str, thing: str = "") -> tuple[ClearanceConstraint, ...]:
-        """That `clearance` is at least the margin; nothing where it has no row."""
+        """Return a constraint that `clearance` is at least the margin, or nothing if it has no rows."""
         if not clearance.labels:
             return ()
 
@@ -143,16 +143,16 @@ class _Solid(Obstacle):
 
     @property
     def label(self) -> str:
-        """The name, or where it is."""
+        """The name, or else the position."""
         return repr(self.name) if self.name else f"{self.shape} at " + ", ".join(f"{c:g}" for c in self.center)
 
     @property
     def extent(self) -> float:
-        """[m] how far it reaches from its center."""
+        """The distance [m] of its farthest point from its center."""
         raise NotImplementedError
 
     def clearance(self, model: Model, kinematics: ForwardKinematics, pieces: list[Piece], center: Array) -> Clearance:
-        """The distances of the pieces of a robot from it."""
+        """Return the distances of the pieces of a robot from the obstacle."""
         raise NotImplementedError
 
     def bind(self, model: Model) -> tuple[ClearanceConstraint, ...]:
@@ -166,24 +166,24 @@ class _Solid(Obstacle):
 
 @dataclass(frozen=True, repr=False)
 class SphereObstacle(_Solid):
-    """A ball in the world that a robot keeps clear of, at every knot of a plan and in between.
+    """A ball in the world that a robot must not collide with, at every knot of a plan and between knots.
 
-    The robot is a few spheres and capsules on each link, which contain its collision shapes, or those that are drawn
-    where it has none; a sphere and a capsule are exact. A link without any shape is a capsule from joint to joint:
-    `Problem` warns of it.
+    The robot is represented by a few spheres and capsules on each link, which contain its collision shapes, or its
+    illustration shapes if it has no collision shapes. Spheres and capsules are exact. A link without any shape is a
+    capsule from joint to joint, and `Problem` warns about it.
 
     Args:
         center: (3,) [m] in the world.
         radius: [m].
-        margin: [m] the least distance that a plan keeps. Replays in other steps may use it up.
-        links: The bodies that keep clear; all that can move where not given.
-        name: What it is called in messages and pages.
-        weight: With one, it is no longer kept: weight times the square of what is used of the margin [m], of every
-            capsule, is added to the cost per second.
+        margin: [m] the least distance in a plan. Replays in other steps may use it up.
+        links: The bodies that avoid it; by default all that can move.
+        name: The name in messages and pages.
+        weight: If given, the obstacle is a cost instead of a constraint: weight times the squared violation of the
+            margin [m], summed over all capsules, is added to the cost per second.
 
     Raises:
-        InputError: Values that are none; by the Problem, a first or last state that is too near.
-        UnknownNameError: By the Problem: its model has no such body.
+        InputError: Invalid values, or a first or last state of the Problem that is too near.
+        UnknownNameError: The Problem's model has no such body.
 
     Example:
         >>> model = dd.load_model("models/double_pendulum.urdf", time_step=0.02)
@@ -216,20 +216,20 @@ class SphereObstacle(_Solid):
 
 @dataclass(frozen=True, repr=False)
 class BoxObstacle(_Solid):
-    """A box in the world that a robot keeps clear of, at every knot of a plan and in between.
+    """A box in the world that a robot must not collide with, at every knot of a plan and between knots.
 
-    The robot is what it is for a `SphereObstacle`. Beside a box its capsules are rows of balls that contain them and
-    stick out by a tenth of the radius at most.
+    The robot is represented as for a `SphereObstacle`. Its capsules are rows of balls that contain them and exceed them
+    by at most a tenth of the radius.
 
     Args:
         center: (3,) [m] in the world.
         size: (3,) [m] the edges along its own x, y and z.
-        rotation: The box's own in the world: a rotation matrix (3, 3), or a quaternion (4,) as w, x, y, z; upright
-            where not given.
-        margin, links, name, weight: As those of a `SphereObstacle`.
+        rotation: The box's rotation in the world: a rotation matrix (3, 3), or a quaternion (4,) as w, x, y, z; upright
+            by default.
+        margin, links, name, weight: As in a `SphereObstacle`.
 
     Raises:
-        InputError, UnknownNameError: As of a `SphereObstacle`.
+        InputError, UnknownNameError: As for a `SphereObstacle`.
 
     Example:
         >>> dd.BoxObstacle([0.5, 0, 0.4], [0.1, 0.4, 0.8], name="shelf")
@@ -260,21 +260,21 @@ class BoxObstacle(_Solid):
 
 @dataclass(frozen=True, repr=False)
 class SelfCollision(Obstacle):
-    """That the links of a robot keep clear of each other, at every knot of a plan and in between.
+    """Avoidance of collisions between a robot's own links, at every knot of a plan and between knots.
 
-    Links are their collision shapes, of meshes the convex hulls, at Drake's signed distance, whatever `contact` the
-    model has; those without are capsules as for a `SphereObstacle`. Left out are links that a joint ties to each other
-    and what is welded together. Pairs that overlap in the posture that the file gives, or in every one of 1,000 random
-    states, and are nearer than the margin at `x0` too, cannot be kept apart: a plan is then undecided, unless they are
+    Links are represented by their collision shapes, meshes by their convex hulls, with Drake's signed distance for any
+    `contact` of the model. Links without such shapes are capsules as for a `SphereObstacle`. Links that are connected
+    by a joint or welded together are omitted. Pairs that overlap in the file's posture, or in all of 1,000 random
+    states, and are also nearer than the margin at `x0`, cannot be separated: a plan is then undecided, unless they are
     in `ignore`.
 
     Args:
-        margin, weight: As those of a `SphereObstacle`.
-        links: The bodies that keep clear of each other; all where not given.
+        margin, weight: As in a `SphereObstacle`.
+        links: The bodies that must not collide with each other; all by default.
         ignore: Pairs of bodies that may touch, such as [("hand", "finger")].
 
     Raises:
-        InputError, UnknownNameError: As of a `SphereObstacle`.
+        InputError, UnknownNameError: As for a `SphereObstacle`.
 
     Example:
         >>> dd.SelfCollision(margin=0.02, ignore=[("panda_hand", "panda_link5")])
@@ -299,9 +299,9 @@ class SelfCollision(Obstacle):
         return self.bind(problem.model, problem.x0)
 
     def rows_away_from(self, model: Model, xs: Array) -> tuple[ClearanceConstraint, ...]:
-        """What keeps the capsules of all pairs of `model` apart but those nearer than the margin at one of xs (K, nx).
+        """Return constraints on all pairs of capsules of `model` that keep the margin at all of xs (K, nx).
 
-        What stands for a link contains its shapes and sticks out of some: what is near there need not touch.
+        Capsules contain the shapes of a link and exceed some of them, so that near capsules need not touch.
         """
         pairs = [(p, r) for a, b in self._pairs(model) for p in a.pieces for r in b.pieces]
         kinematics = _kinematics(model)
@@ -311,9 +311,9 @@ class SelfCollision(Obstacle):
         return self.kept_clear(OfPairs(model, kinematics, pairs), "clear of itself")
 
     def left_out(self, model: Model, x0: Array | None = None) -> tuple[str, ...]:
-        """The pairs of bodies of `model` that overlap by their shapes and are not kept apart: "a and b".
+        """Return the pairs of bodies of `model` whose shapes overlap and that are not constrained: "a and b".
 
-        With a first state `x0` (nx,) only those that are nearer than the margin there.
+        With an initial state `x0` (nx,), return only pairs that are nearer than the margin at this state.
         """
         pairs = self._pairs(model)
         key = ("overlapping", tuple(_bodies(*pair) for pair in pairs))
@@ -331,7 +331,7 @@ class SelfCollision(Obstacle):
         return OfShapes(model, _kinematics(model), pairs, near, near + EXACT)
 
     def _pairs(self, model: Model) -> list[tuple[Solid, Solid]]:
-        """The pairs of shapes that may touch, but those of `ignore`."""
+        """Return the pairs of shapes that may touch, without those of `ignore`."""
         kinematics, ignored = _kinematics(model), {" and ".join(sorted(pair)) for pair in self.ignore}
         _check_bodies(model, "SelfCollision.ignore", [name for pair in self.ignore for name in pair])
         neighbours = {frozenset(pair) for pair in _carried(model, {s.body for s in cover_of(model, kinematics).solids})}
@@ -349,7 +349,7 @@ def _bodies(a: Solid | Piece, b: Solid | Piece) -> str:
 def _overlapping(
     model: Model, distances: Callable[[Sequence[tuple[Solid, Solid]]], OfShapes], pairs: Sequence[tuple[Solid, Solid]]
 ) -> tuple[str, ...]:
-    """The pairs of bodies of which some shapes overlap in the default posture, or in all of many random ones."""
+    """Return the pairs of bodies whose shapes overlap in the default posture, or in all of many random states."""
     random = np.random.default_rng(0)
 
     def overlaps(x: Array, among: Sequence[tuple[Solid, Solid]]) -> set[str]:
@@ -364,7 +364,7 @@ def _overlapping(
 
 
 def _carried(model: Model, shaped: set[str]) -> Iterator[tuple[str, str]]:
-    """Each body of a model and the next one that carries it and is among `shaped`, those with a shape."""
+    """Yield each body of a model and the nearest body that carries it and has a shape (is in `shaped`)."""
     names = {body.index(): label for label, body in labelled(bodies(model.plant)).items()}
     above = {names[j.child_body().index()]: names.get(j.parent_body().index(), "") for j in joints(model.plant)}
     for name in above:
@@ -382,7 +382,7 @@ def _kinematics(model: Model) -> ForwardKinematics:
 
 
 def _solids(model: Model, kinematics: ForwardKinematics, links: Sequence[str] | None) -> list[Solid]:
-    """Those of the named bodies, or of all."""
+    """Return the solids of the named bodies, or of all bodies."""
     _check_bodies(model, "links", links or ())
     solids = cover_of(model, kinematics).solids
     for name in links or ():
@@ -399,9 +399,9 @@ def _check_bodies(model: Model, subject: str, names: Sequence[str]) -> None:
 
 
 def _near(kinematics: ForwardKinematics, pieces: Sequence[Piece], center: Array, reach: float) -> list[Piece]:
-    """Without the pieces that no state brings within `reach` [m] of `center`.
+    """Return the pieces that some state brings within `reach` [m] of `center`.
 
-    A link is never further from where its root is held than all offsets and slides between them together.
+    A link's distance from the fixed point of its root is at most the sum of all offsets and slides between them.
     """
     roots: list[Array] = []
     lengths: list[float] = []
@@ -424,23 +424,23 @@ def _pair(subject: str, given: Any) -> tuple[str, str]:
 
 
 def clearances(constraints: Sequence[Constraint]) -> Iterator[ClearanceConstraint]:
-    """Those of `constraints` that keep something clear."""
+    """Return the `constraints` on clearances."""
     return (c for c in constraints if isinstance(c, ClearanceConstraint))
 
 
 def along_steps(times: Array, xs: Array) -> tuple[Array, Motion]:
-    """The `times` (N+1,) [s] of xs (N+1, nx) with 9 between each two of them, and the motion on straight lines.
+    """Return `times` (N+1,) [s] of xs (N+1, nx) with 9 times between each two, and the linearly interpolated motion.
 
-    That is how a step moves positions: at a constant speed.
+    A step moves positions in this way, at a constant speed.
     """
     instants = np.interp(np.arange(PARTS * (len(xs) - 1) + 1) / PARTS, np.arange(len(xs)), times)
     return instants, lambda every: np.array([np.interp(every, times, column) for column in xs.T]).T
 
 
 def lacking_between(constraints: Sequence[Constraint], xs: Array) -> tuple[float, bool]:
-    """What the way between the states xs (N+1, nx) lacks of a margin [m], and whether something is entered.
+    """Return the largest violation [m] of a margin between the states xs (N+1, nx), and whether there is penetration.
 
-    It is 0 where it is within the tolerance; see `along_steps`.
+    The violation is 0 if it is within the tolerance; see `along_steps`.
     """
     path = along_steps(np.arange(float(len(xs))), xs)
     worst, enters = 0.0, False
@@ -452,7 +452,7 @@ def lacking_between(constraints: Sequence[Constraint], xs: Array) -> tuple[float
 
 
 def swept(constraints: Sequence[Constraint], time_step: float, parts: int) -> tuple[ClearanceConstraint, ...]:
-    """What keeps clear of the same in the middle of the step before each knot, in `parts` - 1 places on its way."""
+    """Return clearance constraints at `parts` - 1 points within the step before each knot."""
     swept_constraints = []
     for c in clearances(constraints):
         clearance = Swept(c.clearance, time_step * np.arange(1, parts) / parts)
@@ -462,7 +462,7 @@ def swept(constraints: Sequence[Constraint], time_step: float, parts: int) -> tu
 
 
 def doubts_of(goals: Sequence[Goal], model: Model, x0: Array | None = None) -> Iterator[str]:
-    """What a model may not keep clear from x0 (nx,) on, where one of `goals` asks for it."""
+    """Yield warnings about possible collisions that `goals` cannot exclude for a model, from x0 (nx,)."""
     if any(isinstance(goal, Obstacle) for goal in goals):
         yield from cover_of(model, _kinematics(model)).doubts
     for goal in goals:

@@ -1,4 +1,4 @@
-"""Several problems one after the other: phases with dynamics of their own, and resets between them."""
+"""A sequence of problems: phases with their own dynamics, and resets between them."""
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, replace
@@ -20,26 +20,26 @@ MOST_PHASES = 100
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PhasedProblem(PicklesItsFields, ShowsItsRepr):
-    """Phases one after the other, each with dynamics, bounds, costs, constraints and a duration of its own.
+    """A sequence of phases, each with its own dynamics, bounds, costs, constraints and duration.
 
-    The cost is the sum of the phases' costs. A phase ends where its next begins: its last state, through the reset
-    between the two, is the next one's first. All phases are solved by collocation in one program. A guard, which says
-    where a phase may end, is a `Constraint` of that phase at `knots=-1`.
+    The cost is the sum of the phases' costs. The reset between two phases maps the last state of the first phase to the
+    first state of the next phase. All phases are solved by collocation in one program. A guard, which defines where a
+    phase may end, is a `Constraint` of that phase at `knots=-1`.
 
     Args:
-        phases: `Problem`s in the order in which they come. The `x0` of every phase but the first is a first guess
-            only, and so is that of the first where its "initial_state" is optimized. A running cost that changes in
-            time counts from the first state of its own phase.
-        resets: one for each pair of neighbours: None where the state goes on as it is, a matrix (n, m), or a function
-            of the last state (m,) that gives the next one's first (n,), written as that of `Dynamics`. All None if
-            not given.
-        periodic: False, or the reset from the last state of all to the first: True for the same state, a matrix or a
-            function. The first state has then to be optimized where it is not to stay what `x0` says.
-        horizon: [s] (lower, upper) for the sum of all durations, or a number; free if not given.
-        names: of the phases, for messages: "phase 0", "phase 1", ... if not given.
+        phases: `Problem`s in their order. The `x0` of every phase but the first is only an initial guess, and so is
+            that of the first phase if its "initial_state" is optimized. The time of a running cost starts at the first
+            state of its own phase.
+        resets: one for each pair of successive phases: None for the same state, a matrix (n, m), or a function from the
+            last state (m,) to the first state (n,) of the next phase, written as that of `Dynamics`. All are None by
+            default.
+        periodic: False, or the reset from the very last state to the first: True for the same state, a matrix or a
+            function. The first state must then be optimized if it may differ from `x0`.
+        horizon: [s] (lower, upper) for the sum of all durations, or a number; free by default.
+        names: names of the phases for messages: "phase 0", "phase 1", ... by default.
 
     Raises:
-        InputError: something does not fit; also ShapeError and GradientError, of a reset.
+        InputError: an argument does not fit; also ShapeError and GradientError for a reset.
 
     Example:
         >>> def falling(x, u):
@@ -107,17 +107,17 @@ class PhasedProblem(PicklesItsFields, ShowsItsRepr):
 
     @property
     def is_map(self) -> bool:
-        """Whether all phases are `DiscreteMap`s, and time counts steps."""
+        """Whether all phases are `DiscreteMap`s, whose time is the step index."""
         return bool(self.phases[0].is_map)
 
     @property
     def name(self) -> str:
-        """What is moved."""
+        """The names of the phases' models."""
         return ", then ".join(dict.fromkeys(phase.name for phase in self.phases))
 
     @cached_property
     def switches(self) -> tuple["Switch", ...]:
-        """From each phase to its next; the last, of a periodic problem, from the last to the first."""
+        """Switches from each phase to the next one, and, in a periodic problem, from the last phase to the first."""
         every = [(i, i + 1, reset) for i, reset in enumerate(self.resets)]
         if self.periodic is not False:
             every.append((len(self.phases) - 1, 0, None if self.periodic is True else self.periodic))
@@ -138,7 +138,7 @@ class PhasedProblem(PicklesItsFields, ShowsItsRepr):
 
 
 class Switch:
-    """From the last state of phase `before` to the first of phase `after`: x_after = reset(x_before)."""
+    """The map from the last state of phase `before` to the first of phase `after`: x_after = reset(x_before)."""
 
     def __init__(self, problem: PhasedProblem, before: int, after: int, reset: Any):
         self.before, self.after = before, after
@@ -160,21 +160,21 @@ class Switch:
             function = _Linear(self.matrix)
         probe = earlier.dynamics.probe()[:, : earlier.nx]
         self.form = Pointwise(self.label, _of_state(function), earlier.nx, (other.nx,), probe)
-        self.probe = np.hstack([probe, other.dynamics.probe()[:, : other.nx]])  # both states, side by side
+        self.probe = np.hstack([probe, other.dynamics.probe()[:, : other.nx]])  # both states, concatenated
         self.link = Constraint(_Apart(function), lower=np.zeros(other.nx), upper=np.zeros(other.nx), name=self.label)
 
     def __call__(self, x: Array) -> Array:
-        """(n,) the first state of the phase after, from the last state `x` (m,) of the one before."""
+        """Return the first state (n,) of the next phase from the last state `x` (m,) of the previous one."""
         return np.asarray(self.form.values(np.asarray(x, dtype=float)[None])[0])
 
     def jacobian(self, x: Array) -> Array:
-        """(n, m) the derivative of the same."""
+        """Return the derivative (n, m) of the reset."""
         return np.asarray(self.form.linearize(np.asarray(x, dtype=float)[None])[1][0])
 
 
 @dataclass(frozen=True, eq=False)
 class _Apart:
-    """How far a first state is from where the last state of the phase before leads."""
+    """The difference of a phase's first state and the reset of the previous phase's last state."""
 
     reset: Callable[[Any], Any]
 
@@ -199,13 +199,13 @@ def _name_of(function: Any) -> str:
 
 
 def _freed(problem: Problem) -> Problem:
-    """`problem` with a first state that is searched for."""
+    """Return `problem` with its initial state as a variable."""
     optimize = tuple(dict.fromkeys((*problem.optimize, "initial_state")))
     return replace(problem, optimize=optimize, initial_state_mask=np.full(problem.nx, True))
 
 
 def duration_of(problem: Problem) -> tuple[float, float]:
-    """(lower, upper) [s] of a phase."""
+    """Return the bounds (lower, upper) [s] of a phase's duration."""
     return problem.horizon or (problem.start_horizon,) * 2
 
 

@@ -1,4 +1,4 @@
-"""What is to be optimized, checked when it is made; contains no solver."""
+"""The definition of a trajectory optimization problem, checked at construction, without any solver."""
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -59,7 +59,7 @@ from drake_diff.optimize.problem.obstacles import ClearanceConstraint, doubts_of
 
 
 class _Parallel:
-    """Zero (3,) where the quaternion at `entries` of a state is a multiple of `wanted` (4,)."""
+    """A function of the state that is zero (3,) if the quaternion at `entries` is a multiple of `wanted` (4,)."""
 
     def __init__(self, entries: slice, wanted: Array):
         self.entries, self.across = entries, np.linalg.svd(wanted[None])[2][1:]
@@ -71,67 +71,67 @@ class _Parallel:
 OPTIMIZABLE = ("controls", "initial_state", "parameters")
 # A parameter that cannot be negative stays above this part of its first value, unless a bound is given.
 SMALLEST_PART = 1e-3
-SAME_STATE = 1e-6  # [the coupling's unit] of states that are typed by hand
-STILL = 1e-6  # of a state's largest magnitude, or of a radian: what moves less stands still
-RETURNS = 0.1  # of its range along a plan: what has to travel less returns to where it was
-NOTHING = 1e-150  # in any unit: its square is no number
-STAYS = 1e-2  # of its bounds, or of a radian: what a state moves that need not travel
-# Of a state's magnitude or size: bounds that are further apart are none, and others count as so many at most, those of
-# velocities as FASTER: no bound makes a scale that is much more than what a state does.
+SAME_STATE = 1e-6  # [the coupling's unit], tolerance for states that a user types
+STILL = 1e-6  # of a state's largest magnitude, or of a radian: a smaller range counts as no motion
+RETURNS = 0.1  # of its range along a plan: a state whose required change is smaller returns to its start
+NOTHING = 1e-150  # in any unit: the square of a smaller number may underflow
+STAYS = 1e-2  # of its bounds, or of a radian: the scale of a state that need not travel
+# Relative to a state's magnitude or size. Bounds further apart than WIDEST are ignored, and others count as at most
+# REACH, those of velocities as at most FASTER, so that no bound makes a scale much larger than the state's motion.
 WIDEST, FASTER, REACH = 1e3, 300.0, 10.0
-GOAL_PART = 0.01  # of what a state has to travel: how far from its goal it may end where nothing else is given
-TRIED, NO_SLOPE = 3, 1e-9  # states at which a goal's slopes are looked at, and what counts as none: rounding
+GOAL_PART = 0.01  # of a state's required change: the default goal tolerance
+TRIED, NO_SLOPE = 3, 1e-9  # random states for the slopes of goals, and the largest slope that is rounding
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Problem(PicklesItsFields, ShowsItsRepr):
-    """A trajectory to be optimized: minimize the time integral of running_cost(x, u), plus final_cost(x_N).
+    """A trajectory optimization problem: minimize the time integral of running_cost(x, u), plus final_cost(x_N).
 
     On a model's discrete steps the integral is sum_k h * running_cost(x_k, u_k) with h = model.time_step; collocation
-    takes the quadrature of its scheme. Bounds hold at every state that is not given and for every input.
+    uses the quadrature of its scheme. Bounds apply to every state that is not given and to every input.
 
     Args:
-        system: a Model, or `Dynamics` x' = f(x, u), which only method="collocation" takes; or an
-            `optimize.DiscreteMap` x_(k+1) = f(x_k, u_k), whose time counts steps.
-        x0: (nx,) the initial state; or a mapping from names of coordinates to values, the model's default elsewhere. A
-            name is one of `state_names`, or that of a joint with one position, which it then is.
-        num_steps: number N of intervals, of model.time_step each where no `horizon` is given.
-        running_cost: a function (x, u) or (x, u, t) -> scalar, t [s] from the first state on; a QuadraticCost, an
-            `optimize.TrackingCost`, or a list of such costs, whose sum it is; or, with `horizon`, a number [per s]:
+        system: a Model; or `Dynamics` x' = f(x, u), for method="collocation" only; or an `optimize.DiscreteMap`, a map
+            x_(k+1) = f(x_k, u_k) whose time is the step index.
+        x0: (nx,) the initial state; or a mapping from coordinate names to values, with the model's defaults for the
+            rest. A name is one of `state_names`, or a joint with one position, which then means this position.
+        num_steps: number N of intervals, each of model.time_step if no `horizon` is given.
+        running_cost: a function (x, u) or (x, u, t) -> scalar, where t [s] is 0 at the first state; a QuadraticCost, an
+            `optimize.TrackingCost`, or a list of such costs, which are added; or, with `horizon`, a number [per s]:
             with 1.0 the cost is the time itself.
         final_cost: a function x -> scalar, or a QuadraticCost.
-        x_goal: (nx,) final state, a hard equality; NaN entries are free. Or a mapping as `x0`, the rest free.
-        goal_tolerance: how far from `x_goal` a state may end where the plan is replayed: a mapping from names, as `x0`,
-            or (nx,), NaN where not given, in the states' units. Elsewhere 1 % of what the state has to travel.
-        waypoints: mapping from knots (1 ... N-1) to states (nx,), with NaN where free, or mappings as `x_goal`.
+        x_goal: (nx,) final state, a hard equality, NaN for free entries. Or a mapping as for `x0`; the rest is free.
+        goal_tolerance: allowed distance of the replay's final state from `x_goal`: a mapping from names as for `x0`, or
+            (nx,), NaN where not given, in the states' units. The default is 1 % of the state's required change.
+        waypoints: mapping from knots (1 ... N-1) to states (nx,), NaN for free entries, or to mappings as for `x_goal`.
         constraints: a `Constraint`, or several.
-        couplings: what joins several knots, such as `optimize.Periodic`, or several of these; for collocation and
-            shooting.
-        goals: a goal in the robot's own words, such as a `FrameGoal`, or several; each keeps what it says of a motion
-            of the model.
-        horizon: [s] time from the first state to the last, in N equal intervals, for collocation: a number, or
-            (lower, upper) for a free final time. Plain dynamics need one.
-        bounds: `Bounds`, or a mapping from names of coordinates or inputs to (lower, upper); where they say nothing,
-            those of the model or the dynamics apply.
-        optimize: what may change: "controls", "initial_state", "parameters", or several of them.
-        initial_state_mask: (nx,) booleans, True where "initial_state" may change; x0 is its first guess there.
-        us: (N, nu) inputs where they are not optimized, their first guess where they are; 0 if not given.
-        parameters: names of model parameters (see `list_parameters`) or of those of the `Dynamics`, or a mapping from
-            names to values. They hold at all times; with "parameters" in `optimize` the search starts from them, and
-            those of the `Dynamics` need not be named.
-        parameter_bounds: mapping from names to (lower, upper). What cannot be negative stays above 1e-3 of its start
-            where no bound is given, and an inertia stays one that a body can have.
+        couplings: a constraint that joins several knots, such as `optimize.Periodic`, or several of these; for
+            collocation and shooting.
+        goals: a goal for the robot's frames, joints or bodies, such as a `FrameGoal`, or several; each adds constraints
+            or a cost on the model's motion.
+        horizon: [s] time from the first state to the last, in N equal intervals: a number, or (lower, upper) for a free
+            final time. Plain dynamics need one.
+        bounds: `Bounds`, or a mapping from names of coordinates or inputs to (lower, upper). The limits of the model or
+            the dynamics apply to all entries that are not given.
+        optimize: the quantities that may change: "controls", "initial_state", "parameters", or several of them.
+        initial_state_mask: (nx,) booleans, True for entries that "initial_state" may change; x0 is their initial guess.
+        us: (N, nu) the inputs if they are not optimized, or else their initial guess; 0 if not given.
+        parameters: names of model parameters (see `list_parameters`) or of parameters of the `Dynamics`, or a mapping
+            from names to values. They are constant in time. With "parameters" in `optimize`, the search starts from
+            them, and parameters of the `Dynamics` need not be named.
+        parameter_bounds: mapping from names to (lower, upper). Without a bound, a parameter that cannot be negative
+            stays above 1e-3 of its start, and an inertia stays physically possible.
         trajectory_cost: a function (xs, us) -> scalar that is added to the cost, such as the distance from a
             measured motion.
         parameter_cost: a function (p) -> scalar of the values (np,) of `parameters` that is added to the cost, such as
-            what a stronger motor costs.
-        motion: how a model gets from knot to knot. "steps": by Drake's own. "continuous": as they do as time steps
-            vanish, contact included (see `rollout`), so that the derivative through an impact is the impact's own; for
-            iLQR and shooting. Such a plan has to hold where another integration replays it.
+            the price of a stronger motor.
+        motion: how a model moves between knots. "steps": by Drake's own steps. "continuous": by their limit for
+            vanishing time steps, contact included (see `rollout`), so that the derivative through an impact is that of
+            the impact itself; for iLQR and shooting. Such a plan must also pass a replay with another integration.
 
     Raises:
-        InputError: something does not fit; also ShapeError, NonFiniteError and UnknownNameError, all with what was
-            expected and what was given.
+        InputError: an argument does not fit; also ShapeError, NonFiniteError and UnknownNameError, all with the
+            expected and the given value.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.05)
@@ -253,31 +253,31 @@ class Problem(PicklesItsFields, ShowsItsRepr):
 
     @property
     def has_model(self) -> bool:
-        """Whether this is a problem of a model, and not of plain dynamics."""
+        """Whether the system is a model rather than plain dynamics."""
         return isinstance(self.system, Model)
 
     @property
     def is_map(self) -> bool:
-        """Whether the system is a `DiscreteMap`, and time counts steps."""
+        """Whether the system is a `DiscreteMap`, whose time is the step index."""
         return isinstance(self.system, DiscreteMap)
 
     @property
     def moved(self) -> Model | None:
-        """The model whose states these are, held or not; None of plain functions."""
+        """The model that defines the states, also under fixed contacts, or None for plain functions."""
         return self.system if isinstance(self.system, Model) else self.system.model
 
     @property
     def model(self) -> Model:
-        """The model; ModelError where the problem is one of plain dynamics."""
+        """The model. Raises ModelError for plain dynamics."""
         if not isinstance(self.system, Model):
             raise ModelError("this problem is one of plain dynamics: it has no model")
         return self.system
 
     @cached_property
     def dynamics(self) -> Dynamics:
-        """x' = f(x, u): the model's equations of motion, or the plain dynamics, with the problem's parameters.
+        """The dynamics x' = f(x, u) with the problem's parameters: a model's equations of motion, or plain dynamics.
 
-        ModelError where there are none.
+        Raises ModelError if the model has no equations of motion.
         """
         if isinstance(self.system, Model):
             return plant_dynamics(self.system, self.parameters)
@@ -285,7 +285,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
 
     @property
     def name(self) -> str:
-        """What is moved: the model's name."""
+        """The model's name, or "plain dynamics"."""
         return "plain dynamics" if self.moved is None else self.moved.name
 
     @property
@@ -306,7 +306,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
 
     @property
     def start_horizon(self) -> float:
-        """[s] from the first state to the last where a search begins, which a free `horizon` lets it change."""
+        """The time [s] from the first state to the last at the start of a search, which changes a free `horizon`."""
         if isinstance(self.system, Model):
             whole = self.num_steps * self.system.time_step
             return whole if self.horizon is None else float(np.clip(whole, *self.horizon))
@@ -316,22 +316,22 @@ class Problem(PicklesItsFields, ShowsItsRepr):
 
     @property
     def time_step(self) -> float:
-        """[s] the model's time step; for plain dynamics an interval of `start_horizon`."""
+        """The model's time step [s], or, for plain dynamics, one interval of `start_horizon`."""
         return self.system.time_step if isinstance(self.system, Model) else self.start_horizon / self.num_steps
 
     @property
     def phases(self) -> tuple["Problem", ...]:
-        """Itself: a problem that is not a `PhasedProblem` is one phase."""
+        """The problem itself, because a problem that is not a `PhasedProblem` is one phase."""
         return (self,)
 
     @cached_property
     def kept(self) -> tuple[Constraint, ...]:
-        """All that a motion has to keep beside its bounds: the constraints, and those that the goals come to."""
+        """All constraints of a motion except bounds: the given constraints, and those of goals and orientations."""
         return (*self.constraints, *self.kept_goals, *self._orientations)
 
     @cached_property
     def _orientations(self) -> tuple[Constraint, ...]:
-        """Those of free bodies at waypoints and goal: a quaternion's length is free, as it grows in steps."""
+        """Constraints on free bodies' orientations at waypoints and goal. Quaternions may grow in length over steps."""
         none, asked = np.zeros(3), {**self.waypoints, self.num_steps: self.goal}
         return tuple(
             Constraint(_Parallel(q, state[q]), none, none, [knot], f"orientation from {self.state_names[q.start]} on")
@@ -341,7 +341,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
 
     @cached_property
     def kept_goals(self) -> tuple[GoalConstraint, ...]:
-        """What the goals without a weight come to on the model."""
+        """The constraints on the model that follow from the goals without a weight."""
         return tuple(constraint for goal in self.goals if goal.weight is None for constraint in self._bound(goal))
 
     def _bound(self, goal: Goal) -> Iterator[GoalConstraint]:
@@ -350,12 +350,12 @@ class Problem(PicklesItsFields, ShowsItsRepr):
 
     @cached_property
     def total_running_cost(self) -> Any:
-        """The running cost, with that of goals that have a weight all along; None where there is none."""
+        """The running cost with the costs of weighted goals along the whole motion, or None."""
         return self._with_goals(self.running_cost, None)
 
     @cached_property
     def total_final_cost(self) -> Any:
-        """The final cost, with that of goals that have a weight at the end; None where there is none."""
+        """The final cost with the costs of weighted goals at the end, or None."""
         return self._with_goals(self.final_cost, LAST)
 
     def _with_goals(self, cost: Any, knots: Any) -> Any:
@@ -367,7 +367,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
 
     @cached_property
     def design(self) -> Design:
-        """What a search through the model's discrete steps moves beside states and inputs."""
+        """The variables of a search through the model's discrete steps besides states and inputs."""
         return Design(
             self.model,
             self.parameters,
@@ -387,7 +387,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return "parameters" in self.optimize
 
     def bounds_of_parameters(self) -> tuple[Array, Array]:
-        """(lower (np,), upper (np,)) of the parameter vector, infinite where there is none."""
+        """Return the bounds (lower (np,), upper (np,)) of the parameter vector, infinite if not given."""
         lower, upper = np.full(len(self.parameters.values), -np.inf), np.full(len(self.parameters.values), np.inf)
         given = self.parameter_bounds or {}
         for p, s in zip(self.parameters.parameters, self.parameters.slices, strict=True):
@@ -399,12 +399,12 @@ class Problem(PicklesItsFields, ShowsItsRepr):
 
     @property
     def goal(self) -> Array:
-        """(nx,) the hard final state; NaN where it is free."""
+        """The final state (nx,) that a plan must reach, NaN for free entries."""
         return np.full(self.nx, np.nan) if self.x_goal is None else np.asarray(self.x_goal)
 
     @property
     def start(self) -> Array:
-        """(nx,) the initial state; NaN where it may change."""
+        """The initial state (nx,), NaN for entries that may change."""
         return np.where(self.initial_state_mask, np.nan, self.x0)
 
     @property
@@ -412,32 +412,32 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return not self.initial_state_mask.any()
 
     def state_limits(self) -> tuple[Array, Array]:
-        """(lower (N+1, nx), upper (N+1, nx)): the bounds of each state, x0, waypoints and goal where they are given."""
+        """Return the bounds (lower (N+1, nx), upper (N+1, nx)) of each state, equal at given x0, waypoints and goal."""
         sides = [np.tile(side, (self.num_steps + 1, 1)) for side in (self.bounds.x_lower, self.bounds.x_upper)]
         for knot, wanted in {0: self.start, **self.waypoints, self.num_steps: self.goal}.items():
             for side in sides:
                 side[knot] = np.where(np.isnan(wanted), side[knot], wanted)
-            for entries in self._orientations_of(wanted) if knot else ():  # which `kept` asks for
+            for entries in self._orientations_of(wanted) if knot else ():  # constrained by `kept`
                 for side, bounds in zip(sides, (self.bounds.x_lower, self.bounds.x_upper), strict=True):
                     side[knot, entries] = bounds[entries]
         return sides[0], sides[1]
 
     def knots_of(self, c: Constraint, *, input_at_end: bool) -> tuple[int, ...]:
-        """The knots at which `c` holds; a discrete method has no input at knot N, collocation has one at the end."""
+        """Return the knots of `c`. Discrete methods have no input at knot N, collocation has one (`input_at_end`)."""
         return c.at_knots(self.num_steps + int(input_at_end and c.takes_input), self.initial_state_is_given)
 
     def coupled(self, *, input_at_end: bool) -> tuple[BoundCoupling, ...]:
-        """The couplings of chosen knots; see `knots_of`."""
+        """Return the couplings of selected knots; see `knots_of`."""
         sizes = self.num_steps, self.nx, self.nu
         return tuple(c.bound(*sizes, input_at_end=input_at_end) for c in self.couplings if isinstance(c, Joins))
 
     @property
     def rate_limits(self) -> tuple[RateLimit, ...]:
-        """The couplings of all neighbouring knots."""
+        """The couplings of all pairs or triples of successive knots."""
         return tuple(c for c in self.couplings if isinstance(c, RateLimit))
 
     def coupled_steps(self, time_step: float | None = None) -> tuple[BoundCoupling, ...]:
-        """All couplings of a motion in steps of `time_step` [s], those that a search begins with where None."""
+        """Return all couplings of a motion in steps of `time_step` [s], by default the step where a search starts."""
         h = self.start_horizon / self.num_steps if time_step is None else time_step
         rates = [rate.of_steps(self.system, self.num_steps, h) for rate in self.rate_limits]
         return (*self.coupled(input_at_end=False), *rates)
@@ -445,17 +445,17 @@ class Problem(PicklesItsFields, ShowsItsRepr):
     def constraint_excess(
         self, xs: Array, us: Array, knots: Indices | None = None, coupled: Sequence[BoundCoupling] | None = None
     ) -> dict[str, tuple[float, int]]:
-        """The largest excess over its bounds of each constraint, and the row it is at, along xs (M+1, nx) under us.
+        """Return each constraint's largest excess over its bounds along xs (M+1, nx) under us, and the excess's row.
 
-        us is (M, nu), or (M+1, nu) at the knots; `knots` (N+1,) are the rows of the problem's own knots where a mesh
-        was refined, and a constraint of all knots is one of all rows. Waypoints are constraints here too, and so are
-        couplings: those of steps, where they are not given.
+        us is (M, nu), or (M+1, nu) at the knots. `knots` (N+1,) are the rows of the problem's own knots after mesh
+        refinement, and a constraint on all knots applies to all rows. Waypoints and couplings are included as
+        constraints. The couplings are those of steps by default.
         """
         excesses: dict[str, tuple[float, int]] = {}
         where = np.arange(len(xs)) if knots is None else knots
         for c in self.kept:
             own_knots = self.knots_of(c, input_at_end=len(us) == len(xs))
-            every = range(own_knots[0], len(us) if c.takes_input else len(xs))  # from 1 where the first state is given
+            every = range(own_knots[0], len(us) if c.takes_input else len(xs))  # from 1 if the first state is given
             rows: Any = every if c.knots is None else where[list(own_knots)]
             if c.whole and c.knots is not None:
                 rows = range(where[own_knots[0]], where[own_knots[-1]] + 1)
@@ -467,13 +467,13 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return excesses | excess_of(self.coupled_steps() if coupled is None else coupled, xs, us, where)
 
     def state_scales(self, xs: Array) -> Array:
-        """(nx,) how far each state goes along xs (M, nx), the scale of its tolerances, in its unit.
+        """Return the scale (nx,) of each state's tolerances, in its unit, from its range along xs (M, nx).
 
-        That is its own range; of a joint of several directions, that of the one which moves most. A position that is
-        not asked to travel has at least STAYS of its bounds, an angle of a radian at most. Such a velocity has STAYS
-        of its limits, or of what moves the position so far over the horizon. Bounds of 1e30 are none, see WIDEST. A
-        state that stands still has 1e-6 of the largest of its magnitude, what is asked of it, a radian and the body's
-        radius of gyration, and its velocity that over the horizon. Where all that is 0, it has 1e-6 of its bound.
+        A joint of several directions has the range of the one that moves most. A position that need not travel has at
+        least STAYS of its bounds, an angle at most STAYS of a radian. The velocity of such a position has STAYS of its
+        limits, or of the position's bounds over the horizon. Bounds such as 1e30 are ignored, see WIDEST. A state at
+        rest has 1e-6 of the largest of its magnitude, required values, a radian and the body's radius of gyration, and
+        its velocity has this over the horizon. If all these are 0, the scale is 1e-6 of the bound.
         """
         asked = np.vstack([xs, self.x0, *self.waypoints.values(), self.goal])
         scales, sizes = np.ptp(xs, axis=0), np.max(np.nan_to_num(np.abs(asked), posinf=0.0), axis=0)
@@ -493,19 +493,19 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return _not_zero(np.maximum(scales, least), self.bounds.x_lower, self.bounds.x_upper)
 
     def input_scales(self, us: Array) -> Array:
-        """(nu,) the largest magnitude of each input along us (M, nu); of one that is 0, 1e-6 of its bound."""
+        """Return the largest magnitude (nu,) of each input along us (M, nu), or 1e-6 of its bound if that is 0."""
         return _not_zero(np.max(np.abs(us), axis=0, initial=0.0), self.bounds.u_lower, self.bounds.u_upper)
 
     def spans(self, xs: Array, us: Array) -> Array:
-        """(nx + nu,) `state_scales` and `input_scales` side by side."""
+        """Return `state_scales` and `input_scales`, concatenated (nx + nu,)."""
         return np.concatenate([self.state_scales(xs), self.input_scales(us)])
 
     def search_spans(self, xs: Array, us: Array, slopes: Array, horizon: float) -> Array:
-        """(nx + nu,) how far states and inputs may go in a search from xs (M, nx), us (M, nu), in any units.
+        """Return how far states and inputs (nx + nu,) may move in a search from xs (M, nx), us (M, nu), in any units.
 
-        By x0, waypoints, goal and the guess. A state that is the same there has what moves another one by its way over
-        the `horizon` [s], by `slopes` (nx, nx + nu) of x', or what it is moved by; so has an input, or what the guess
-        has of it where that is more, within its bounds. One of which nothing is known has 1, or its bound below that.
+        The spans come from x0, waypoints, goal and the guess. A state that is constant there has what moves another one
+        by its span over the `horizon` [s], by `slopes` (nx, nx + nu) of x', or its change due to others. So has an
+        input, or its magnitude in the guess if larger, within bounds. Others have 1, or their bound if that is smaller.
         """
         b, nx = self.bounds, self.nx
         given = np.vstack([xs, np.where(self.initial_state_mask, np.nan, self.x0), *self.waypoints.values(), self.goal])
@@ -525,9 +525,9 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return np.where(spans > 0, spans, 1.0)
 
     def feasibility_scales(self, xs: Array, us: Array, values: Array, knots: Indices) -> dict[str, float]:
-        """The scale of each state, input, parameter (by `values` (np,)), constraint, coupling and the horizon.
+        """Return the scale of each state, input, parameter (from `values` (np,)), constraint, coupling and the horizon.
 
-        By the names that excesses have, along xs (M, nx) under us (M, nu). What a solver leaves is a part of these.
+        The keys are the names of excesses along xs (M, nx) under us (M, nu). Solver tolerances are relative to these.
         """
         spans, us = self.spans(xs, us), np.vstack([us, np.tile(us[-1:], (len(xs) - len(us), 1))])
         scales = dict(zip((*self.state_names, *self.input_names), spans, strict=True))
@@ -543,10 +543,10 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return scales
 
     def goal_tolerances(self, xs: Array) -> Array:
-        """(nx,) how far from the goal each state may end: as given, else 1 % of what it has to travel.
+        """Return the allowed distance (nx,) of each final state from the goal: as given, or 1 % of its required change.
 
-        That is the range of its values at x0, waypoints and goal. A state that returns to where it was, to RETURNS of
-        its range along xs (M, nx), travels that range: a velocity from rest to rest.
+        The required change is the range of the values at x0, waypoints and goal. A state that returns to its start,
+        within RETURNS of its range along xs (M, nx), has this range instead, such as a velocity from rest to rest.
         """
         scales = self.state_scales(xs)
         way = self._way(xs)
@@ -555,7 +555,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return np.where(self.has_goal_tolerance, given, tolerances)
 
     def _way(self, xs: Array) -> Array:
-        """(nx,) the range of what is asked of each state at x0, waypoints and goal; a joint's directions share it."""
+        """Return the range (nx,) of each state's values at x0, waypoints and goal, shared by a joint's directions."""
         x0 = np.where(self.initial_state_mask, xs[0], self.x0)
         way = _spread(np.vstack([x0, *self.waypoints.values(), self.goal]))
         for q, v, *_ in self._vectors:
@@ -564,7 +564,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
 
     @property
     def has_goal_tolerance(self) -> Array:
-        """(nx,) whether `goal_tolerance` is given for each state."""
+        """A mask (nx,) of the states whose `goal_tolerance` is given."""
         return ~np.isnan(np.full(self.nx, np.nan) if self.goal_tolerance is None else self.goal_tolerance)
 
     @cached_property
@@ -576,49 +576,49 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return [] if self.moved is None else vectors_of(self.moved)
 
     def goal_error(self, x: Array) -> Array:
-        """(nx,) the distance of `x` from the goal; see `distance`."""
+        """Return the distance (nx,) of `x` from the goal; see `distance`."""
         return self.distance(x, self.goal)
 
     def distance(self, x: Array, wanted: Array) -> Array:
-        """(nx,) of `x` from a state `wanted`, 0 where that is free; of quaternions whatever their lengths and signs."""
+        """Return the distance (nx,) of `x` from `wanted`, 0 if free, regardless of quaternions' lengths and signs."""
         state, wanted = np.array(x), self._with_the_signs_of(x, wanted)
         for entries in self._orientations_of(wanted):
             state[entries] *= np.linalg.norm(wanted[entries]) / np.linalg.norm(state[entries])
         return np.where(np.isnan(wanted), 0.0, state - wanted)
 
     def _orientations_of(self, wanted: Array) -> list[slice]:
-        """Where the quaternions are of which a state `wanted` (nx,) gives all entries."""
+        """Return the slices of the quaternions whose four entries are all given in the state `wanted` (nx,)."""
         every = [slice(start, start + 4) for start in self._quaternions]
         return [entries for entries in every if not np.isnan(wanted[entries]).any()]
 
     @cached_property
     def is_orientation(self) -> Indices:
-        """(nx,) whether an entry of the goal is part of an orientation: a row of `kept` asks for it."""
+        """A mask (nx,) of the goal's entries that belong to an orientation, which `kept` constrains."""
         mask = np.zeros(self.nx, dtype=bool)
         for entries in self._orientations_of(self.goal):
             mask[entries] = True
         return mask
 
     def cost_of_parameters(self, values: Array) -> float:
-        """What `parameter_cost` says of the values (np,), a part of the cost; 0 where there is none."""
+        """Return the `parameter_cost` of the values (np,), or 0 if there is none."""
         return 0.0 if self.parameter_cost is None else float(self.parameter_cost(values))
 
     def objective(self, xs: Array, inputs: Array, time_step: float | None = None) -> float:
-        """The objective of xs (N+1, nx) under inputs (N, nu) held over each step, but for that of the parameters.
+        """Return the objective of xs (N+1, nx) under inputs (N, nu) held over each step, without `parameter_cost`.
 
-        Inputs (N+1, nu) are at the knots, and the running cost is integrated by the trapezoid rule. Steps have the
-        length `time_step` [s], that of the model where None.
+        Inputs (N+1, nu) are at the knots, and the running cost is then integrated by the trapezoid rule. Steps have the
+        length `time_step` [s], by default that of the model.
         """
         return float(np.sum(self.cost_terms(xs, inputs, time_step)))
 
     def least_cost(self, x0: Array, time_step: float) -> float:
-        """What is nothing beside the cost of staying at `x0` (nx,) under inputs of 0, a millionth of it."""
+        """Return a millionth of the cost of resting at `x0` (nx,) under inputs of 0. Smaller costs count as zero."""
         return STILL * abs(
             self.objective(np.tile(x0, (self.num_steps + 1, 1)), np.zeros((self.num_steps, self.nu)), time_step)
         )
 
     def cost_terms(self, xs: Array, inputs: Array, time_step: float | None = None) -> Array:
-        """The terms of `objective`: of the knots, of the end and of the whole motion."""
+        """Return the terms of `objective` for the knots, the final state and the whole motion."""
         h = self.time_step if time_step is None else time_step
         running, final, rates = self.total_running_cost, self.total_final_cost, np.zeros(0)
         if running is not None:
@@ -669,7 +669,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return mask
 
     def _check_state(self, subject: str, given: Any, before: Array) -> Array:
-        """`given` (nx,), NaN where free, within the bounds; quaternions have the signs nearer to the state `before`."""
+        """Check the state `given` (nx,), NaN where free, and give its quaternions the signs nearer to `before`."""
         named = state_of(self.system, subject, given, np.full(self.nx, np.nan))
         state = array_with_gaps(subject, named, (self.nx,))
         if np.any(np.isinf(state)):
@@ -681,7 +681,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return self._with_the_signs_of(before, state)
 
     def _with_the_signs_of(self, x: Array, state: Array) -> Array:
-        """`state` (nx,) with each quaternion or its negative, the same orientation, on the side of that of `x`."""
+        """Return `state` (nx,) with each quaternion or its negative, the same orientation, nearer to that of `x`."""
         signed = np.array(state)
         for q in self._quaternions:
             if signed[q : q + 4] @ x[q : q + 4] < 0:
@@ -716,7 +716,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return states
 
     def _last_before_goal(self) -> Array:
-        """(nx,) the last that x0 and the waypoints say of each state."""
+        """Return the last value (nx,) that x0 and the waypoints give for each state."""
         last = self.x0
         for state in self.waypoints.values():
             last = np.where(np.isnan(state), last, state)
@@ -742,7 +742,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return couplings
 
     def _check_given(self, bound: BoundCoupling) -> None:
-        """Refuse a coupling of states that are all given and do not keep it."""
+        """Raise InputError if the states of a coupling are all given and violate it."""
         lower, upper = self.state_limits()
         knots = np.unique(bound.knots)
         if bound.takes_input or np.any(lower[knots] != upper[knots]):
@@ -764,7 +764,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return given
 
     def _check_kept(self) -> None:
-        """Bind the goals, which checks their names, and look at the knots of all that is kept."""
+        """Bind the goals, which checks their names, and check the knots and given states of all constraints."""
         if self.has_model:
             sides = np.array([self.bounds.u_lower, self.bounds.u_upper])
             check_inside("bounds", sides, *self.model.inputs.one_sided, self.input_names)
@@ -792,7 +792,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
                 )
 
     def _fixed_values(self, constraint: GoalConstraint) -> Array:
-        """(m,) the values of a goal's rows that no coordinate changes at any of some states, NaN of all others."""
+        """Return the values (m,) of a goal's rows that do not depend on the coordinates, and NaN for the other rows."""
         random, none = np.random.default_rng(0), np.zeros(self.nu)
         states = self.x0 + random.standard_normal((TRIED, self.nx))
         pairs = [constraint.differentiate(x, none) for x in states]
@@ -819,21 +819,21 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             self._call_costs()
 
     def _call_costs(self) -> None:
-        """Call each cost once with plain numbers: one that gives no scalar is refused before a method asks for it."""
+        """Call each cost once with floats, so that a cost without a scalar value is rejected before a solve."""
         for _, cost, arguments in self._user_costs():
             cost(*(argument.copy() for argument in arguments))
         if self.trajectory_cost is not None:
             self.trajectory_cost(np.tile(self.x0, (self.num_steps + 1, 1)), np.array(self.us))
 
     def _user_costs(self) -> Iterator[tuple[str, Any, tuple[Array, ...]]]:
-        """The costs of a knot, with their names and the arguments at the first knot."""
+        """Yield the costs of a knot, with their names and their arguments at the first knot."""
         if self.running_cost is not None:
             yield "running_cost", cost_at(self.running_cost, 0.0), (self.x0, self.us[0])
         if self.final_cost is not None:
             yield "final_cost", self.final_cost, (self.x0,)
 
     def check_derivatives(self) -> None:
-        """GradientError where a cost of a knot loses its derivatives, whichever method would ask for them."""
+        """Raise GradientError if a cost of a knot loses its derivatives, for any method."""
         for name, cost, arguments in self._user_costs():
             ends = np.cumsum([0, *map(len, arguments)])
             z = InitializeAutoDiff(np.concatenate(arguments)).ravel()
@@ -843,7 +843,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
                 raise GradientError(f"{named(name, cost)} lost its derivatives: write it in {ORDINARY}")
 
     def _check_parameter_cost(self, cost: Callable[[Any], Any]) -> None:
-        """Call it once, with AutoDiffXd."""
+        """Check the cost by one call with AutoDiffXd."""
         if not self.optimizes_parameters:
             raise InputError(
                 "parameter_cost", got="given", expected='"parameters" in optimize, as the cost is constant otherwise'
@@ -867,16 +867,16 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             expected = "no horizon, as a motion in continuous time lasts num_steps * model.time_step"
             raise InputError("horizon", got="given", expected=expected)
         with self.intervals(self.parameters):
-            pass  # what has none says why
+            pass  # raises an error if the model has no such motion
 
     @contextmanager
     def intervals(self, vector: ParameterVector) -> Iterator[Intervals]:
-        """How the model gets from knot to knot with the parameters applied, for as long as the block runs."""
+        """Yield the model's intervals from knot to knot. The parameters are applied while the block runs."""
         with applied(vector) as model:
             yield intervals_of(model, vector, self.motion)
 
     def _check_quantities(self) -> None:
-        """Call each function once with the parameters applied: what depends on the model's own refuses them."""
+        """Call each function once with the parameters applied. Functions of the model's original values raise."""
         if self.parameter_cost is not None:
             self._check_parameter_cost(self.parameter_cost)
         if not self.parameters.parameters or not self.has_model:
@@ -888,15 +888,15 @@ class Problem(PicklesItsFields, ShowsItsRepr):
 
 
 def _spread(values: Array) -> Array:
-    """(n,) the range of each column of values (M, n), NaN left out; 0 of one that is NaN alone."""
+    """Return the range (n,) of each column of values (M, n) without NaN, or 0 for a column of NaN."""
     lowest, highest = (np.nan_to_num(sign * values, nan=np.inf).min(axis=0) for sign in (1, -1))
     return np.where(np.isnan(values).all(axis=0), 0.0, -highest - lowest)
 
 
 def _not_zero(scales: Array, lower: Array, upper: Array) -> Array:
-    """`scales` (n,), and for those below NOTHING the rounding of a finite bound, else of the largest of all, else of 1.
+    """Replace `scales` (n,) below NOTHING by 1e-6 of a finite bound, or else of the largest scale, or else of 1.
 
-    A bound counts as WIDEST times the largest at most, where there is one.
+    A bound counts as at most WIDEST times the largest scale, if there is one.
     """
     scales = np.where(scales < NOTHING, 0.0, scales)
     largest = np.max(scales, initial=0.0)

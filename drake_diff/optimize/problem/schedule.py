@@ -1,4 +1,4 @@
-"""Which foot stands when: a goal that a plan keeps, and the guess that it begins with."""
+"""Schedules of the feet in contact, as goals of a plan, and initial guesses that follow them."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -18,33 +18,33 @@ from drake_diff.optimize.problem.cost import QuadraticCost, TrackingCost
 from drake_diff.optimize.problem.dynamics import coordinates
 from drake_diff.optimize.problem.goals import USED, Goal, GoalConstraint, name_of
 
-MIDDLE = 0.25  # of a swing at either end is left out where its clearance is looked at
-KEPT = 1000  # states of which it is remembered where the feet are
-OF_FRICTION = 0.7  # of the friction that is possible: what a guess uses
+MIDDLE = 0.25  # part at either end of a swing in which its clearance is not constrained
+KEPT = 1000  # number of states with cached positions of the feet
+OF_FRICTION = 0.7  # part of the possible friction that a guess uses
 Phases = tuple[tuple[int, tuple[str, ...]], ...]
-# What counts as 1 of what a plan is off its guess: of a quaternion, [m], [rad], [rad/s or m/s] of the base, [rad/s];
-# of the largest input of the guess; and how much more the last state counts than a second on the way.
+# Scales of a plan's deviation from its guess: of quaternions, [m], [rad], [rad/s or m/s] of the base, [rad/s], and of
+# inputs relative to the guess's largest; then the weight of the last state relative to a second of motion.
 TURN, PLACE, JOINT, BASE_SPEED, JOINT_SPEED, EFFORT, LAST_STATE = 0.3, 0.2, 1.0, 3.0, 10.0, 1.5, 10.0
 
 
 @dataclass(frozen=True, repr=False)
 class ContactSchedule(Goal):
-    """Which foot stands in which steps, on a ground at z = 0; a foot that does not stand swings.
+    """The feet that stand in each step, on a ground at z = 0. All other feet swing.
 
-    As a goal of a `Problem` it is kept: a standing foot touches the ground and does not slip, a swinging one is above.
-    `guess` makes a motion to begin with, and `follow` the cost that stays near it. The plan itself is of the model's
-    own steps.
+    As a goal of a `Problem` it is a constraint: a standing foot touches the ground and does not slip, a swinging foot
+    is above the ground. `guess` computes an initial guess, and `follow` a cost on the distance from it. The plan itself
+    uses the model's own steps.
 
     Args:
-        phases: For each phase the number of its steps, and the feet that stand in it.
-        feet: The feet; those of all phases where not given. A foot is a body with spheres or boxes fixed to it.
-        clearance: [m] how high a swinging foot is at least in the middle half of its way.
-        slip: [m/s] how fast a standing foot may slide.
-        touch: [m] how high over the ground a foot may be that stands, in a replay; in the plan it is on it.
+        phases: For each phase the number of its steps and its standing feet.
+        feet: The feet; by default those of all phases. A foot is a body with spheres or boxes fixed to it.
+        clearance: [m] the least height of a swinging foot in the middle half of its swing.
+        slip: [m/s] the largest sliding speed of a standing foot.
+        touch: [m] the largest height of a standing foot over the ground in a replay; in the plan the height is 0.
 
     Raises:
-        InputError: Values that are none; or, by the Problem, another number of steps, or a foot that has no shape.
-        UnknownNameError: By the Problem: its model has no such foot; the message lists its bodies.
+        InputError: Invalid values, a different number of steps in the Problem, or a foot without a shape.
+        UnknownNameError: The Problem's model has no such foot; the message lists its bodies.
 
     Example:
         >>> hop = dd.optimize.ContactSchedule([(20, ["left", "right"]), (12, []), (20, ["left", "right"])])
@@ -72,12 +72,12 @@ class ContactSchedule(Goal):
 
     @property
     def num_steps(self) -> int:
-        """Of all phases."""
+        """The number of steps of all phases."""
         return sum(steps for steps, _ in self.phases)
 
     @property
     def stands(self) -> Any:
-        """(N, feet) whether a foot stands in a step."""
+        """A mask (N, feet) of the standing feet in each step."""
         rows = [[foot in standing for foot in self.feet] for steps, standing in self.phases for _ in range(steps)]
         return np.array(rows, dtype=bool)
 
@@ -102,7 +102,7 @@ class ContactSchedule(Goal):
             heights = _OfFeet(soles, False, points)
             slides = _OfFeet(soles, True, np.concatenate([2 * points, 2 * points + 1]))
             carries = stands[:, those[0]]
-            standing = np.flatnonzero(carries) + 1  # not where it lands: longer steps fly a little longer
+            standing = np.flatnonzero(carries) + 1  # not at the landing knot: longer steps fly a little longer
             still = np.flatnonzero(carries & np.concatenate([carries[:1], carries[:-1]])) + 1
             swung = np.array([k for a, b in swings(down) for k in _middle(a, b, self.num_steps)], dtype=int)
             constraints += _rows(heights, standing, name, "over the ground where it stands", self.touch, upper=0.0)
@@ -112,10 +112,10 @@ class ContactSchedule(Goal):
         return tuple(constraints)
 
     def with_soft_feet(self, model: Model) -> Model:
-        """The model with contact that is as soft for its time step as plans need, where its file gives none.
+        """Return the model with contact as soft as plans need at its time step, unless its file defines the contact.
 
-        An even share of the weight presses a foot by 0.0625 m/s times the step; the contact relaxes in 2.5 steps. A
-        stiff foot that a search moves by a tenth of a millimetre leaves the ground, which no derivative foretells.
+        An even share of the weight presses a foot in by 0.0625 m/s times the step. The contact relaxes in 2.5 steps. A
+        stiff foot leaves the ground if a search moves it by 0.1 mm, and no derivative predicts this.
 
         Args:
             model: A model from a file, with a ground.
@@ -124,7 +124,7 @@ class ContactSchedule(Goal):
             `model.changed(...)` with another `stiffness`, `dissipation`, `relaxation_time` and `near_rigid`.
 
         Raises:
-            ModelError: It was made from a diagram.
+            ModelError: The model was made from a diagram.
 
         Example:
             >>> model = dd.load_model("models/quadruped.urdf", time_step=0.02, ground=True, actuators="all")
@@ -135,19 +135,19 @@ class ContactSchedule(Goal):
         return with_soft_feet(model, len(self.feet))
 
     def standing(self, model: Model, joints: Any) -> Array:
-        """The state in which it stands at rest on all feet, its joints where they are said to be.
+        """Return the state at rest on all feet, with the given joint positions.
 
-        The base is rolled, pitched and raised until a step of the model changes nothing.
+        The base is rolled, pitched and raised until a step of the model leaves the state unchanged.
 
         Args:
             model: The model, with a ground at z = 0.
-            joints: The position [rad or m] of joints by their names; others are where the file puts them.
+            joints: The position [rad or m] of joints by name; other joints have the positions of the file.
 
         Returns:
             (nx,) the state.
 
         Raises:
-            InputError: It does not rest so, a foot is off the ground, more than feet touch, or a motor is too weak.
+            InputError: The state is not at rest, a foot is off the ground, other bodies touch, or a motor is too weak.
             UnknownNameError: The model has no such foot or joint.
 
         Example:
@@ -170,23 +170,23 @@ class ContactSchedule(Goal):
         return standing(Legs.named(model, self.feet, posture), posture).x
 
     def guess(self, model: Model, x0: Any, end: Any = None, *, swing: float = 0.04) -> tuple[Array, Array]:
-        """A motion by the schedule: forces at the standing feet bring the centre of mass to where it is to be.
+        """Return a scheduled motion, in which forces at the standing feet move the centre of mass to its target.
 
-        It nearly obeys the steps of the model, and is an `initial_guess` of `solve`; what is told is what the search
-        makes of it.
+        The motion nearly satisfies the model's steps and is an `initial_guess` of `solve`. The result of a solve is the
+        search's own motion.
 
         Args:
             model: The model.
-            x0: (nx,) the first state, its feet on the ground where they stand at first.
-            end: (nq,) the posture that it comes to, at rest: its feet are where they are to stand at last. The first
-                one where not given.
-            swing: [m] how high a foot is swung.
+            x0: (nx,) the first state, with its initially standing feet on the ground.
+            end: (nq,) the final posture, at rest, with the feet at their last places of contact. It is the first
+                posture by default.
+            swing: [m] the height of a swing.
 
         Returns:
             States xs (N+1, nx) and inputs us (N, nu).
 
         Raises:
-            InputError: No forces of the feet within friction make such a motion, or feet that stand are in the air.
+            InputError: No forces of the feet within friction allow such a motion, or standing feet are in the air.
         """
         x0 = np.array(model.finite_state("x0", x0))
         last = x0[: model.nq] if end is None else np.array(finite_array("end", end, (model.nq,)))
@@ -196,7 +196,7 @@ class ContactSchedule(Goal):
         return scheduled_motion(model, legs, x0, last, self.stands, height, friction)
 
     def _check_touching(self, legs: Legs, x0: Array) -> None:
-        """InputError where the first state leaves feet in the air that are to stand in the first step."""
+        """Raise InputError if the initial state has feet in the air that stand in the first step."""
         legs.put(x0[: legs.model.nq])
         over, standing = legs.heights(), np.flatnonzero(self.stands[0])
         if not len(standing):
@@ -208,14 +208,14 @@ class ContactSchedule(Goal):
             raise InputError("ContactSchedule: x0", got=got, expected=expected)
 
     def follow(self, model: Model, guess: tuple[Array, Array]) -> dict[str, Any]:
-        """The `running_cost` and `final_cost` of a Problem that stays near a guess and ends at rest where it ends.
+        """Return the costs of a Problem that stays near a guess and ends at rest at the guess's final posture.
 
         Args:
             model: The model.
-            guess: What `guess` gave, or another motion xs (N+1, nx), us (N, nu).
+            guess: The result of `guess`, or another motion xs (N+1, nx), us (N, nu).
 
         Returns:
-            Both by name, so that `Problem(model, ..., **schedule.follow(model, guess))` has them.
+            The `running_cost` and `final_cost` by name, for `Problem(model, ..., **schedule.follow(model, guess))`.
         """
         xs, us = guess
         base = Legs.named(model, self.feet, xs[0, : model.nq]).base_q
@@ -233,18 +233,18 @@ class ContactSchedule(Goal):
 
 
 class _Soles:
-    """Heights and slides of the points that feet stand on; those of the last KEPT states are remembered."""
+    """Heights and sliding velocities of the feet's contact points, with a cache of the last KEPT states."""
 
     def __init__(self, legs: Legs):
-        self.legs, self.read = legs, dict[bytes, tuple[Array, Array]]()  # of the plant, which is slow to ask
+        self.legs, self.read = legs, dict[bytes, tuple[Array, Array]]()  # the plant's values, which are slow to read
         self.known: dict[Any, dict[bytes, tuple[Array, Array]]] = {self._values: {}, self._slopes: {}}
 
     def values(self, xs: Array) -> list[tuple[Array, Array]]:
-        """Heights (n,) [m] over the ground and slides (2 n,) [m/s] along it at each of xs (K, nx)."""
+        """Return heights (n,) [m] over the ground and sliding velocities (2 n,) [m/s] at each of xs (K, nx)."""
         return self._cached(xs, self._values)
 
     def slopes(self, xs: Array) -> list[tuple[Array, Array]]:
-        """(n, nx) and (2 n, nx) the derivatives of the same."""
+        """Return the derivatives (n, nx) and (2 n, nx) of `values`."""
         return self._cached(xs, self._slopes)
 
     def _cached(self, xs: Array, evaluate: Callable[[Array, Soles], tuple[Array, Array]]) -> list[tuple[Array, Array]]:
@@ -274,7 +274,7 @@ class _Soles:
 
 @dataclass(frozen=True, eq=False)
 class _OfFeet(StateFunction):
-    """Some `rows` of the heights, or of the slides, that `soles` give."""
+    """Some `rows` of the heights, or of the sliding velocities, of `soles`."""
 
     soles: _Soles
     slides: bool
@@ -290,7 +290,7 @@ class _OfFeet(StateFunction):
 def _rows(
     function: Callable[[Any], Any], knots: Indices, name: str, off: str, tolerance: float, **sides: Any
 ) -> Iterator[GoalConstraint]:
-    """`function` within `sides` at `knots`, if there are any; `off` says what is missed."""
+    """Yield a constraint on `function` within `sides` at `knots`, if any; `off` describes a violation."""
     if not len(knots):
         return
     unit = "m/s" if off.startswith("of slip") else "m"
@@ -310,6 +310,6 @@ def _phase(given: Any) -> tuple[int, tuple[str, ...]]:
 
 
 def _middle(a: int, b: int, last: int) -> range:
-    """The knots of a swing from a to b without its first and last part; up to where it begins or ends the motion."""
+    """Return the knots of a swing from a to b without its first and last part, except at the ends of the motion."""
     margin = MIDDLE * (b - a)
     return range(math.ceil(a + margin) if a > 0 else 1, (math.floor(b - margin) if b < last else last) + 1)

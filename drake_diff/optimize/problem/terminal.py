@@ -1,10 +1,10 @@
-"""A motion ends where a linear regulator takes over: in a level set of its cost-to-go from which it was seen to arrive.
+"""Terminal sets: level sets of a linear regulator's cost-to-go, from which simulations converge under the regulator.
 
-Within the level the regulator's inputs keep their limits, by formula, and so do the state's bounds. That the nonlinear
-plant comes to rest from there is evidence by sampling: random states in the set are stepped, under the regulator, until
-they have converged, and the level is lowered until as many as are asked for have done so one after the other
-(after Tedrake, Manchester, Tobenkin and Roberts, "LQR-trees", IJRR 29(8), 2010, and Reist and Tedrake,
-"Simulation-based LQR-trees with input and state constraints", ICRA 2010).
+Within the level, formulas guarantee that the regulator keeps the inputs' limits and the state's bounds. The convergence
+of the nonlinear plant is tested by sampling: random states in the set are simulated under the regulator until they
+converge, and the level is lowered until the required number of successive states converges (after Tedrake, Manchester,
+Tobenkin and Roberts, "LQR-trees", IJRR 29(8), 2010, and Reist and Tedrake, "Simulation-based LQR-trees with input and
+state constraints", ICRA 2010).
 """
 
 from dataclasses import KW_ONLY, dataclass, replace
@@ -24,37 +24,37 @@ from drake_diff.motion.policy import LQR
 from drake_diff.optimize.problem.constraint import Bounds
 from drake_diff.optimize.problem.goals import LAST, Goal, GoalConstraint
 
-AIMED = 0.75  # of the level: what a plan may use of it
-GONE = 1e6  # [the state's units] from the goal: nothing comes back from there
-ARRIVED = 1e-2  # of the level: what is left of the cost-to-go of a state that has converged
-SLOWEST, PATIENCE, MOST_STEPS = 1e-3, 3.0, 20_000  # the linear motion's part that is left when a search gives up, times
-LOWERED, TRIED = 0.7, 10  # the level while one of the first states fails; how many states make it worth counting
-WITHIN = 0.95  # of the level that was seen to converge: what is given out, so that its edge lies inside
-FLAT = np.pi  # [rad, m] how far from the goal a position without a bound may be
+AIMED = 0.75  # part of the level for a plan
+GONE = 1e6  # [the state's units], a distance from the goal that counts as divergence
+ARRIVED = 1e-2  # of the level: the cost-to-go of a converged state
+SLOWEST, PATIENCE, MOST_STEPS = 1e-3, 3.0, 20_000  # a run lasts PATIENCE times the linear motion's decay to SLOWEST
+LOWERED, TRIED = 0.7, 10  # factor on the level while one of the first TRIED states fails
+WITHIN = 0.95  # of the level that passed the samples: the level that is returned, so that its edge lies inside
+FLAT = np.pi  # [rad, m], the largest distance from the goal of a position without a bound
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """d' S d <= level about a fixed point: where u = u_goal - K d keeps its limits and is seen to converge."""
+    """d' S d <= level about a fixed point, where u = u_goal - K d keeps its limits and sampled states converge."""
 
     x_goal: Array  # (nx,)
     u_goal: Array  # (nu,)
     gain: Array  # (nu, nx) K
     cost_to_go: Array  # (nx, nx) S
     level: float
-    linear_level: float  # within which limits are kept, by formula
-    samples: int  # random states that converged, one after the other
-    period: float  # [s] of the regulator
-    patience: int  # [steps] that a state gets to converge
+    linear_level: float  # level up to which formulas guarantee the limits
+    samples: int  # number of successive random states that converged
+    period: float  # period of the regulator [s]
+    patience: int  # number of steps in which a state must converge
     bounds: Bounds
 
     def value(self, x: Any) -> Any:
-        """The part of the level that x (nx,) is at: at most 1 within."""
+        """Return d' S d / level at x (nx,), which is at most 1 in the set."""
         d = x - self.x_goal
         return d @ (self.cost_to_go / self.level) @ d
 
     def converges(self, model: Model, x: Array) -> bool:
-        """Whether `model`, in steps of the period or shorter, comes from x (nx,) to a hundredth of the level."""
+        """Return whether `model`, in steps of at most the period, moves from x (nx,) to a hundredth of the level."""
         held, b = max(1, round(self.period / model.time_step)), self.bounds
         for _ in range(self.patience):
             if not np.max(np.abs(x - self.x_goal)) < GONE:
@@ -72,7 +72,7 @@ class Region:
         return False
 
     def random_state(self, random: np.random.Generator) -> Array:
-        """(nx,) one uniform in the set."""
+        """Return a random state (nx,), uniformly distributed in the set."""
         direction = random.standard_normal(len(self.x_goal))
         radius = random.random() ** (1 / len(direction)) / np.linalg.norm(direction)
         square_root = np.linalg.cholesky(self.cost_to_go / self.level)
@@ -84,27 +84,27 @@ _KNOWN: "WeakKeyDictionary[Model, dict[Any, Region]]" = WeakKeyDictionary()
 
 @dataclass(frozen=True, repr=False)
 class TerminalSet(Goal):
-    """A motion ends in a set from which a linear quadratic regulator brings the plant to rest at x_goal.
+    """A terminal set from which a linear quadratic regulator moves the plant to rest at x_goal.
 
-    The set is (x - x_goal)' S (x - x_goal) <= level, S the regulator's cost-to-go in the model's own steps. There the
-    regulator keeps the inputs' limits and the state's bounds, by formula. That the plant converges is evidence by
-    sampling, not a proof: the level is lowered until `samples` random states of the set converge one after the other,
-    in steps of the plant under the regulator. A plan uses three quarters of the level, and each replay is followed by
-    the regulator from where it ends: one that does not converge does not hold. Every method keeps it.
+    The set is (x - x_goal)' S (x - x_goal) <= level, with S the regulator's cost-to-go in the model's own steps. In the
+    set the regulator keeps the inputs' limits and the state's bounds, by formula. The convergence of the plant is
+    evidence by sampling, not a proof: the level is lowered until `samples` successive random states of the set converge
+    in simulations of the plant under the regulator. A plan uses three quarters of the level. The regulator continues
+    each replay from its final state, and a replay that does not converge fails. Every method supports it.
 
     Args:
-        x_goal: (nx,) where the plant is to rest, a state that some input within its limits holds.
-        Q: (nx, nx) weights of the regulator, per step; the identity where None.
-        R: (nu, nu) the same of the inputs.
-        level: The level to be used; the largest that was seen to converge where None. One that is larger is refused.
-        samples: How many random states have to converge; of n all of which do, at most 3/n of the set's volume does not
-            with 95 % confidence.
-        seed: Of the random states.
+        x_goal: (nx,) the state of rest, which must be a fixed point for some input within its limits.
+        Q: (nx, nx) weights of the state per step; the identity if None.
+        R: (nu, nu) weights of the inputs per step; the identity if None.
+        level: The level of the set; if None, the largest with convergence. A larger one raises InputError.
+        samples: The number of random states that must converge. If n of n converge, at most 3/n of the set's volume
+            does not, with 95 % confidence.
+        seed: The seed of the random states.
 
     Raises:
-        InputError: By the Problem: no input holds x_goal or none stabilizes it, its limits leave no set, or the `level`
-            is larger than what was seen to converge.
-        ModelError: By the Problem: the state has quaternions.
+        InputError: For the Problem's model, no input makes x_goal a fixed point or stabilizes it, the limits leave no
+            set, or the `level` is larger than the largest with convergence.
+        ModelError: The state of the Problem's model has quaternions.
 
     Source:
         Reist and Tedrake, "Simulation-based LQR-trees with input and state constraints", ICRA 2010.
@@ -141,9 +141,9 @@ class TerminalSet(Goal):
         self._set(x_goal=tuple(x_goal.tolist()), samples=samples, seed=seed)
 
     def region(self, model: Model, bounds: Bounds, parameters: Parameters = ()) -> Region:
-        """The set on a `model` within resolved `bounds`, as a `Problem` has them; looked for once.
+        """Return the set for a `model` with the resolved `bounds` of a `Problem`. It is computed once.
 
-        With `parameters` of the model, names and values, it is that of the model with these.
+        With `parameters` of the model, names and values, it is the set of the model with these values.
         """
         vector = select(model, parameters)
         sides = (np.asarray(side).tobytes() for side in vars(bounds).values())
@@ -173,13 +173,13 @@ class TerminalSet(Goal):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TerminalConstraint(GoalConstraint):
-    """What a `TerminalSet` comes to; a replay that ends in it has to `converge` besides."""
+    """The constraint of a `TerminalSet`. A replay that ends in the set must also `converge`."""
 
     region: Any = None
 
 
 def _make_region(asked: TerminalSet, model: Model, bounds: Bounds) -> Region:
-    """The region of `asked`, by formula and then by sampling; InputError where there is none."""
+    """Compute the region of `asked` by formula and sampling. Raises InputError if there is no region."""
     x_goal = finite_array("TerminalSet.x_goal", asked.x_goal, (model.nx,))
     if tangent_space(model).quaternions:
         raise ModelError("TerminalSet: expected a state without quaternions, as the set needs differences of states")
@@ -215,7 +215,7 @@ def _make_region(asked: TerminalSet, model: Model, bounds: Bounds) -> Region:
 
 
 def _sampled(model: Model, region: Region, asked: TerminalSet) -> Region:
-    """The region, lowered until the random states in a row converge; a level that was asked for is refused instead."""
+    """Lower the level until the random states in a row converge. Raise InputError instead if the level was given."""
     random, first, in_a_row = np.random.default_rng(asked.seed), region.level, 0
     while in_a_row < asked.samples:
         x, level = region.random_state(random), region.level
@@ -233,9 +233,9 @@ def _sampled(model: Model, region: Region, asked: TerminalSet) -> Region:
 
 
 def linear_level(K: Array, S: Array, x_goal: Array, u_goal: Array, bounds: Bounds, nq: int) -> float:
-    """The largest level of d' S d within which u_goal - K d and x_goal + d keep their limits.
+    """Return the largest level of d' S d within which u_goal - K d and x_goal + d keep their limits.
 
-    Over it the largest a' d is sqrt(level a' S^-1 a). A position without a bound stays within FLAT of its goal.
+    In this set the largest a' d is sqrt(level a' S^-1 a). A position without a bound stays within FLAT of its goal.
     """
     rows = np.vstack([-K, np.eye(len(S))])
     goal = np.concatenate([u_goal, x_goal])

@@ -1,1 +1,1 @@
-"""One step of sequential quadratic programming over the steps that come next, fast enough for a control period."""
+"""One step of sequential quadratic programming over the next steps, fast enough for a control period."""

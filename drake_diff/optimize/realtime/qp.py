@@ -1,13 +1,13 @@
-"""The quadratic program of one step: linear dynamics and hard input bounds, every other row with a slack at a price.
+"""The quadratic program of one step: linear dynamics, hard input bounds, and priced slacks on all other constraints.
 
-Over the moves d of inputs and states, knot by knot (that of the first state is 0),
+The variables are the moves d of inputs and states at each knot. The move of the first state is 0. The program is
 
     minimize  sum_k g_k' d_k + d_k' H_k d_k / 2 + price' slack
     where     dx_(k+1) = F_k d_k + gap_k,  du within its bounds,  lower - slack <= J d <= upper + slack,  slack >= 0,
 
-so that it always has a solution. A price above a row's multiplier keeps the row wherever it can be kept (an exact
-penalty; Nocedal and Wright, "Numerical Optimization", 2006, section 17.2). PIQP solves it, which CasADi carries:
-Schwan, Jiang, Kuhn and Jones, "PIQP: A Proximal Interior-Point Quadratic Programming Solver", 2023.
+The slacks make it always feasible. If a row's price exceeds its multiplier, the row is satisfied wherever possible (an
+exact penalty; Nocedal and Wright, "Numerical Optimization", 2006, section 17.2). PIQP, which CasADi includes, solves
+it: Schwan, Jiang, Kuhn and Jones, "PIQP: A Proximal Interior-Point Quadratic Programming Solver", 2023.
 """
 
 from collections.abc import Sequence
@@ -25,32 +25,32 @@ from drake_diff.optimize.ilqr.riccati import LinearQuadratic
 from drake_diff.optimize.knots import PointFunction
 
 ACCURATE = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 50}
-# The second is slower and solves what the first may not, whose numbers differ widely.
+# The second set is slower and solves programs with widely different numbers, where the first set may fail.
 OPTIONS = (ACCURATE, ACCURATE | {"iterative_refinement_always_enabled": True})
-FREE = 1e30  # what PIQP takes for no limit
-FAR = 1e3  # ranges: a limit there is as good as none
-DEAREST = 1e4  # price: dearer ones cost PIQP its digits, so that the cost is taken in another unit
+FREE = 1e30  # PIQP's value for no limit
+FAR = 1e3  # ranges: a limit beyond this distance has no effect
+DEAREST = 1e4  # largest price: higher ones reduce PIQP's accuracy, so that the cost is scaled
 
 
 @dataclass(frozen=True, eq=False)
 class RowLimits:
-    """Rows lower <= f(z) <= upper at the K knots from `first` on, infinite where there is no limit."""
+    """Rows lower <= f(z) <= upper at the K knots from `first` on, infinite if there is no limit."""
 
     labels: tuple[str, ...]  # (m,)
     function: PointFunction
     first: int
     lower: Array  # (K, m)
     upper: Array
-    has_lower: Flags  # (m,) whether there is such a limit at any knot of the problem
+    has_lower: Flags  # (m,) whether any knot of the problem has such a limit
     has_upper: Flags
-    prices: Array  # (m,) per unit that a limit is passed by
-    ranges: Array  # (m,) how far f ranges; a limit on both sides that is far narrower is one to be met
+    prices: Array  # (m,) per unit of violation
+    ranges: Array  # (m,) the range of f; limits on both sides that are much narrower count as an equality
 
     @classmethod
     def unpriced(
         cls, labels: tuple[str, ...], function: PointFunction, first: int, lower: Array, upper: Array
     ) -> "RowLimits":
-        """At prices of 1."""
+        """Create row limits with prices of 1."""
         has_lower, has_upper = (np.any(np.isfinite(side), axis=0) for side in (lower, upper))
         return cls(labels, function, first, lower, upper, has_lower, has_upper, *np.ones((2, len(labels))))
 
@@ -59,16 +59,16 @@ class RowLimits:
         return slice(self.first, self.first + len(self.lower))
 
     def select(self, xs: Array, us: Array) -> Array:
-        """(K, nx + nu) the knots of a motion where they hold."""
+        """Return the knots (K, nx + nu) of a motion at which the rows apply."""
         return np.hstack([xs, np.vstack([us, np.zeros((1, us.shape[1]))])])[self.knots]
 
     def beyond(self, xs: Array, us: Array) -> Array:
-        """(K, m) how far a motion is beyond a limit."""
+        """Return the violations (K, m) of the limits by a motion."""
         values = self.function.values(self.select(xs, us))
         return np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0)
 
     def linearize(self, xs: Array, us: Array) -> "Limited":
-        """Around a motion; GradientError where something is not finite."""
+        """Linearize around a motion. Raises GradientError if a value is not finite."""
         values, jacobians = self.function.linearize(self.select(xs, us))
         if not (np.all(np.isfinite(values)) and np.all(np.isfinite(jacobians))):
             raise GradientError(f"{self.labels[0]} or its derivative is not finite along the motion")
@@ -77,7 +77,7 @@ class RowLimits:
 
 @dataclass(frozen=True, eq=False)
 class Limited:
-    """`RowLimits` around a motion: Jacobians (K, m, nx + nu), and how far the limits are from the values (K, m)."""
+    """`RowLimits` around a motion: Jacobians (K, m, nx + nu), and the limits minus the values (K, m)."""
 
     limits: RowLimits
     jacobians: Array
@@ -87,24 +87,24 @@ class Limited:
 
     @property
     def beyond(self) -> Array:
-        """(K, m) how far the values are beyond a limit."""
+        """The violations (K, m) of the limits by the values."""
         return np.maximum(np.maximum(self.lower, -self.upper), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Moves:
-    """A solution. Multipliers are positive at an upper limit and negative at a lower one."""
+    """A solution of the program. Multipliers are positive at an upper limit and negative at a lower one."""
 
     dxs: Array  # (N+1, nx)
     dus: Array  # (N, nu)
-    slacks: tuple[Array, ...]  # (K, m) of each of the rows
+    slacks: tuple[Array, ...]  # (K, m) for each of the row limits
     multipliers: tuple[Array, ...]  # (K, m)
     bounds: Array  # (N, nu) multipliers of the inputs' bounds
-    dynamics: Array  # (N, nx) of each step: d cost / d gap
+    dynamics: Array  # (N, nx) multipliers of each step: d cost / d gap
 
 
 class SoftProgram:
-    """The program for `count` steps; its structure never changes, and is set up once."""
+    """The program for `count` steps. Its structure is constant and is set up once."""
 
     def __init__(self, nx: int, nu: int, count: int, rows: Sequence[RowLimits]):
         self.nx, self.nu, self.count = nx, nu, count
@@ -112,7 +112,7 @@ class SoftProgram:
         self.slack_at = np.cumsum([moves, *(r.lower.size for r in rows)])
         self.size = int(self.slack_at[-1])
         places, sides = [self._dynamics()], count * nx
-        self.sides: list[tuple[int, int, Indices]] = []  # (+1 upper or -1 lower, which of the rows, bounded (m,))
+        self.sides: list[tuple[int, int, Indices]] = []  # (+1 upper or -1 lower, index of the rows, bounded (m,))
         for i, r in enumerate(rows):
             for sign, has in ((1, r.has_upper), (-1, r.has_lower)):
                 bounded = np.flatnonzero(has)
@@ -120,7 +120,7 @@ class SoftProgram:
                 places.append(self._soft(i, r, bounded, sides))
                 sides += len(r.lower) * len(bounded)
         entries = np.concatenate([np.stack(pair) for pair in places], axis=1)
-        self._inside = entries[1] >= 0  # what depends on the first state, which is given, has no column
+        self._inside = entries[1] >= 0  # the first state is given and has no columns
         self._a, self._shape = entries[:, self._inside], (sides, self.size)
         self._h = self._set_hessian(n)
         shapes = {"h": self._hessian(np.ones(len(self._h[0]))), "a": self._rows(np.ones(len(self._a[0])))}
@@ -135,7 +135,7 @@ class SoftProgram:
         return ca.DM(csc_matrix((data, self._h), (self.size, self.size)))
 
     def _dynamics(self) -> tuple[Indices, Indices]:
-        """(rows, columns) of dx_(k+1), then of -F_k."""
+        """Return (rows, columns) of dx_(k+1), then those of -F_k."""
         nx, n = self.nx, self.nx + self.nu
         k, i = _all(self.count, nx)
         steps, entries, j = _all(self.count, nx, n)
@@ -143,13 +143,13 @@ class SoftProgram:
         return rows, np.concatenate([k * n + self.nu + i, self._column(steps, j)])
 
     def _column(self, k: Indices, j: Indices) -> Indices:
-        """Where entry j of [x, u] at knot k is among the variables; negative for the first state, which is given."""
+        """Return the index of the variable for entry j of [x, u] at knot k, negative for the given first state."""
         n = self.nx + self.nu
         positions = np.where(j < self.nx, (k - 1) * n + self.nu + j, k * n + j - self.nx)
         return np.where((k == 0) & (j < self.nx), -1, positions)
 
     def _soft(self, i: int, r: RowLimits, bounded: Indices, first: int) -> tuple[Indices, Indices]:
-        """(rows, columns) of one side's Jacobian, then of its slacks."""
+        """Return (rows, columns) of one side's Jacobian, then those of its slacks."""
         count, m = r.lower.shape
         k, a = _all(count, len(bounded))
         steps, entries, j = _all(count, len(bounded), len(r.function.columns))
@@ -165,10 +165,10 @@ class SoftProgram:
         return entries[:, self._curved]
 
     def solve(self, model: LinearQuadratic, limited: Sequence[Limited]) -> Moves | Refusal:
-        """A Refusal where PIQP finds no solution, as of numbers that are not finite or far too large."""
+        """Solve the program, or return a Refusal if PIQP finds no solution, as for non-finite or very large numbers."""
         n, nx, nu, count = self.nx + self.nu, self.nx, self.nu, self.count
         dearest = max((float(np.max(rows.prices, initial=0.0)) for rows in limited), default=0.0)
-        unit = DEAREST / dearest if dearest > DEAREST else 1.0  # of the cost
+        unit = DEAREST / dearest if dearest > DEAREST else 1.0  # unit of the cost
         data = [np.ones(count * nx), -model.F.ravel()]
         lower, upper = [model.gaps.ravel()], [model.gaps.ravel()]
         for sign, i, bounded in self.sides:
@@ -176,7 +176,7 @@ class SoftProgram:
             side, far = (rows.upper if sign > 0 else rows.lower)[:, bounded], FAR * rows.limits.ranges[bounded]
             columns = rows.limits.function.columns
             data += [rows.jacobians[:, bounded][:, :, columns].ravel(), np.full(side.size, -float(sign))]
-            side = np.clip(side, -far, far).ravel()  # PIQP complains of rows without a limit
+            side = np.clip(side, -far, far).ravel()  # PIQP warns about rows without a limit
             lower.append(side if sign < 0 else np.full(side.size, -np.inf))
             upper.append(side if sign > 0 else np.full(side.size, np.inf))
         a, h = np.concatenate(data)[self._inside], unit * model.hessians.ravel()[self._curved]
@@ -214,5 +214,5 @@ class SoftProgram:
 
 
 def _all(*counts: int) -> Indices:
-    """All indices below `counts`, in order: one row for each of them."""
+    """Return all indices below `counts`, in order, with one row for each count."""
     return np.indices(counts, dtype=np.intp).reshape(len(counts), -1)

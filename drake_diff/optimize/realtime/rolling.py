@@ -1,4 +1,4 @@
-"""A problem as stretches that begin at any of its steps and may reach beyond its end."""
+"""Stretches of a problem, which start at any of its steps and may extend beyond its end."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ from drake_diff.optimize.realtime.step import OPTIONS, Stretch, expand
 
 @dataclass(frozen=True, eq=False)
 class Staying:
-    """Staying at `point`, a state (nx,) and its input (nu,); `final` is what staying costs from a state nearby."""
+    """Staying at `point`, a state (nx,) and its input (nu,). `final` is the cost-to-go of staying from near states."""
 
     point: tuple[Array, Array]
     running: QuadraticCost
@@ -29,9 +29,9 @@ class Staying:
 
 
 class Rolling:
-    """`problem` around a plan xs (N+1, nx), us (N, nu); with `staying`, its end is stayed at.
+    """Stretches of `problem` around a plan xs (N+1, nx), us (N, nu). With `staying`, motions stay at its end.
 
-    Without, a stretch ends where the problem does, and those that begin later are of its own costs again.
+    Without `staying`, a stretch ends at the problem's end, and later stretches use the problem's own costs again.
     """
 
     def __init__(self, problem: Problem, staying: Staying | None, xs: Array, us: Array):
@@ -46,13 +46,13 @@ class Rolling:
         if staying is not None:
             self._stay = knot_cost(staying.running, self.nx, self.nu, probe)
             self._stayed = knot_cost(staying.final, self.nx, 0, states)
-        self.tails: tuple[CostToGo, ...] = ()  # of the states of a plan of the whole
+        self.tails: tuple[CostToGo, ...] = ()  # cost-to-go at the states of a plan of the whole problem
         self._programs: dict[int, SoftProgram] = {}
         self.limits = tuple(self._limits(probe))
         self._set_prices(xs, us)
 
     def stretch(self, begin: int, count: int) -> Stretch:
-        """The steps `begin` ... `begin` + `count`."""
+        """Return the stretch over the steps `begin` ... `begin` + `count`."""
         limits = tuple(self._select(every, begin, count) for every in self.limits)
         if count not in self._programs:
             self._programs[count] = SoftProgram(self.nx, self.nu, count, limits)
@@ -60,7 +60,7 @@ class Rolling:
         return Stretch(self.problem.model, self.problem.bounds, costs, limits, self._programs[count])
 
     def count(self, begin: int, horizon: int) -> int:
-        """How many steps are planned at most from step `begin` on."""
+        """Return the largest number of steps to plan from step `begin` on."""
         left = self.problem.num_steps - begin
         return min(horizon, left) if self.staying is None and left > 0 else horizon
 
@@ -79,7 +79,7 @@ class Rolling:
         yield Stage(final, slice(count, count + 1), times[count:], 1.0, final=True)
 
     def _limits(self, probe: Array) -> Iterator[RowLimits]:
-        """At the knots 0 ... N of the problem, and in a last row at all that come after; without prices."""
+        """Yield limits, without prices, at the knots 0 ... N of the problem and, in a last row, at all later knots."""
         problem, b, rows = self.problem, self.problem.bounds, (self.problem.num_steps + 2, 1)
         lower, upper = np.tile(b.x_lower, rows), np.tile(b.x_upper, rows)
         for k, wanted in problem.waypoints.items():
@@ -91,7 +91,7 @@ class Rolling:
             yield RowLimits.unpriced(labels, states, 1, lower[:, which], upper[:, which])
         for c in (*problem.constraints, *problem.kept_goals):
             if self.staying is not None and isinstance(c, GoalConstraint) and c.knots == LAST:
-                continue  # the plan keeps it, and its end is stayed at
+                continue  # the plan satisfies it, and motions stay at its end
             lower, upper = (np.tile(side, rows) for side in _wide(c))
             if c.knots is not None:
                 away = np.setdiff1d(np.arange(rows[0]), problem.knots_of(c, input_at_end=False))
@@ -100,12 +100,12 @@ class Rolling:
             yield RowLimits.unpriced(_labels(c), function, 0 if c.takes_input else 1, lower, upper)
 
     def _select(self, limits: RowLimits, begin: int, count: int) -> RowLimits:
-        """Those of the steps `begin` ... `begin` + `count`."""
+        """Return the limits for the steps `begin` ... `begin` + `count`."""
         knots = np.minimum(begin + limits.first + np.arange(count), len(limits.lower) - 1)
         return replace(limits, lower=limits.lower[knots], upper=limits.upper[knots])
 
     def _set_prices(self, xs: Array, us: Array) -> None:
-        """Prices by what a unit of each state and input is worth along the plan, and by the slopes of the rows."""
+        """Set prices from the value of a unit of each state and input along the plan, and from the rows' slopes."""
         problem, b = self.problem, self.problem.bounds
         whole = replace(self.stretch(0, problem.num_steps), limits=())
         quadratic = expand(whole, whole.motion(xs, us)).quadratic
@@ -149,9 +149,9 @@ def _priced(limits: RowLimits, knots: Array, worth: Array, spans: Array, unit: f
 
 
 def _wide(c: Constraint) -> tuple[Array, Array]:
-    """Its limits; of a goal that is met from both sides half of its tolerance, of which a plan uses less.
+    """Return the limits of `c`. For a goal with limits on both sides, widen them to half of its tolerance.
 
-    What a push has spent is not to be won back at any price.
+    A plan uses less than half. The part that a disturbance uses need not be recovered at a high price.
     """
     if not isinstance(c, GoalConstraint):
         return c.lower, c.upper

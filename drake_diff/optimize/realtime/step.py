@@ -1,11 +1,11 @@
-"""One step of sequential quadratic programming on a stretch of a problem: linearize, solve, take what the merit allows.
+"""One step of sequential quadratic programming on a stretch of a problem: linearize, solve, and search along the step.
 
-The merit is an exact one: the cost, the prices of what is beyond limits, and of the gaps between the steps. Gauss and
-Newton's curvature alone is used, that of the dynamics is left out. Diehl, Bock and Schloeder, "A real-time iteration
-scheme for nonlinear optimization in optimal feedback control", 2005.
+The merit function is exact. It is the cost plus the prices of violated limits and of gaps between the steps. The
+curvature is that of Gauss-Newton, without the curvature of the dynamics. See Diehl, Bock and Schloeder, "A real-time
+iteration scheme for nonlinear optimization in optimal feedback control", 2005.
 
-Where shapes touch, a state beside the motion is in another contact: so each step is rolled out on the plant, under
-the feedback of the quadratic program, and there are no gaps. Tassa, Erez and Todorov, "Synthesis and stabilization of
+Where shapes touch, a state near the motion may have other contacts. Each step is then rolled out on the plant under the
+feedback of the quadratic program, and there are no gaps. See Tassa, Erez and Todorov, "Synthesis and stabilization of
 complex behaviors through online trajectory optimization", 2012.
 """
 
@@ -38,34 +38,34 @@ from drake_diff.optimize.realtime.qp import Limited, Moves, RowLimits, SoftProgr
 
 @dataclass(frozen=True)
 class StepOptions:
-    """What tunes a step."""
+    """Tuning parameters of a step."""
 
     step_sizes: tuple[float, ...] = (1.0, 0.5, 0.25, 0.125, 1 / 16, 1 / 32)
     rolled_sizes: tuple[float, ...] = (1.0, 0.4, 0.1)  # each costs a rollout
     sufficient_decrease: float = 1e-4
-    gap_price: float = 2.0  # over the largest multiplier of the dynamics
-    rounding: float = 1e-12  # of the merit: a change below this is lost in the sum
-    solved_to: float = 1e-9  # the same of a quadratic program with limits that push
-    # Of the plant's motion in a step: a larger error is measured again over a part of the step, where it has to shrink.
+    gap_price: float = 2.0  # relative to the largest multiplier of the dynamics
+    rounding: float = 1e-12  # of the merit: a smaller change is lost in rounding
+    solved_to: float = 1e-9  # the same for a quadratic program with active limits
+    # Relative to the plant's motion in a step. A larger error is measured again over a part of it and must shrink.
     suspect: float = 0.1
     short_part: float = 1e-2
     still: float = 0.5
-    unseen: float = 1e-5  # of a state: Drake solves contact to 1e-6
-    # Of a multiplier over its price: a row between the two holds the motion, others do not or give way.
+    unseen: float = 1e-5  # relative to a state: Drake solves contact to 1e-6
+    # Of a multiplier relative to its price. A row is inactive below `holds`, active, or violated above `gives`.
     holds: float = 1e-6
     gives: float = 1 - 1e-6
-    slight: float = 1e-6  # of a row's range: what a limit that gives way is passed by at least
-    dear: float = 10.0  # prices over what a unit is worth
-    no_slope: float = 1e-12  # slopes whose squares are taken for none
-    narrow: float = 0.1  # of the range of a row: limits on both sides that are nearer to each other are met, not kept
-    stiff: float = 1e4  # over a row's price, per its scale: the curvature of a row that holds, for gains and values
-    # A price above a limit's multiplier keeps it wherever it can be kept. Where an end is stayed at, prices are this
-    # many costs of the plan for a whole range of what is limited: ten times what staying costs that is off by as much.
-    # Elsewhere they are `dear` times what the cost-to-go says that a unit is worth.
+    slight: float = 1e-6  # of a row's range: the least violation of a limit that counts as violated
+    dear: float = 10.0  # prices relative to the value of a unit
+    no_slope: float = 1e-12  # squared slopes that count as zero
+    narrow: float = 0.1  # of the range of a row: limits on both sides that are closer count as an equality
+    stiff: float = 1e4  # relative to a row's price, per its scale: the curvature of an active row, for gains and values
+    # A price above a limit's multiplier enforces the limit wherever possible. If the motion stays at its end, a
+    # violation by the whole range of a row costs this many times the plan, ten times the cost of staying so far away.
+    # Otherwise prices are `dear` times the value of a unit in the cost-to-go.
     dear_beside_staying: float = 1e5
     half: float = 0.5  # of a goal's tolerance
-    perturbed: int = 8  # motions at which slopes are looked at,
-    spread: float = 0.3  # in ranges of the states beside the plan
+    perturbed: int = 8  # number of perturbed motions for slopes of rows
+    spread: float = 0.3  # their deviation from the plan, in ranges of the states
 
 
 OPTIONS = StepOptions()
@@ -73,7 +73,7 @@ OPTIONS = StepOptions()
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """What is minimized over some steps: costs, and limits, whose prices are paid where they are passed."""
+    """The minimization over some steps: costs, and limits with prices for violations."""
 
     model: Model
     bounds: Bounds
@@ -83,7 +83,7 @@ class Stretch:
     rolls: bool = False  # whether each motion is rolled out on the plant, see `along`
 
     def along(self, xs: Array) -> "Stretch":
-        """The same for motions near xs (N+1, nx): rolled out where shapes touch in one of its states."""
+        """Return the stretch for motions near xs (N+1, nx), with rollouts if shapes touch in one of its states."""
         twin = self.model.double
         if not self.model.contract.contact.collision_pairs:
             return self
@@ -94,28 +94,28 @@ class Stretch:
         return self
 
     def cost(self, xs: Array, us: Array) -> float:
-        """That of a motion xs (N+1, nx), us (N, nu)."""
+        """Return the cost of a motion xs (N+1, nx), us (N, nu)."""
         return float(np.sum(self.costs.values(xs, us)))
 
     def paid(self, motion: Motion, rows: Sequence[RowLimits | Limited]) -> float:
-        """The cost of a motion, and what it pays for what is beyond limits at the prices of `rows`."""
+        """Return the cost of a motion plus the cost of its limit violations at the prices of `rows`."""
         with np.errstate(all="ignore"):
             beyond = (limit.beyond(*motion.point) for limit in self.limits)
             prices = (float(np.sum(row.prices * far)) for row, far in zip(rows, beyond, strict=True))
             return self.cost(*motion.point) + sum(prices)
 
     def ends(self, xs: Array, us: Array) -> Array:
-        """(N, nx) where the plant's steps from xs (N, nx) under us (N, nu) lead."""
+        """Return the ends (N, nx) of the plant's steps from xs (N, nx) under us (N, nu)."""
         return np.array([advance(self.model.double, x, u) for x, u in zip(xs, us, strict=True)])
 
     def motion(self, xs: Array, us: Array) -> Motion:
-        """xs (N+1, nx) under us (N, nu), with the gaps that the plant leaves."""
+        """Return the motion xs (N+1, nx) under us (N, nu), with the gaps of the plant's steps."""
         return Motion.with_ends(xs, us, self.ends(xs[:-1], us))
 
 
 @dataclass(frozen=True, eq=False)
 class Expansion:
-    """A stretch to second order around a motion."""
+    """The second-order expansion of a stretch around a motion."""
 
     quadratic: LinearQuadratic
     limited: tuple[Limited, ...]
@@ -123,10 +123,10 @@ class Expansion:
 
 @dataclass(frozen=True, eq=False)
 class RealtimeStep:
-    """One step: where it leads, and how much of it was taken.
+    """One step: its resulting motion and its size.
 
-    `size` is 0 where none was. `promised` is the decrease of the merit that a full step promised, `slacks` are those of
-    the quadratic program: how far each limit has to be passed.
+    `size` is 0 if no step was taken. `promised` is the predicted decrease of the merit by a full step. The slacks in
+    `moves` are the violations of the limits that the quadratic program requires.
     """
 
     stretch: Stretch
@@ -136,21 +136,21 @@ class RealtimeStep:
     merit: float
     expansion: Expansion
     moves: Moves
-    whole: bool  # whether no limit pushed
-    swept: Array | None = None  # (N, nu, nx) the gains of the sweep that solved it, if one did
-    is_doubtful: bool = False  # whether the derivatives seem not to be those of the plant's steps
+    whole: bool  # whether no limit was active
+    swept: Array | None = None  # gains (N, nu, nx) of the Riccati sweep, if it solved the step
+    is_doubtful: bool = False  # whether the derivatives seem to differ from those of the plant's steps
 
     @cached_property
     def policy(self) -> AffinePolicy | None:
-        """How the solution changes with its first state, and what remains to be paid; None where neither is known.
+        """The solution's feedback on its first state and the cost-to-go, or None if neither is known.
 
-        Rows and bounds that hold the solution go on to hold it, and those that give way give way.
+        Active rows and bounds stay active, and violated rows stay violated.
         """
         return least_regularized(_held(self.expansion, self.moves, one_sided=True))
 
     @cached_property
     def feedback(self) -> Array:
-        """(N, nu, nx) the gains by which it is rolled out; 0 where there are none."""
+        """The feedback gains (N, nu, nx) of rollouts, or 0 if there are none."""
         if self.swept is not None:
             return self.swept
         none = np.zeros((*self.motion.us.shape, self.motion.xs.shape[1]))
@@ -158,7 +158,7 @@ class RealtimeStep:
 
     @cached_property
     def tails(self) -> tuple[CostToGo, ...] | None:
-        """What remains to be paid from each knot on, for motions that may also leave the limits to the inside."""
+        """The cost-to-go from each knot, for motions that may also leave active limits to the inside."""
         policy = least_regularized(_held(self.expansion, self.moves, one_sided=False))
         if policy is None:
             return None
@@ -167,12 +167,12 @@ class RealtimeStep:
 
     @property
     def is_reached(self) -> bool:
-        """Whether a further step promises no more than what the program is solved to."""
+        """Whether the predicted decrease of a further step is within the accuracy of the program."""
         return self.promised <= (OPTIONS.rounding if self.whole else OPTIONS.solved_to) * (1 + abs(self.merit))
 
     @property
     def given_way(self) -> tuple[str, float, int] | None:
-        """(label, how far, knot) of the limit that the solution passes at the highest price, if it passes one."""
+        """The (label, violation, knot) of the limit that is violated at the highest price, or None."""
         worst, passed = 0.0, None
         for rows, slack, force in zip(self.expansion.limited, self.moves.slacks, self.moves.multipliers, strict=True):
             limits = rows.limits
@@ -185,11 +185,11 @@ class RealtimeStep:
 
 
 def take_step(stretch: Stretch, motion: Motion, damping: Array | None = None) -> RealtimeStep | Refusal:
-    """One step from `motion`, whose first state is given; a Refusal where the quadratic program is not solved.
+    """Take one step from `motion` with a given first state. Return a Refusal if the quadratic program is not solved.
 
-    `damping` (nx + nu,) is added to the curvature of each knot, for shorter steps (Levenberg and Marquardt).
+    `damping` (nx + nu,) is added to the curvature of each knot, for shorter steps (Levenberg-Marquardt).
 
-    Raises GradientError or SimulationError where a derivative is refused.
+    Raises GradientError or SimulationError if a derivative is refused.
     """
     expansion = expand(stretch, motion)
     if damping is not None:
@@ -224,10 +224,10 @@ def take_step(stretch: Stretch, motion: Motion, damping: Array | None = None) ->
 
 
 def _is_doubtful(step: RealtimeStep, before: Motion) -> bool:
-    """Whether the plant departs from its derivatives by an error that does not shrink with the step."""
+    """Return whether the plant deviates from its derivatives by an error that does not shrink with the step."""
     dxs, dus = step.motion.xs - before.xs, step.motion.us - before.us
     linear = np.einsum("kij,kj->ki", step.expansion.quadratic.F, np.hstack([dxs[:-1], dus]))
-    change = float(np.max(np.abs(linear - dxs[:-1])))  # beside the motion of a state without inputs
+    change = float(np.max(np.abs(linear - dxs[:-1])))  # change of the end minus that of the start
 
     def error(motion: Motion, fraction: float) -> float:
         return float(np.max(np.abs(motion.ends - before.ends - fraction * linear)))
@@ -240,12 +240,12 @@ def _is_doubtful(step: RealtimeStep, before: Motion) -> bool:
 
 
 def merit(stretch: Stretch, expansion: Expansion, motion: Motion, gap_prices: Array) -> float:
-    """What a motion costs, with the prices of what is beyond limits and of gaps, `gap_prices` (nx,)."""
+    """Return a motion's cost plus the prices of limit violations and of gaps, `gap_prices` (nx,)."""
     return stretch.paid(motion, expansion.limited) + float(np.sum(gap_prices * np.abs(motion.gaps)))
 
 
 def _moved(step: RealtimeStep, size: float) -> Motion:
-    """A part of the step from its motion: rolled out where shapes touch."""
+    """Return the motion after a part of the step, rolled out where shapes touch."""
     motion, stretch = step.motion, step.stretch
     xs, us = motion.xs + size * step.moves.dxs, motion.us + size * step.moves.dus
     if stretch.rolls:
@@ -254,7 +254,7 @@ def _moved(step: RealtimeStep, size: float) -> Motion:
 
 
 def roll(stretch: Stretch, x: Array, xs: Array, us: Array, feedback: Array) -> Motion:
-    """The plant's motion from x (nx,) under the `feedback` (N, nu, nx) about xs (N+1, nx) and us (N, nu)."""
+    """Return the plant's motion from x (nx,) under `feedback` (N, nu, nx) around xs (N+1, nx) and us (N, nu)."""
     bounds, twin = stretch.bounds, stretch.model.double
     states, inputs = np.empty_like(xs), np.empty_like(us)
     states[0] = x
@@ -265,7 +265,7 @@ def roll(stretch: Stretch, x: Array, xs: Array, us: Array, feedback: Array) -> M
 
 
 def _first_rollout(step: RealtimeStep) -> RealtimeStep:
-    """From a motion with gaps: the plant's own, the whole step or none of it, whichever costs less."""
+    """Replace a motion with gaps by a rollout of the plant, with the full step or no step, whichever costs less."""
     best = None
     for size in (1.0, 0.0):
         try:
@@ -281,9 +281,9 @@ def _first_rollout(step: RealtimeStep) -> RealtimeStep:
 
 
 def _solve(stretch: Stretch, expansion: Expansion) -> tuple[Expansion, Moves, bool, Array | None] | Refusal:
-    """The program with prices that are dear enough, its solution, whether no limit pushes, and gains (N, nu, nx).
+    """Return the program with high enough prices, its solution, whether no limit is active, and gains (N, nu, nx).
 
-    Where motions are rolled out and bounds of inputs alone push it is by Riccati's sweep, which has gains.
+    If motions are rolled out and only bounds of inputs are active, the Riccati sweep solves it and has gains.
     """
     quadratic = expansion.quadratic
     nothing = tuple(np.zeros_like(rows.lower) for rows in expansion.limited)
@@ -300,7 +300,7 @@ def _solve(stretch: Stretch, expansion: Expansion) -> tuple[Expansion, Moves, bo
 
 
 def expand(stretch: Stretch, motion: Motion) -> Expansion:
-    """The quadratic program around `motion`. Raises GradientError or SimulationError."""
+    """Return the quadratic program around `motion`. Raises GradientError or SimulationError."""
     xs, us, bounds = motion.xs, motion.us, stretch.bounds
     A, B, _ = linearize(stretch.model, xs, off_bounds(bounds, us), x_next=motion.ends)
     gradients, hessians = stretch.costs.expand(xs, us)
@@ -319,7 +319,7 @@ def expand(stretch: Stretch, motion: Motion) -> Expansion:
 
 
 def _swept(quadratic: LinearQuadratic) -> tuple[Moves, AffinePolicy] | None:
-    """The solution by Riccati's sweep, its inputs within their bounds; None where the cost has no minimum."""
+    """Solve by the Riccati sweep with inputs within bounds. Return None if the cost has no minimum."""
     policy = solve_riccati(quadratic, 0.0)
     if policy is None:
         return None
@@ -333,7 +333,7 @@ def _swept(quadratic: LinearQuadratic) -> tuple[Moves, AffinePolicy] | None:
 
 
 def _is_kept(expansion: Expansion, moves: Moves) -> bool:
-    """Whether moves leave no limit of states."""
+    """Return whether the moves satisfy all limits of states."""
     for rows in expansion.limited:
         moved = np.einsum("kri,ki->kr", rows.jacobians, rows.limits.select(moves.dxs, moves.dus))
         if np.any(moved < rows.lower) or np.any(moved > rows.upper):
@@ -342,9 +342,9 @@ def _is_kept(expansion: Expansion, moves: Moves) -> bool:
 
 
 def _dear_enough(limited: Sequence[Limited], forces: Array) -> tuple[Limited, ...]:
-    """The same at prices that stand above what the motion without limits is worth, all raised alike.
+    """Raise all prices by one factor, above the value of a unit for the motion without limits.
 
-    `forces` (N, nx) are its multipliers: far from the plan they are larger than the plan's own.
+    `forces` (N, nx) are this motion's multipliers, which far from the plan are larger than the plan's own.
     """
     worth, factor = np.max(np.abs(forces), axis=0), 1.0
     for rows in limited:
@@ -357,9 +357,9 @@ def _dear_enough(limited: Sequence[Limited], forces: Array) -> tuple[Limited, ..
 
 
 def _held(expansion: Expansion, moves: Moves, *, one_sided: bool) -> LinearQuadratic:
-    """The program around its own solution, with what holds it as curvature, and held inputs at rest.
+    """Return the program around its own solution, with active rows as curvature and active inputs fixed.
 
-    Where not `one_sided`, that is of rows alone that are to be met from both sides, and as stiff as they are dear.
+    If not `one_sided`, only rows with an equality contribute, with a curvature proportional to their price.
     """
     q = expansion.quadratic
     nx, d = q.num_states, np.hstack([moves.dxs, np.vstack([moves.dus, np.zeros((1, moves.dus.shape[1]))])])
@@ -382,7 +382,7 @@ def _held(expansion: Expansion, moves: Moves, *, one_sided: bool) -> LinearQuadr
 
 
 def _on_bound(q: LinearQuadratic, moves: Moves) -> Array:
-    """(N, nu) which inputs a bound holds: those nearer to it than its multiplier is to 0, both in their own scale."""
+    """Return a mask (N, nu) of inputs on a bound: those near it with a multiplier, each relative to its own scale."""
     width = np.where(np.isfinite(q.upper - q.lower), q.upper - q.lower, 1.0)
     near = np.minimum(moves.dus - q.lower, q.upper - moves.dus) / np.maximum(width, 1e-300)
     scale = np.max(np.abs(moves.bounds), initial=0.0)

@@ -1,1 +1,1 @@
-"""Collocation: a problem on a mesh of knots as a nonlinear program, solved by IPOPT or SNOPT."""
+"""Collocation of a problem on a mesh of knots as a nonlinear program, solved by IPOPT or SNOPT."""

@@ -1,4 +1,4 @@
-"""How far a collocated motion leaves its bounds and constraints between the nodes at which the solver keeps them."""
+"""Violations of bounds and constraints by a collocated motion between the nodes at which the solver enforces them."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -20,16 +20,16 @@ from drake_diff.optimize.transcription.collocation import Collocated
 from drake_diff.optimize.transcription.lead import MOST_PLACES, SUBSTEPS, WIDTH
 from drake_diff.optimize.transcription.task import constraint_form, values_of_many
 
-DENSE = np.linspace(0, 1, 41)[1:-1]  # where the input is looked at between two knots
-# Of a number's range along the motion: how far beyond its bound it may be between nodes. The solver keeps the scheme's
-# polynomials of states and inputs within; what the dynamics do in between differs from these by the integration error.
+DENSE = np.linspace(0, 1, 41)[1:-1]  # places between two knots at which the input is checked
+# Relative to a number's range along the motion: allowed excess over its bound between nodes. The solver keeps the
+# scheme's polynomials within bounds. The dynamics' states differ from these by the integration error.
 EXCESS_TOLERANCE = 1e-3
-# Of a limit of jerks: the slopes of a scheme's polynomials differ from those of what the dynamics do by an order of an
-# interval's length more than the polynomials do.
+# Relative to a jerk limit. The slopes of a scheme's polynomials have an error that is one order of an interval's length
+# larger than the error of the polynomials.
 JERK_TOLERANCE = 1e-2
-DEPTH_TOLERANCE = 1e-3  # of the ranges of states and inputs: how far away a constraint that does not hold may hold
-SOLVED = 1e-8  # of a constraint's scale or bound: what the solver may leave of a constraint that it keeps
-CLOSER, CLOSER_ROUNDS = 9, 2  # places about a constraint's nearest approach to its bound, and how often
+DEPTH_TOLERANCE = 1e-3  # of the ranges of states and inputs: allowed distance to where a constraint is satisfied
+SOLVED = 1e-8  # of a constraint's scale or bound: the residual that a solver may leave
+CLOSER, CLOSER_ROUNDS = 9, 2  # places around a constraint's closest approach to its bound, and repetitions
 KINDS = ("state", "input", "constraint")
 
 
@@ -37,10 +37,10 @@ KINDS = ("state", "input", "constraint")
 class Excess:
     """The largest excess over a bound of a state, an input and a constraint between the nodes.
 
-    The tolerance of each is 1e-3 of its range along the motion, or 1e-5 of its scale where that is more. A constraint
-    has to hold within 1e-3 of the ranges of states and inputs besides. `worst` is the largest excess as a part of its
-    tolerance, `where` that is, and `checks` has one for each bound and constraint; what fails does so in one of the
-    `intervals`.
+    The tolerance of each is 1e-3 of its range along the motion, or 1e-5 of its scale if that is larger. A violated
+    constraint must also be satisfied within 1e-3 of the ranges of states and inputs. `worst` is the largest ratio of an
+    excess to its tolerance, and `where` its place. `checks` has an entry for each bound and constraint, and failures
+    are in the `intervals`.
     """
 
     state: float
@@ -53,10 +53,10 @@ class Excess:
 
 
 def violation_between_nodes(motion: Collocated) -> Excess:
-    """How far a collocated motion leaves its bounds and constraints between the nodes.
+    """Return the violations of bounds and constraints by a collocated motion between the nodes.
 
-    The states are those that an accurate integration from each knot passes through, under the input as the plant
-    applies it, cut off at its own limits. A cost below the optimum of the problem goes together with an excess here.
+    The states are those of an accurate integration from each knot under the input that the plant applies, clipped at
+    its own limits. A cost below the optimum of the problem implies an excess.
     """
     task, b, count = motion.task, motion.task.bounds, len(motion.mesh) - 1
     if task.is_map:
@@ -96,7 +96,7 @@ def violation_between_nodes(motion: Collocated) -> Excess:
 
 
 def passed_between_steps(problem: Problem, times: Array, xs: Array, us: Array) -> Iterator[Check]:
-    """Whether a motion in steps, xs (N+1, nx) under us (N, nu), goes through a constraint between two of them."""
+    """Yield checks of whether steps xs (N+1, nx) under us (N, nu) pass through a constraint between two of them."""
     every = np.unique(
         np.concatenate([times, np.interp(np.arange(0, len(us), 1 / SUBSTEPS), np.arange(len(xs)), times)])
     )
@@ -124,11 +124,11 @@ def passed_between_steps(problem: Problem, times: Array, xs: Array, us: Array) -
 
 @dataclass(frozen=True)
 class _Beyond:
-    """The largest excess of one number over its bounds, in one of the `KINDS`, and when it is above its tolerance."""
+    """The largest excess of one number over its bounds, in one of the `KINDS`, and the times above its tolerance."""
 
     kind: str
     excess: float
-    part: float  # of its tolerance
+    part: float  # ratio to its tolerance
     when: Array  # [s]
     check: Check
 
@@ -136,7 +136,7 @@ class _Beyond:
 def _beyond(
     kind: str, names: Sequence[str], values: Array, lower: Array, upper: Array, tolerance: Array, times: Array
 ) -> list[_Beyond]:
-    """One for each column of `values` (S, n)."""
+    """Return one entry for each column of `values` (S, n)."""
     excess, excesses = _excess(values, lower, upper), list[_Beyond]()
     for i, k in enumerate(np.argmax(excess, axis=0).tolist()):
         far, limit = float(excess[k, i]), float(tolerance[i])
@@ -150,7 +150,7 @@ def _between(what: str, where: str, value: float, tolerance: float, unit: str = 
 
 
 def _excess(values: Array, lower: Array, upper: Array) -> Array:
-    """How far beyond their bounds `values` (S, n) are; what is no number is infinitely far."""
+    """Return the excess of `values` (S, n) over their bounds, infinite for values that are not finite."""
     excess = np.maximum(np.maximum(lower - values, values - upper), 0.0)
     return np.where(np.isfinite(values), excess, np.inf)
 
@@ -164,7 +164,7 @@ def _tolerance(ranges: Array, scales: Array) -> Array:
 
 
 def _parts(excess: Array, tolerance: Array) -> Array:
-    """`excess` over `tolerance`; 0 where there is none of either."""
+    """Return `excess` / `tolerance`, or 0 without an excess."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(excess > 0, excess / tolerance, 0.0)
 
@@ -179,7 +179,7 @@ def _too_near(motion: Collocated, c: ClearanceConstraint) -> _Beyond:
 
 
 def _of_stay(motion: Collocated, c: GoalConstraint) -> _Beyond:
-    """How far beyond its tolerance a goal is missed while it is to hold, where the dynamics lead between the knots."""
+    """Return the excess of a goal over its tolerance while it applies, for the dynamics' states between the knots."""
     problem, (times, xs) = motion.task.problem, motion.between_knots
     knots = problem.knots_of(c, input_at_end=True)
     begin, end = (motion.horizon * knots[i] / problem.num_steps for i in (0, -1))
@@ -192,18 +192,18 @@ def _of_stay(motion: Collocated, c: GoalConstraint) -> _Beyond:
 
 
 def _of_constraint(motion: Collocated, c: Constraint, spans: Array) -> list[_Beyond]:
-    """One for each number of a constraint of all knots.
+    """Return one entry for each number of a constraint on all knots.
 
-    Its range tells little where its slope is small at the bound: (x - a)^2 >= r^2 is a wall of any width. So it must
-    not be far to where it holds, by its slope or by where the motion enters and leaves what is forbidden, and the
-    motion must not come out on the other side of that.
+    Its range is a poor scale if its slope is small at the bound: (x - a)^2 >= r^2 is a wall of any width. The distance
+    to where it is satisfied must also be small, by its slope or by the ends of the violation along the motion, and the
+    motion must not leave the forbidden set on its other side.
     """
     times, xs = motion.between_knots
     order = np.argsort(times)
     times, xs = times[order], xs[order]
     first = motion.horizon * (motion.mesh[0] + motion.mesh[1]) / 2
-    mask = times > (first if motion.task.problem.initial_state_is_given else 0.0)  # what is given nothing can keep
-    mask &= np.isfinite(xs).all(axis=1)  # where the dynamics lead nowhere, the check of their integration fails
+    mask = times > (first if motion.task.problem.initial_state_is_given else 0.0)  # given states are not checked
+    mask &= np.isfinite(xs).all(axis=1)  # where the dynamics diverge, their integration check fails
     times, xs = times[mask], xs[mask]
 
     def motion_at(more: Array) -> tuple[Array, Array]:
@@ -240,14 +240,14 @@ def _of_constraint(motion: Collocated, c: Constraint, spans: Array) -> list[_Bey
 
 
 def _is_users(c: Constraint) -> bool:
-    """Whether nothing is known of where `c` may be broken."""
+    """Return whether nothing is known about the places where `c` may be violated."""
     return not isinstance(c, GoalConstraint) and not hasattr(c.function, "linearize")
 
 
 def _outside(c: Constraint, xs: Array, us: Array) -> Any:
-    """Which of very many places in order, xs (S, nx) and us (S, nu), tell where `c` is broken.
+    """Select places from very many in order, xs (S, nx) and us (S, nu), that describe where `c` is violated.
 
-    Those are the ends and the worst place of each stretch in which it is.
+    These are the ends and the worst place of each sequence of violations.
     """
     knots = np.hstack([xs, us])
     values = values_of_many(constraint_form(c, xs.shape[1], knots[:: max(1, len(knots) // PROBED)]), knots)
@@ -260,7 +260,7 @@ def _outside(c: Constraint, xs: Array, us: Array) -> Any:
 
 
 def _values(c: Constraint, xs: Array, us: Array) -> Array:
-    """(S, m) along xs (S, nx) and us (S, nu)."""
+    """Return the values (S, m) along xs (S, nx) and us (S, nu)."""
     with np.errstate(all="ignore"):
         return np.array([c(x, u) for x, u in zip(xs, us, strict=True)]).reshape(len(xs), -1)
 
@@ -268,9 +268,9 @@ def _values(c: Constraint, xs: Array, us: Array) -> Array:
 def _looked_at(
     c: Constraint, times: Array, xs: Array, us: Array, motion_at: Callable[[Array], tuple[Array, Array]]
 ) -> tuple[Array, Array, Array]:
-    """`times` (S,) [s] in order, states and inputs (S, ...) at them, and more by `motion_at` where `c` may not hold.
+    """Return ordered `times` (S,) [s] and states and inputs (S, ...), with more from `motion_at` where `c` may fail.
 
-    These are about each place where it comes nearer to a bound than before and after.
+    The new places are around each local minimum of the distance from a bound.
     """
     for _ in range(CLOSER_ROUNDS):
         values = _values(c, xs, us)
@@ -295,11 +295,11 @@ def _looked_at(
 def _depth(
     c: Constraint, xs: Array, us: Array, excess: Array, spans: Array, scales: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """(S, m) how far it is to where the constraint holds, as a part of `spans` (nx + nu,), and where motions pass it.
+    """Return the distance (S, m), in `spans` (nx + nu,), to where the constraint holds, and where motions pass it.
 
-    The less of two: to first order in its slope, and half of the way between the places before and after on the motion
-    at which it holds. Where the slopes at the first and the last place between these point against each other, the
-    motion has gone through what is forbidden.
+    The distance is the smaller of two values: the first-order estimate by the slope, and half of the motion between the
+    previous and next places at which the constraint is satisfied. If the slopes at the first and the last place between
+    these are opposite, the motion has passed through the forbidden set.
     """
     z, depth, through = np.hstack([xs, us]) / spans, np.zeros_like(excess), np.zeros(excess.shape, dtype=bool)
     bound = np.where(np.isfinite(c.lower), np.abs(c.lower), np.abs(c.upper))
@@ -308,7 +308,7 @@ def _depth(
     for k in np.flatnonzero(np.any(outside, axis=1)):
         try:
             slopes[k] = c.differentiate(xs[k], us[k])[1] * spans
-        except GradientError:  # it has none here: then the way along the motion tells
+        except GradientError:  # without a derivative, only the second value is used
             continue
     with np.errstate(divide="ignore", invalid="ignore"):
         by_slope = np.where(outside, excess / np.sum(np.abs(slopes), axis=2), 0.0)

@@ -1,9 +1,9 @@
-"""A problem in a collocation scheme: solved by IPOPT, again on a mesh that is refined, and the motion measured.
+"""A problem in a collocation scheme: its solution by IPOPT, the refinement of the mesh, and measures of the motion.
 
     minimize    int_0^T L(x, u) dt + F(x(T)),    x' = f(x, u),    x(0) = x0, x(T) = x_goal where they are given.
 
-`errors` of a result say that its motion is what the dynamics do, not that no better one exists: where the mesh is
-too coarse for the best input, only a finer one tells.
+Small `errors` of a result mean that its motion satisfies the dynamics, not that no better motion exists. If the mesh is
+too coarse for the best input, only a finer mesh shows this.
 """
 
 import math
@@ -27,22 +27,22 @@ from drake_diff.optimize.transcription.lead import SUBSTEPS, Lead, Places, Withi
 from drake_diff.optimize.transcription.task import OptimalControl, Scheme
 
 SIMPSON = np.array([1.0, *[4.0, 2.0] * (SUBSTEPS // 2 - 1), 4.0, 1.0]) / (3 * SUBSTEPS)  # SUBSTEPS is even
-SLOPED = np.linspace(0, 1, 11)  # where slopes are looked at within an interval, its ends among them
-EFFORT_WEIGHT, FINAL_WEIGHT = 0.1, 100.0  # of inputs and of the last state in TVLQR, over that of the states
-CLEARANCE_ROUNDS, MOST_INTERVALS = 5, 1000  # where a plan comes too near to an obstacle between its knots
-ROUNDED = 1e-9  # of an interval: so near to its end is the end
-SMALLEST_COST = 1e-6  # of the running cost's change where states or inputs are a range away: what a solver may leave
-ACCURATE = 1e-4  # of an interval, in the states' units
-SMALLEST_ERROR = 1e-12  # of an interval: rounding, which no finer mesh makes less
-MOST_PIECES, NARROW_PIECES = 4, 8  # of one interval in one round of refinement; where something narrow is in it
+SLOPED = np.linspace(0, 1, 11)  # places in an interval at which slopes are computed, with its ends
+EFFORT_WEIGHT, FINAL_WEIGHT = 0.1, 100.0  # of inputs and of the last state in TVLQR, relative to the states' weight
+CLEARANCE_ROUNDS, MOST_INTERVALS = 5, 1000  # for plans that are too near to an obstacle between knots
+ROUNDED = 1e-9  # of an interval: a place this near to its end is the end
+SMALLEST_COST = 1e-6  # of the running cost's change over a range of states or inputs: a solver's residual
+ACCURATE = 1e-4  # error of an interval, in the states' units
+SMALLEST_ERROR = 1e-12  # of an interval: rounding, which a finer mesh does not reduce
+MOST_PIECES, NARROW_PIECES = 4, 8  # of one interval in one round of refinement, without and with a narrow force or cost
 FOUND = (Outcome.SOLVED, Outcome.INACCURATE)
 
 
 @dataclass(frozen=True, eq=False)
 class Collocated:
-    """A motion at N+1 knots: xs (N+1, nx), us (N+1, nu), at the midpoints xs_mid, us_mid (N, ...) or None; T [s].
+    """A motion of T [s] at N+1 knots: xs (N+1, nx), us (N+1, nu), and at midpoints xs_mid, us_mid (N, ...) or None.
 
-    Between knots x' and u are the scheme's polynomials.
+    Between knots, x' and u are the scheme's polynomials.
     """
 
     task: OptimalControl
@@ -67,9 +67,9 @@ class Collocated:
         return None if self.task.scheme.nodes == 1 else self.nodes[1::2, self.task.dynamics.nx :]
 
     def sample(self, parts: int) -> tuple[Array, Array]:
-        """The motion at the m-th `parts` of each of the problem's N equal intervals, whatever the mesh.
+        """Sample the motion at the m = `parts` parts of each of the problem's N equal intervals, for any mesh.
 
-        xs (m N + 1, nx), and the mean inputs us (m N, nu) over each part.
+        Returns xs (m N + 1, nx), and the mean inputs us (m N, nu) over each part.
         """
         count, scheme = self.task.problem.num_steps, self.task.scheme
         inputs = scheme.per_interval(self.nodes[:, self.task.dynamics.nx :])
@@ -83,7 +83,7 @@ class Collocated:
         return np.vstack([self.between(k, tau)[0], self.xs[-1]]), us
 
     def means(self, ends: Array) -> Array:
-        """(M, nu) the mean inputs between `ends` (M+1,), fractions of the horizon, which may lie within intervals."""
+        """Return the mean inputs (M, nu) between `ends` (M+1,), fractions of the horizon, also within intervals."""
         scheme, lengths = self.task.scheme, np.diff(self.mesh)[:, None]
         inputs = scheme.per_interval(self.nodes[:, self.task.dynamics.nx :])
         k, tau = self._locate(ends)
@@ -94,12 +94,12 @@ class Collocated:
 
     @property
     def cost(self) -> float:
-        """The integral of the running cost along the motion that the dynamics make from each knot, and the others."""
+        """The running cost integrated along the dynamics' motion from each knot, plus the other costs."""
         return float(np.sum(self._integrated[-1, :, -1])) + sum(self._other_costs)
 
     @property
     def cost_error(self) -> float:
-        """By how much the scheme's own quadrature differs from that integral, and what is left of its errors."""
+        """The difference of the scheme's own quadrature from that integral, plus the integral's remaining error."""
         return float(_finite(np.abs(self.quadrature - self.cost) + np.sum(self._within.errors[:, -1])))
 
     @cached_property
@@ -109,9 +109,9 @@ class Collocated:
 
     @cached_property
     def cost_scale(self) -> float:
-        """What the parts of the cost come to without their signs, at the nodes.
+        """The sum of the absolute values of the parts of the cost at the nodes.
 
-        It is no less than a millionth of what the running cost changes by where a state or input is a range away.
+        It is at least a millionth of the change of the running cost if a state or input changes by its range.
         """
         middle = self.nodes[len(self.nodes) // 2]
         spans = self.task.problem.spans(self.xs, self.us)
@@ -123,30 +123,30 @@ class Collocated:
 
     @property
     def _other_costs(self) -> tuple[float, float]:
-        """Of the last state, and of the parameters."""
+        """The costs of the last state and of the parameters."""
         final = 0.0 if self.task.final is None else float(self.task.final.values(self.nodes[-1:])[0, 0])
         return final, self.task.problem.cost_of_parameters(self.task.parameters)
 
     @property
     def _node_weights(self) -> Array:
-        """(K,) [s] of the nodes in the scheme's quadrature."""
+        """The weights (K,) [s] of the nodes in the scheme's quadrature."""
         return self.horizon * self.task.scheme.node_weights(self.mesh)
 
     @property
     def narrow(self) -> Any:
-        """(N,) whether a force or cost acts in a small part of an interval."""
+        """A mask (N,) of the intervals in which a force or cost acts over a small part only."""
         return self._within.narrow
 
     @property
     def smallest_width(self) -> float:
-        """Of forces and costs that are seen between the knots: of each state's range along the motion; see `lead`."""
+        """The smallest width of resolved forces and costs between knots, in each state's range; see `lead`."""
         return self._within.width
 
     @property
     def rate_excess(self) -> dict[str, tuple[float, int]]:
-        """The largest excess of each rate limit of the problem, and the interval that it is in, by differences.
+        """The largest excess over each rate limit of the problem, and its interval, from differences.
 
-        Those are of the scheme's own polynomials: of the input, and of x'.
+        The differences are of the scheme's own polynomials, those of the input and of x'.
         """
         excesses: dict[str, tuple[float, int]] = {}
         for limit in self.task.problem.rate_limits:
@@ -159,9 +159,9 @@ class Collocated:
         return excesses
 
     def rates_of(self, limit: RateLimit) -> tuple[Array, Array]:
-        """(S, n) slopes by time, at places from end to end of all intervals, of what `limit` is of; and the times (S,).
+        """Return time derivatives (S, n) of `limit`'s quantity in all intervals, with their ends, and times (S,).
 
-        Those of accelerations are of the dynamics' own, where the plan's states and inputs lead.
+        Accelerations are those of the dynamics at the plan's states and inputs.
         """
         count = len(self.mesh) - 1
         k, tau = np.repeat(np.arange(count), len(SLOPED)), np.tile(SLOPED, count)
@@ -173,13 +173,13 @@ class Collocated:
         return slopes.reshape(len(k), -1), self.times(k, tau)
 
     def _slopes(self, values: Array) -> Array:
-        """Of `values` (N, S, n) by time, exact for parabolas."""
+        """Return the time derivatives of `values` (N, S, n), exact for parabolas."""
         by_tau = np.gradient(values, SLOPED, axis=1, edge_order=2)
         return np.asarray(by_tau / self.lengths[:, None, None])
 
     @cached_property
     def defects_of_states(self) -> Array:
-        """(N, nx) how far each interval is from the scheme's equations, in the states' units."""
+        """The residuals (N, nx) of the scheme's equations in each interval, in the states' units."""
         xs = self.task.scheme.per_interval(self.nodes[:, : self.task.dynamics.nx])
         rates = self.task.scheme.per_interval(self._rates)
         defects = self.task.scheme.interval_defects(self.lengths, xs, rates)
@@ -187,52 +187,52 @@ class Collocated:
 
     @property
     def errors(self) -> Array:
-        """(N,) distance of knot k+1 from an integration from knot k under the scheme's input; inf where it diverges.
+        """The distances (N,) of knots k+1 from integrations from knots k under the scheme's input, or inf.
 
-        By the steps of `Within`, in the worst coordinate's unit.
+        The integration uses the steps of `Within`. Distances are in the unit of the worst coordinate.
         """
         return np.asarray(np.max(self.gaps, axis=1))
 
     @property
     def gaps(self) -> Array:
-        """(N, nx) the same of each state."""
+        """The same distances (N, nx) for each state."""
         return _finite(np.abs(self._integrated[-1, :, :-1] - self.xs[1:]))
 
     @property
     def between_knots(self) -> tuple[Array, Array]:
-        """(9 N,) times [s] within the intervals, and the states (9 N, nx) that the knots before them lead to."""
+        """The times (9 N,) [s] within the intervals, and the states (9 N, nx) integrated from the knots before them."""
         count, inside = len(self.mesh) - 1, np.arange(1, SUBSTEPS) / SUBSTEPS
         times = self.times(np.tile(np.arange(count), len(inside)), np.repeat(inside, count))
         return times, self._integrated[1:-1, :, :-1].reshape(len(times), -1)
 
     @property
     def cost_errors(self) -> Array:
-        """(N,) the same of the running cost's quadrature, as a part of `cost_scale`."""
+        """The errors (N,) of the running cost's quadrature, relative to `cost_scale`."""
         scheme = self.task.scheme
         quadrature = self.lengths * (scheme.per_interval(self._cost_rates) @ scheme.weights)
         return _finite(np.abs(self._integrated[-1, :, -1] - quadrature) / self.cost_scale)
 
     def at(self, times: Any) -> tuple[Array, Array]:
-        """xs (S, nx) and us (S, nu) at `times` (S,) [s] by the scheme's own polynomials."""
+        """Return xs (S, nx) and us (S, nu) at `times` (S,) [s] from the scheme's own polynomials."""
         return self.between(*self._locate(np.asarray(times, dtype=float) / self.horizon))
 
     def on(self, mesh: Array, task: OptimalControl) -> Array:
-        """(K, nx + nu) the motion at the nodes of a mesh in the scheme of `task`, inputs within its bounds."""
+        """Return the motion (K, nx + nu) at the nodes of a mesh in the scheme of `task`, inputs within its bounds."""
         return task.within(np.hstack(self.at(self.horizon * task.scheme.node_fractions(mesh))))
 
     @property
     def worst(self) -> Array:
-        """(N,) the larger of `errors` and `cost_errors`."""
+        """The larger (N,) of `errors` and `cost_errors`."""
         return np.maximum(self.errors, self.cost_errors)
 
     @property
     def largest_error(self) -> float:
-        """Of an interval and of its part of the cost."""
+        """The largest error of an interval or of its part of the cost."""
         return float(np.max(self.worst))
 
     @property
     def rates(self) -> Array:
-        """(N+1, nx) x' at the knots."""
+        """The rates x' (N+1, nx) at the knots."""
         return self._rates[:: self.task.scheme.nodes]
 
     @cached_property
@@ -241,43 +241,43 @@ class Collocated:
 
     @property
     def _cost_rates(self) -> Array:
-        """(K,) the running cost at the nodes."""
+        """The running cost (K,) at the nodes."""
         return self.task.rates(self.nodes, self.horizon * self.task.scheme.node_fractions(self.mesh))
 
     @property
     def lengths(self) -> Array:
-        """(N,) [s] of the intervals."""
+        """The lengths (N,) [s] of the intervals."""
         return self.horizon * np.diff(self.mesh)
 
     def interval_at(self, times: Array) -> Indices:
-        """(S,) the number of the interval that each of `times` (S,) [s] lies in."""
+        """Return the index (S,) of the interval that contains each of `times` (S,) [s]."""
         return self._locate(times / self.horizon)[0]
 
     def _locate(self, fractions: Array) -> tuple[Indices, Array]:
-        """The interval that each of `fractions` (S,) of the horizon lies in, and where in it, from 0 to 1."""
+        """Return the interval of each of `fractions` (S,) of the horizon, and the position in it, from 0 to 1."""
         k = np.clip(np.searchsorted(self.mesh, fractions, side="right") - 1, 0, len(self.mesh) - 2)
         return k, (fractions - self.mesh[k]) / np.diff(self.mesh)[k]
 
     def times(self, k: Indices, tau: Array) -> Array:
-        """[s] (S,) of the places `tau` in the intervals `k`."""
+        """Return the times (S,) [s] of the positions `tau` in the intervals `k`."""
         return np.asarray(self.horizon * self.mesh[k] + tau * self.lengths[k])
 
     def between(self, k: Any, tau: Array) -> tuple[Array, Array]:
-        """xs and us in the intervals `k` (S,) at `tau` (S,) of each."""
+        """Return xs and us at the positions `tau` (S,) in the intervals `k` (S,)."""
         scheme, nx = self.task.scheme, self.task.dynamics.nx
         us = scheme.per_interval(self.nodes[:, nx:])[k]
-        if self.task.is_map:  # between two steps nothing moves
+        if self.task.is_map:  # the state is constant between two steps
             return self.xs[k + (tau > 1 - ROUNDED)], np.einsum("sj,sju->su", scheme.at(tau), us)
         moved = np.einsum("sj,sjx->sx", scheme.integrated(tau), scheme.per_interval(self._rates)[k])
         return self.xs[k] + self.lengths[k, None] * moved, np.einsum("sj,sju->su", scheme.at(tau), us)
 
     @cached_property
     def open_loop(self) -> Array:
-        """(N+1, nx) where the dynamics lead from the first state under the scheme's input; NaN once they diverge."""
+        """The dynamics' states (N+1, nx) from the first state under the scheme's input, NaN after divergence."""
         return self._open_loop[::SUBSTEPS]
 
     def led(self, control: str) -> Array:
-        """(10 N + 1, nx) the same at every tenth of an interval, by "open loop", or by "TVLQR" about the motion."""
+        """Return these states (10 N + 1, nx) at tenths of intervals, "open loop", or by "TVLQR" around the motion."""
         return self._open_loop if control == "open loop" else self.led_from(self.xs[0], self.gains()[0])
 
     @cached_property
@@ -285,7 +285,7 @@ class Collocated:
         return self.led_from(self.xs[0], None)
 
     def cost_beside(self, xs: Array, gains: Array | None) -> float:
-        """What the cost of `xs` (10 N + 1, nx), see `led_from`, is above the plan's, by one quadrature of both."""
+        """Return the cost of `xs` (10 N + 1, nx), see `led_from`, minus the plan's cost, by the same quadrature."""
         task, count = self.task, len(self.lengths)
         k, tau = np.repeat(np.arange(count), SUBSTEPS + 1), np.tile(np.arange(SUBSTEPS + 1) / SUBSTEPS, count)
         planned, us = self.between(k, tau)
@@ -303,7 +303,7 @@ class Collocated:
         return total
 
     def led_from(self, x: Array, gains: Array | None) -> Array:
-        """(10 N + 1, nx) where the dynamics lead from `x` (nx,), with feedback by `gains` (N, nu, nx) if there are."""
+        """Return the dynamics' states (10 N + 1, nx) from `x` (nx,), with feedback `gains` (N, nu, nx) if given."""
         if not self.task.is_map:
             return self._lead.from_state(x, gains)
         states, (lower, upper) = [x[None]], self.input_limits
@@ -313,7 +313,7 @@ class Collocated:
                 if gains is not None:
                     u = np.minimum(np.maximum(u + gains[k] @ (planned[: len(x)] - x), lower), upper)
                 after = self.task.moved(np.concatenate((x, u))[None], np.array([k]))
-                states.append(np.vstack([np.tile(x, (SUBSTEPS - 1, 1)), after]))  # the state is held until then
+                states.append(np.vstack([np.tile(x, (SUBSTEPS - 1, 1)), after]))  # the state is constant until then
         return np.concatenate(states)
 
     @cached_property
@@ -321,9 +321,9 @@ class Collocated:
         return Lead(self, SUBSTEPS, self._within.least)
 
     def gains(self, at_end: Array | None = None) -> tuple[Array, Array]:
-        """(N, nu, nx) of each interval, by Riccati's recursion with Bryson's weights, as a replay's TVLQR has them.
+        """Return the gains (N, nu, nx) of Riccati's recursion with Bryson's weights, as in the TVLQR of a replay.
 
-        And (nx, nx) what a distance from the first state then costs; `at_end` (nx, nx) is what one from the last does.
+        Also return the cost-to-go (nx, nx) of a deviation from the first state. `at_end` is that of the last state.
         """
         nx, nu, is_map = self.task.dynamics.nx, self.task.dynamics.nu, self.task.is_map
         effort = self.task.problem.input_scales(self.us)
@@ -342,12 +342,12 @@ class Collocated:
 
     @property
     def _integrated(self) -> Array:
-        """(11, N, nx + 1) where each knot leads within its interval, at its tenths, and what that costs."""
+        """The states, integrated from each knot, at the tenths of its interval, and their cost (11, N, nx + 1)."""
         return self._within.states
 
     @cached_property
     def places(self) -> Places:
-        """Where the functions of users are looked at between the knots."""
+        """The places between the knots at which users' functions are evaluated."""
         return Places(self, self._held)
 
     @cached_property
@@ -355,9 +355,9 @@ class Collocated:
         return Within(self, self._held)
 
     def measured_as(self, other: "Collocated") -> None:
-        """Take over where the knots of `other` lead, which has the same dynamics and cost; nothing of another motion.
+        """Reuse the integrated states of `other`, which has the same dynamics and cost, if both motions are equal.
 
-        It depends on knots, inputs, mesh, horizon and parameters alone, which have to be the same to the last bit.
+        They depend only on knots, inputs, mesh, horizon and parameters, which must be equal to the last bit.
         """
         ours, theirs = ((m.mesh, m.xs, m.inputs, np.array([m.horizon]), m.task.parameters) for m in (self, other))
         same = all(np.array_equal(a, b) for a, b in zip(ours, theirs, strict=True))
@@ -367,28 +367,28 @@ class Collocated:
 
     @property
     def inputs(self) -> Array:
-        """(K, nu) the inputs at all nodes."""
+        """The inputs (K, nu) at all nodes."""
         return self.nodes[:, self.task.dynamics.nx :]
 
     @cached_property
     def _held(self) -> Array:
-        """(N, 21, nx + nu) the motion, inputs as the plant applies them, at every half of an interval's ten steps."""
+        """The motion (N, 21, nx + nu), inputs as the plant applies them, at half steps of an interval's ten steps."""
         count, halves = len(self.mesh) - 1, np.arange(2 * SUBSTEPS + 1)
         xs, us = self.between(np.repeat(np.arange(count), len(halves)), np.tile(halves / (2 * SUBSTEPS), count))
         return np.hstack([xs, self.cut_off(us)]).reshape(count, len(halves), -1)
 
     def applied_at(self, times: Array) -> Array:
-        """(S, nu) the inputs at `times` (S,) [s] as the plant applies them."""
+        """Return the inputs (S, nu) at `times` (S,) [s] as the plant applies them."""
         return self.cut_off(self.at(times)[1])
 
     def applied(self, k: Indices, tau: Array) -> Array:
-        """(S, nu) the inputs in the intervals `k` at `tau` as the plant applies them."""
+        """Return the inputs (S, nu) in the intervals `k` at `tau` as the plant applies them."""
         return self.cut_off(self.between(k, tau)[1])
 
     def seen(self, c: ClearanceConstraint) -> tuple[Array, Array]:
-        """Times (S,) [s] between the knots and states (S, nx): where the dynamics lead, and what `c` looks at besides.
+        """Return times (S,) [s] between the knots and states (S, nx): integrated ones, and those that `c` also checks.
 
-        The latter are by the scheme's polynomials.
+        The latter are from the scheme's polynomials.
         """
         times, xs = self.between_knots
         knots = self.horizon * self.mesh
@@ -400,48 +400,48 @@ class Collocated:
 
     @property
     def input_limits(self) -> tuple[Array, Array]:
-        """(nu,) each: the task's bounds within the plant's own limits."""
+        """The bounds of the task's inputs (lower (nu,), upper (nu,)) within the plant's own limits."""
         return self.cut_off(self.task.bounds.u_lower), self.cut_off(self.task.bounds.u_upper)
 
     def cut_off(self, us: Array) -> Array:
-        """`us` (S, nu) at the plant's own limits."""
+        """Return `us` (S, nu), clipped at the plant's own limits."""
         limits = self.task.dynamics.bounds
         return np.clip(us, limits.u_lower, limits.u_upper)
 
 
 @dataclass(frozen=True, eq=False)
 class Transcribed:
-    """The motions of all phases that a solver came to, and how it ended."""
+    """The motions of all phases that a solver returned, and its outcome."""
 
     phases: tuple[Collocated, ...]
     result: NlpResult
-    derivatives: str  # where the solver's came from, and why there is no Hessian where there is none
-    refinements: tuple[tuple[float, ...], ...] = ()  # of each round, see `row`
-    cleared: tuple[tuple[int, float], ...] = ()  # intervals, and what was lacking of a margin [m]; empty if nothing was
+    derivatives: str  # the source of the solver's derivatives, and why a missing Hessian is missing
+    refinements: tuple[tuple[float, ...], ...] = ()  # the `row` of each round
+    cleared: tuple[tuple[int, float], ...] = ()  # intervals and violations of a margin [m], empty without violations
 
     @property
     def count(self) -> int:
-        """How many intervals there are in all."""
+        """The total number of intervals."""
         return sum(len(phase.mesh) - 1 for phase in self.phases)
 
     @property
     def row(self) -> tuple[float, ...]:
-        """The number of intervals and the largest error, in phases the numbers of intervals."""
+        """The number of intervals and the largest error, or, for several phases, their numbers of intervals."""
         if len(self.phases) == 1:
             return self.count, self.largest_error
         return tuple(len(phase.mesh) - 1 for phase in self.phases)
 
     @property
     def largest_error(self) -> float:
-        """Of an interval and of its part of the cost."""
+        """The largest error of an interval or of its part of the cost."""
         return max(phase.largest_error for phase in self.phases)
 
 
 @dataclass(frozen=True, eq=False)
 class Initial:
-    """Where a search of one phase begins: nodes (K, nx + nu) on a mesh, a duration [s] and parameters (np,).
+    """The start of a search in one phase: nodes (K, nx + nu) on a mesh, a duration [s] and parameters (np,).
 
-    `multipliers` are those of a plan there; nodes on a line are `far` from a motion.
+    `multipliers` are those of a plan at these nodes. Nodes on a straight line are `far` from a motion.
     """
 
     mesh: Array
@@ -452,14 +452,14 @@ class Initial:
     far: bool = False
 
     def on(self, mesh: Array, scheme: Scheme) -> "Initial":
-        """The same on another mesh."""
+        """Return the same start on another mesh."""
         these, then = scheme.node_fractions(mesh), scheme.node_fractions(self.mesh)
         nodes = np.array([np.interp(these, then, column) for column in self.nodes.T]).T
         return replace(self, mesh=mesh, nodes=nodes, multipliers=None)
 
 
 def _finite(values: Array) -> Array:
-    """With inf for what is no number."""
+    """Replace NaN by inf."""
     return np.asarray(np.nan_to_num(values, nan=np.inf, posinf=np.inf))
 
 
@@ -473,9 +473,9 @@ def collocated(
     mesh: Array,
     parameters: Array | None = None,
 ) -> Collocated:
-    """The motion with knots xs (N+1, nx), us (N+1, nu) and midpoint inputs (N, nu), linear in between where None.
+    """Return the motion with knots xs (N+1, nx), us (N+1, nu) and midpoint inputs (N, nu), interpolated if None.
 
-    `parameters` (np,) are values of the problem's, its own where None.
+    `parameters` (np,) are values of the problem's parameters, by default its own values.
     """
     task, knots = OptimalControl(problem, scheme), np.hstack([xs, us])
     task = task if parameters is None else task.at(parameters)
@@ -490,7 +490,7 @@ def collocated(
 
 
 class Transcription:
-    """A problem in a scheme, its phases on their own `num_steps` equal intervals to begin with."""
+    """A problem in a scheme, whose phases initially have their own `num_steps` equal intervals."""
 
     def __init__(self, problem: Problem | PhasedProblem, scheme: str):
         from drake_diff.optimize.transcription.expressions import knot_functions  # loads CasADi
@@ -502,14 +502,14 @@ class Transcription:
         self.links = link_functions(problem)
 
     def jacobian(self, knot: Array, k: int = 0, phase: int = 0) -> Array:
-        """(nx, nx + nu) of a phase's rates at `knot` (nx + nu,), or of a map's step `k`, as the solver gets it.
+        """Return the solver's Jacobian (nx, nx + nu) of a phase's rates at `knot` (nx + nu,), or of a map's step `k`.
 
-        A knot has the coordinates of parameters where they are optimized."""
+        A knot includes the coordinates of parameters if these are optimized."""
         f = self.functions[phase].dynamics
         return np.asarray(getattr(f, "functions", [f] * (k + 1))[k].linearize(knot[None])[1][0])
 
     def begin(self, phase: int, guess: Any, *, horizon: float | None = None, mesh: Any = None, **more: Any) -> Initial:
-        """Where a phase begins, inputs within bounds: at xs (N+1, nx), us (N+1, nu) on a mesh, or along a motion."""
+        """Return a phase's start within input bounds from xs (N+1, nx), us (N+1, nu) on a mesh, or from a motion."""
         task = self.tasks[phase]
         mesh = np.linspace(0, 1, task.problem.num_steps + 1) if mesh is None else mesh
         if isinstance(guess, Collocated):
@@ -521,7 +521,7 @@ class Transcription:
         return Initial(mesh, nodes, float(np.clip(first, *task.horizon)), **more)
 
     def program(self, meshes: Sequence[Array] | None = None) -> Any:
-        """The `TranscribedProgram` of the phases on meshes, on their own intervals where None."""
+        """Return the `TranscribedProgram` of the phases on meshes, by default on their own equal intervals."""
         from drake_diff.optimize.transcription.nodes import Phase, TranscribedProgram
 
         if meshes is None:
@@ -532,13 +532,13 @@ class Transcription:
     def solve(
         self, starts: Sequence[Initial], *, limits: Limits, report: Report | None, refinement: Options | None = None
     ) -> Transcribed:
-        """From where each phase begins; `limits.max_iterations` hold for each round.
+        """Solve from a start for each phase. `limits.max_iterations` applies to each round.
 
-        A `refinement` splits the intervals whose error is above its tolerance and solves again from what was found.
-        Intervals that come nearer to an obstacle than a plan may are split in any case, up to CLEARANCE_ROUNDS times.
+        A `refinement` splits the intervals whose error is above its tolerance and solves again from the last result.
+        Intervals that violate the margin of an obstacle are split in any case, up to CLEARANCE_ROUNDS times.
         """
         start, motion = now(), self._solve_on(starts, limits, report)
-        if motion.result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):  # there is no time to measure it
+        if motion.result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):  # no time is left to measure it
             return motion
         tolerance, most, left = np.inf, MOST_INTERVALS, math.inf
         if refinement is not None:
@@ -561,7 +561,7 @@ class Transcription:
                 break
             if report is not None:
                 report.say(f"{reason} with {count} intervals: refined to {sum(len(mesh) - 1 for mesh in meshes)}")
-            # What goes through an obstacle is no place to go on from, and what is near one may be none either.
+            # A motion through an obstacle is no guess for the next round, and a motion near an obstacle may be none.
             first = [b.on(m, t.scheme) for b, m, t in zip(starts, meshes, self.tasks, strict=True)]
             last, near_one = motion, any(np.any(short > 0) for short in lacking) and not entered
             motion = self._solve_on(first if entered else _from(last, meshes), _left(limits, start), report)
@@ -584,9 +584,9 @@ class Transcription:
         limits: Limits,
         report: Report | None,
     ) -> Transcribed | None:
-        """The problem on meshes with the coarsest intervals of `motion` split, those `exceeded` among them.
+        """Solve on meshes in which the coarsest intervals of `motion`, including those `exceeded`, are split.
 
-        A phase for which these are None keeps its mesh. None where one has more than `most` intervals then.
+        A phase with None instead keeps its mesh. Returns None if a phase would have more than `most` intervals.
         """
         pairs = list(zip(motion.phases, exceeded, strict=True))
         meshes = [phase.mesh if beyond is None else finer_mesh(phase, beyond, most) for phase, beyond in pairs]
@@ -599,7 +599,7 @@ class Transcription:
         return self._solve_on(_from(motion, finer), limits, report)
 
     def _solve_on(self, starts: Sequence[Initial], limits: Limits, report: Report | None) -> Transcribed:
-        """IPOPT on meshes."""
+        """Solve with IPOPT on the meshes of the starts."""
         from drake_diff.optimize.transcription.program import FAR
 
         program = self.program([b.mesh for b in starts])
@@ -617,7 +617,7 @@ class Transcription:
 
 
 def _from(motion: Transcribed, meshes: Sequence[Array]) -> list[Initial]:
-    """Where a search on other meshes begins."""
+    """Return the starts of a search on other meshes."""
     pairs = zip(motion.phases, meshes, strict=True)
     return [Initial(mesh, p.on(mesh, p.task), p.horizon, np.asarray(p.task.parameters)) for p, mesh in pairs]
 
@@ -630,9 +630,9 @@ def solve_program(
     multipliers: Multipliers | None = None,
     more: dict[str, Any] | None = None,
 ) -> tuple[NlpResult, str]:
-    """The result of IPOPT, and where the derivatives came from: with an exact Hessian, if there is one that is finite.
+    """Solve with IPOPT, by an exact Hessian if it exists and is finite. Return the result and derivatives' source.
 
-    Where `multipliers` are as many as the program's they begin the search; where that fails, it begins without.
+    If `multipliers` have the sizes of the program, they are used first. If that fails, the search is repeated without.
     """
     from drake_diff.optimize.transcription.program import NOT_FINITE, solve_ipopt
 
@@ -649,20 +649,20 @@ def solve_program(
         result = replace(result, message=f"{result.message}, from the guess's multipliers")
     if not why and result.message == NOT_FINITE:
         again = solve_ipopt(program, guess, limits, report, exact=False, **options)
-        if again.message != NOT_FINITE:  # then it was the Hessian
+        if again.message != NOT_FINITE:  # the Hessian was not finite
             return again, "symbolic, limited-memory Hessian: the exact one is not finite at an iterate"
     return result, derivatives
 
 
 def finer_mesh(motion: Collocated, exceeded: Sequence[int], most: int) -> Array | None:
-    """The mesh of `motion` with its coarsest intervals split, those `exceeded` among them.
+    """Return the mesh of `motion` with its coarsest intervals, including those `exceeded`, split.
 
-    Where a jerk is limited and the motion is accurate, those `exceeded` alone: the jerk is beyond its limit where it
-    switches, and elsewhere nothing is gained. None where that has more than `most` intervals, or no other ones.
+    If a jerk is limited and the motion is accurate, only those `exceeded` are split, because the jerk exceeds its limit
+    at switches. Returns None for more than `most` intervals, or if none is split.
     """
     lacking = np.zeros(len(motion.mesh) - 1)
     lacking[list(exceeded)] = 1.0
-    tolerance = motion.largest_error / 2 ** (motion.task.scheme.order + 1)  # what halving all would bring
+    tolerance = motion.largest_error / 2 ** (motion.task.scheme.order + 1)  # the effect of halving all intervals
     smooth = any(not limit.of_inputs for limit in motion.task.problem.rate_limits)
     if smooth and len(exceeded) and motion.largest_error <= ACCURATE:
         tolerance = np.inf
@@ -671,14 +671,14 @@ def finer_mesh(motion: Collocated, exceeded: Sequence[int], most: int) -> Array 
 
 
 def _left(limits: Limits, start: float) -> Limits:
-    """What is left of `limits` of a solve that began at `start`, of the monotonic clock."""
+    """Return what is left of `limits` in a solve that began at `start` on the monotonic clock."""
     return replace(limits, time_limit=max(0.0, limits.time_limit - (now() - start)))
 
 
 def kept(last: Transcribed, failed: Transcribed) -> Transcribed:
-    """The last motion that was found, with a note on the finer mesh on which none was.
+    """Return the last motion that was found, with a note on the finer mesh that has no solution.
 
-    Where that was cut short, by Ctrl-C or by the time limit, the whole search was: where it leads is not known.
+    If the finer solve was stopped by Ctrl-C or the time limit, this is the outcome of the whole search.
     """
     if failed.result.outcome in (Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
         return replace(last, result=replace(failed.result, z=last.result.z))
@@ -688,7 +688,7 @@ def kept(last: Transcribed, failed: Transcribed) -> Transcribed:
 
 
 def _nearer(motion: Collocated) -> Array:
-    """(N,) [m] how much more than its tolerance each interval lacks of a margin, 0 where nothing does."""
+    """Return the violation (N,) [m] of a margin in each interval, 0 if it is within its tolerance."""
     lacking = np.zeros(len(motion.mesh) - 1)
     for c in clearances(motion.task.problem.kept):
         times, xs = motion.seen(c)
@@ -702,16 +702,16 @@ def _largest_margin(problem: Problem) -> float:
 
 
 def _split(motion: Collocated, tolerance: float, lacking: Array) -> Array:
-    """The mesh with intervals above the tolerance in as many pieces as the scheme's order asks for, at most 4.
+    """Split intervals above the tolerance into as many pieces as the scheme's order requires, at most 4.
 
-    Those that come too near to an obstacle, by `lacking`, at least in two.
+    Intervals that are too near to an obstacle, by `lacking`, are split at least in two.
     """
     errors = motion.worst
     wanted = (errors / tolerance) ** (1 / (motion.task.scheme.order + 1))
     pieces = np.where(errors > tolerance, np.clip(np.ceil(wanted), 2, MOST_PIECES), 1).astype(int)
     pieces[(errors > tolerance) & motion.narrow] = NARROW_PIECES
     near = lacking > 0
-    near[1:], near[:-1] = near[1:] | (lacking[:-1] > 0), near[:-1] | (lacking[1:] > 0)  # where it goes next, elsewhere
+    near[1:], near[:-1] = near[1:] | (lacking[:-1] > 0), near[:-1] | (lacking[1:] > 0)  # and neighbours
     pieces = np.maximum(pieces, 1 + near)
     ends = zip(motion.mesh[:-1], motion.mesh[1:], pieces, strict=True)
     return np.append(np.concatenate([a + (b - a) * np.arange(n) / n for a, b, n in ends]), 1.0)

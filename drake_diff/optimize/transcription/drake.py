@@ -27,12 +27,12 @@ from drake_diff.optimize.program import Iterate, Iteration, Limits, NlpResult, O
 def solve_collocation(
     problem: Problem, xs: Array, us: Array, *, limits: Limits, report: Report | None
 ) -> tuple[NlpResult, Array, Array, Array | None]:
-    """Solve `problem` from the guess xs (N+1, nx), us (N, nu); gives (result, xs, us, u_final).
+    """Solve `problem` from the guess xs (N+1, nx), us (N, nu). Return (result, xs, us, u_final).
 
-    N intervals of exactly model.time_step; inputs linear between knots; running cost by the trapezoid rule.
-    Raises ModelError where the model has no continuous form.
+    The N intervals have the length model.time_step, inputs are linear between knots, and the running cost is integrated
+    by the trapezoid rule. Raises ModelError if the model has no continuous form.
     """
-    from pydrake.planning import DirectCollocation  # as slow to import as NumPy, and of this method alone
+    from pydrake.planning import DirectCollocation  # slow to import, and used by this method only
 
     h, count, b = problem.model.time_step, problem.num_steps, problem.bounds
     system = ContinuousSystem(EquationsOfMotion(problem.model))
@@ -61,7 +61,7 @@ def solve_collocation(
 
 
 def _add_hull(problem: Problem, program: MathematicalProgram, states: list[Any], inputs: list[Any]) -> None:
-    """Keep the inner Bernstein coefficients of bounded states, x + h f / 3 and x - h f / 3, within their bounds too."""
+    """Constrain the inner Bernstein coefficients of bounded states, x + h f / 3 and x - h f / 3, by the same bounds."""
     b, count, h = problem.bounds, problem.num_steps, problem.model.time_step
     bounded = np.flatnonzero((np.isfinite(b.x_lower) | np.isfinite(b.x_upper)) & (b.x_lower < b.x_upper))
     equations = EquationsOfMotion(problem.model)
@@ -123,7 +123,7 @@ class _Cost:
 
 
 class _Stop(Exception):  # noqa: N818  (a signal, not an error)
-    """Raised in the callback to end a solve."""
+    """An exception that the callback raises to end a solve."""
 
 
 def _solve_snopt(
@@ -135,7 +135,7 @@ def _solve_snopt(
 ) -> NlpResult:
     """Solve `program` from `guess` (n,).
 
-    `report` gets a line of progress a few times a second, with what `motions` makes of the point. Ctrl-C and the time
+    `report` receives a line of progress a few times a second, with the `motions` of the point. Ctrl-C and the time
     limit end the solve with the best iterate so far.
     """
     engine, options = SnoptSolver(), solvers.SolverOptions()
@@ -165,7 +165,7 @@ def _solve_snopt(
 
 
 class _Callback:
-    """Called by the solver at every evaluation: reports, keeps the best iterate, raises to stop."""
+    """The solver's callback for every evaluation. It reports, stores the best iterate, and raises to stop."""
 
     def __init__(
         self, program: MathematicalProgram, watch: Watch, report: Report | None, motions: Callable[[Array], Any]
@@ -173,7 +173,7 @@ class _Callback:
         self.program, self.watch, self.report, self.motions = program, watch, report, motions
         self.evaluations, self.called = 0, now()
         self.current: Array | None = None
-        self.before: Array | None = None  # the last point but this at which everything could be evaluated
+        self.before: Array | None = None  # the previous point at which all functions were evaluated
 
     def __call__(self, z: Array) -> None:
         self.evaluations += 1
@@ -181,21 +181,21 @@ class _Callback:
         if self.current is None or not np.array_equal(z, self.current):
             self.before, self.current = self.current, np.array(z)
         if self.evaluations == 1:
-            self.watch.offer(z, math.inf, 0.0)  # better than none: what it costs has not been asked yet
+            self.watch.offer(z, math.inf, 0.0)  # a first best iterate, of unknown cost
         if self.watch.look_up():
             self._look(z)
         if self.watch.stopped_by is not None:
             raise _Stop
-        if self.evaluations > 2:  # the next one takes as long as the last, but for the first, which loads what it needs
+        if self.evaluations > 2:  # the next one takes as long as the last, except after the first, which loads modules
             check_time(ahead=self.called - before)
 
     def look_back(self) -> None:
-        """Keep the point before the one that ended the solve, if it is the best."""
+        """Offer the point before the last one as the best iterate."""
         if self.before is not None:
             try:
                 self._look(self.before)
             except (DrakeDiffError, TimeIsUpError):
-                return  # nor can it be evaluated: the best that was seen stays
+                return  # it cannot be evaluated either: the best iterate is unchanged
 
     def _look(self, z: Array) -> None:
         cost = sum(float(self.program.EvalBinding(binding, z)[0]) for binding in self.program.GetAllCosts())
@@ -217,17 +217,17 @@ class _Callback:
 
 
 def _explain_exception(watch: Watch, error: Exception) -> tuple[Outcome, str]:
-    """SNOPT wraps our exceptions in a RuntimeError: flags and names tell, not types."""
-    if watch.stopped_by is None and watch.interrupted.is_set():  # in the middle of an evaluation
+    """Return the outcome and message of an exception. SNOPT wraps exceptions in a RuntimeError with their names."""
+    if watch.stopped_by is None and watch.interrupted.is_set():  # during an evaluation
         watch.stopped_by = Outcome.INTERRUPTED
     if watch.stopped_by is not None:
         return watch.stopped_by, f"stopped: {watch.stopped_by.value}"
     text = f"{type(error).__name__}: {error}"
-    if TimeIsUpError.__name__ in text:  # in the middle of an evaluation
+    if TimeIsUpError.__name__ in text:  # during an evaluation
         return Outcome.TIME_LIMIT, f"stopped: {Outcome.TIME_LIMIT.value}"
     for name, outcome in (("SimulationError", Outcome.DIVERGED), ("GradientError", Outcome.NO_GRADIENT)):
         if name in text:
-            return outcome, text[text.rindex(name) :].strip()  # SNOPT's text holds the traceback first
+            return outcome, text[text.rindex(name) :].strip()  # SNOPT's text starts with the traceback
     return Outcome.FAILED, text
 
 
@@ -238,13 +238,13 @@ _RESULTS = {
     SolutionResult.kInfeasibleOrUnbounded: Outcome.INFEASIBLE,
     SolutionResult.kUnbounded: Outcome.UNBOUNDED,
 }
-# Feasible, or not better: "requested accuracy could not be achieved", "current point cannot be improved".
+# Feasible ("requested accuracy could not be achieved"), or not better ("current point cannot be improved").
 _SNOPT_INACCURATE = (3, 41)
 _SNOPT_INFEASIBLE = (11, 12, 13, 14, 15, 16)
 
 
 def _explain(result: Any) -> tuple[Outcome, str]:
-    """The outcome and the solver's own words for it."""
+    """Return the outcome and the solver's message."""
     outcome = _RESULTS.get(result.get_solution_result(), Outcome.FAILED)
     info = result.get_solver_details().info
     if info in _SNOPT_INACCURATE:
@@ -258,11 +258,11 @@ def _read_table(print_file: Path) -> tuple[Iteration, ...]:
     if not print_file.is_file():
         return ()
     rows = _snopt_rows(print_file.read_text(errors="replace").splitlines())
-    return tuple({row.iteration: row for row in rows}.values())  # SNOPT repeats an iteration whose Hessian it resets
+    return tuple({row.iteration: row for row in rows}.values())  # SNOPT repeats an iteration after a Hessian reset
 
 
 def _snopt_rows(lines: list[str]) -> Iterator[Iteration]:
-    """Columns are read where their header stands: the first row leaves some of them blank."""
+    """Yield the rows of the table. Columns are located by their header, because the first row leaves some blank."""
     ends: dict[str, tuple[int, int]] = {}
     for line in lines:
         if "Itns" in line and "Major" in line and "Feasible" in line:

@@ -1,4 +1,4 @@
-"""The functions that a collocation program is made of: dynamics, costs, constraints and couplings of its nodes."""
+"""The functions of a collocation program: dynamics, costs, constraints and couplings of its nodes."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -26,7 +26,7 @@ from drake_diff.optimize.transcription.task import OptimalControl, TimedRate
 
 
 class PlantRates(Traced):
-    """A plant's equations of motion, whose Hessians take the Jacobians at the same points."""
+    """A plant's equations of motion, whose Hessians use the Jacobians at the same points."""
 
     def __init__(self, plant: PlantFunctions):
         super().__init__(plant.function)
@@ -39,7 +39,7 @@ class PlantRates(Traced):
 
 
 class Stepwise(PointFunction):
-    """A map that is another function at each step: the K points are those of the K `functions`."""
+    """A map with a different function at each step. The K points are those of the K `functions`."""
 
     def __init__(self, functions: list[PointFunction]):
         self.functions, self.rows, self.width = functions, functions[0].rows, functions[0].width
@@ -61,7 +61,7 @@ class Stepwise(PointFunction):
 
 
 class Timed:
-    """A running cost that changes in time: a function of knots once their times are known, see `at`."""
+    """A running cost that depends on time. With known times, `at` returns it as a function of knots."""
 
     linear = False
 
@@ -72,7 +72,7 @@ class Timed:
         self.why_not = self.expression.reason if isinstance(self.expression, Refusal) else ""
 
     def at(self, times: Array) -> PointFunction:
-        """The function of the knots at `times` (K,) [s]."""
+        """Return the function of the knots at `times` (K,) [s]."""
         known, rate = self.rate.cost.known_at(times), self.rate
         if not isinstance(self.expression, Refusal):
             knot, p = ca.SX.sym("knot", self.width), ca.SX.sym("known", known.shape[1])
@@ -89,9 +89,9 @@ class Timed:
 
 @dataclass(frozen=True, eq=False)
 class KnotFunctions:
-    """Those of a task; the final cost is one of the last knot, `paths` are its constraints.
+    """The functions of a task. The final cost is a function of the last knot, and `paths` are its constraints.
 
-    `joined` are its couplings, of the states of several knots side by side and the inputs there.
+    `joined` are its couplings, functions of the concatenated states of several knots and their inputs.
     """
 
     dynamics: PointFunction
@@ -99,10 +99,10 @@ class KnotFunctions:
     final: PointFunction | None
     paths: tuple[PointFunction, ...]
     joined: tuple[PointFunction, ...] = ()
-    parameters: PointFunction | None = None  # the cost of the parameters, of their coordinates
+    parameters: PointFunction | None = None  # the cost of the parameters as a function of their coordinates
 
     def why_not(self, *, linear: bool) -> str:
-        """Which of them has no second derivative and why, "" where all have; of those that are `linear`, or others."""
+        """Return "" if all functions with this `linear` have second derivatives, or the first one without and why."""
         named = [("dynamics", self.dynamics), ("running_cost", self.rate), ("final_cost", self.final)]
         named += [("parameter_cost", self.parameters)]
         named += [(f"constraint {i}", path) for i, path in enumerate(self.paths)]
@@ -112,7 +112,7 @@ class KnotFunctions:
 
 
 def knot_functions(task: OptimalControl) -> KnotFunctions:
-    """The functions of `task`, each an expression if it can be."""
+    """Return the functions of `task`, as symbolic expressions if possible."""
     nx, probe, rate, final = task.dynamics.nx, task.dynamics.probe(), task.rate, task.final
     cost, parameters = task.parameter_cost, None
     if cost is not None and task.varied is not None:
@@ -129,9 +129,9 @@ def knot_functions(task: OptimalControl) -> KnotFunctions:
 
 
 def joined_function(c: BoundCoupling, nx: int, probe: Array) -> PointFunction:
-    """That of a coupling, of the states at the knots of a place side by side, and then the inputs there."""
+    """Return the function of a coupling, of the concatenated states at the knots of a place, then of the inputs."""
     count = c.knots.shape[1]
-    several = [np.roll(probe, i, axis=0) for i in range(count)]  # so that no two of a place are the same knot
+    several = [np.roll(probe, i, axis=0) for i in range(count)]  # so that a place has different knots
     beside = np.hstack([*(knots[:, :nx] for knots in several), *(knots[:, nx:] for knots in several)])
     return constraint_function(c.rows, count * nx, beside)
 
@@ -148,7 +148,7 @@ def _dynamics(task: OptimalControl) -> PointFunction:
     dynamics, moved = task.dynamics, task.varied
     form, source = dynamics.form, moved or dynamics
     probe, nx, nu = source.probe(), dynamics.nx, dynamics.nu
-    if isinstance(dynamics, DiscreteMap) and dynamics.counts:  # after the last step there is none: it stands there too
+    if isinstance(dynamics, DiscreteMap) and dynamics.counts:  # the last knot has no step and repeats it
         steps = [dynamics.at_step(k) for k in range(task.problem.num_steps)]
         functions = [_chosen(step.f, step.values, step.linearize, nx, nx, probe) for step in steps]
         return Stepwise([*functions, functions[-1]])

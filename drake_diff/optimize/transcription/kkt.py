@@ -1,7 +1,7 @@
-"""The Karush-Kuhn-Tucker system of a collocated plan: how its variables change where the problem does.
+"""The Karush-Kuhn-Tucker system of a collocated plan, for derivatives of its variables with respect to the problem.
 
-With the multipliers y of the rows that hold the plan z, the stationarity of the Lagrangian and these rows stay true as
-the problem changes by p, so that, the active set kept,
+Let y be the multipliers of the rows that are active at the plan z. The stationarity of the Lagrangian and these rows
+remain valid as the problem changes by p, so that, for a constant active set,
 
     [ H  A' ] [ dz ]      [ d^2 L / dz dp ]
     [ A  0  ] [ dy ]  = - [ dg / dp       ]
@@ -27,20 +27,20 @@ from drake_diff.optimize.program import Multipliers
 from drake_diff.optimize.transcription.nodes import TranscribedProgram
 from drake_diff.optimize.transcription.steps import StepProgram
 
-NEAR_BOUND = 1e-4  # of max(1, |bound|): a value this near may lie on it: an interior point method leaves sqrt(mu)
-WEAK = 1e-4  # of the cost's largest slope: a smaller multiplier may hold nothing
-LEFT = 3e-7  # of both, at most, where their product is 1e-14: an interior point method leaves its root
-NEAREST = 1e-5  # of max(1, |p|): a corner that is nearer is one of the plan
-ROUNDED = 1e-7  # of the largest derivative of a kind: less is none
-SINGULAR, REFINEMENTS = 1e-10, 4  # on the diagonal, of rows that say the same, and how often its error is taken out
-DIFFERENCE = 1e-5  # of max(1, |p|): of derivatives by a parameter of the model, which are exact by the state
+NEAR_BOUND = 1e-4  # of max(1, |bound|): a value this near may be on it, as an interior point method leaves sqrt(mu)
+WEAK = 1e-4  # of the cost's largest slope: a bound or row with a smaller multiplier may be inactive
+LEFT = 3e-7  # largest value of both if an interior point method leaves a product of 1e-14
+NEAREST = 1e-5  # of max(1, |p|): a corner (a change of the active set) nearer than this is one of the plan
+ROUNDED = 1e-7  # of the largest derivative of a kind: smaller ones count as 0
+SINGULAR, REFINEMENTS = 1e-10, 4  # diagonal entry for redundant rows, and refinements of its error
+DIFFERENCE = 1e-5  # of max(1, |p|): step of differences of exact first derivatives with respect to a model parameter
 FLAT = "the plan has no derivative: it is not the only optimum, as some change of it leaves the cost equal"
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """What the problem changes by: entries of the first or last node, or parameters of the model."""
+    """The change of the problem: entries of the first or last node, or parameters of the model."""
 
     columns: tuple[str, ...]
     values: Array  # (p,)
@@ -50,7 +50,7 @@ class Change:
 
     @contextmanager
     def moved(self, problem: Problem, column: int, step: float) -> Iterator[Problem]:
-        """The problem with one column moved by `step`."""
+        """Yield the problem with one column moved by `step`."""
         if self.ends is None:
             values = np.array(self.values)
             values[column] += step
@@ -68,7 +68,7 @@ KnotProgram = TranscribedProgram | StepProgram
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """(n, p) the derivative of the variables, (p,) that of the cost, what holds the plan without force, how many do."""
+    """Derivatives of the variables (n, p) and the cost (p,), weakly active rows, and the number of active ones."""
 
     dz: Array
     cost: Array
@@ -77,9 +77,9 @@ class Held:
 
 
 class HeldPlan:
-    """The Lagrangian's second derivatives and the rows that hold a solution, in the variables that nothing holds.
+    """The Lagrangian's second derivatives and the active rows of a solution, in the variables without active bounds.
 
-    `make` gives the program of which z (n,) are the variables of the plan; that of the problem when it has changed too.
+    `make` returns the program of a problem, also of a changed one. Its variables at the plan are z (n,).
     """
 
     def __init__(self, problem: Problem, make: Callable[[Problem], KnotProgram], z: Array):
@@ -89,7 +89,7 @@ class HeldPlan:
         self.slope, self.values, self.rows = self._first_derivatives(self.derivatives)
 
     def _first_derivatives(self, derivatives: dict[str, Any]) -> tuple[Array, Array, Any]:
-        """The cost's gradient (n,), the rows' values (m,) and their Jacobian; GradientError where one is refused."""
+        """Return the cost's gradient (n,), the rows' values (m,) and Jacobian. Raises GradientError if refused."""
         slope = np.asarray(derivatives["grad_f"](self.z, [])[1]).ravel()
         values, rows = derivatives["jac_g"](self.z, [])
         if not (np.all(np.isfinite(slope)) and np.all(np.isfinite(rows.nonzeros()))):
@@ -98,18 +98,18 @@ class HeldPlan:
 
     @cached_property
     def fixed(self) -> Mask:
-        """(n,) the variables that are given."""
+        """A mask (n,) of the variables that are given."""
         return self.program.lower >= self.program.upper
 
     @cached_property
     def multipliers(self) -> Multipliers:
-        """Those that leave the least of the Lagrangian's gradient."""
+        """The multipliers that minimize the Lagrangian's gradient."""
         on_bound, _, of_rows, left = self._active
         return Multipliers(np.where(on_bound | self.fixed, -left, 0.0), of_rows)
 
     @cached_property
     def left(self) -> float:
-        """What they leave, as a part of the cost's largest slope: 0 at an optimum."""
+        """The Lagrangian's remaining gradient, relative to the cost's largest slope. It is 0 at an optimum."""
         on_bound, _, _, left = self._active
         return float(np.max(np.abs(left[~(on_bound | self.fixed)]), initial=0.0)) / self._scale
 
@@ -118,7 +118,7 @@ class HeldPlan:
         return max(float(np.max(np.abs(self.slope))), 1e-300)
 
     def solve(self, change: Change) -> Held:
-        """How the variables change by `change`, the active set kept."""
+        """Return the derivatives of the variables with respect to `change`, for a constant active set."""
         on_bound, on_row, multipliers, _ = self._active
         free = np.flatnonzero(~(self.fixed | on_bound))
         dz = np.zeros((len(self.z), len(change.values)))
@@ -144,9 +144,9 @@ class HeldPlan:
         return Held(dz, self.slope @ dz + of_cost, weak, holding)
 
     def _weak(self, units: Array, dz: Array, left: Array, moved: Array, of_rows: Array) -> tuple[str, ...]:
-        """What begins or ceases to hold the plan, to first order, as a column moves by NEAREST of its unit.
+        """Name bounds and rows that become active or inactive, to first order, if a column moves by NEAREST units.
 
-        The derivatives are of the variables, of what the rows' multipliers leave, of the rows and of their multipliers.
+        The derivatives are of the variables, of the remaining gradient, of the rows and of their multipliers.
         """
         on_bound, on_row, multipliers, remains = self._active
         lower, upper = self.program.lower, self.program.upper
@@ -165,9 +165,9 @@ class HeldPlan:
 
     @cached_property
     def _active(self) -> tuple[Mask, Mask, Array, Array]:
-        """The bounds and rows that hold the plan, the multipliers of all rows, and what these leave (n,).
+        """Masks of active bounds and rows, the multipliers of all rows, and the Lagrangian's remaining gradient (n,).
 
-        What lies further from the plan than it pushes, both as parts of their size, does not hold it.
+        A bound or row is inactive if its distance from the plan exceeds its multiplier, both relative to their size.
         """
         program, (least, most) = self.program, self.program.sides
         low, high = _near(self.z, program.lower), _near(program.upper, self.z)
@@ -175,7 +175,7 @@ class HeldPlan:
         equal = least >= most
         scale = self._scale
         on_bound, holds = (low | high) & ~self.fixed, row_low | row_high | equal
-        while True:  # one after the other, as of bounds and rows that say the same only one pushes
+        while True:  # one at a time, since of equivalent ones only one is active
             on_row = holds & (equal | self._moves(on_bound))
             multipliers, left = self._multipliers(on_bound, on_row)
             by_bound = np.where(on_bound, -left, 0.0)
@@ -197,7 +197,7 @@ class HeldPlan:
         return on_bound, on_row, multipliers, left
 
     def _moves(self, on_bound: Mask) -> Mask:
-        """(m,) the rows in which a variable has a part that nothing holds; the others follow from bounds."""
+        """Return a mask (m,) of the rows that depend on free variables. The other rows follow from bounds."""
         of_row = np.asarray(ca.sum2(ca.fabs(self.rows[:, np.flatnonzero(~(self.fixed | on_bound)).tolist()]))).ravel()
         return of_row > 0
 
@@ -205,7 +205,7 @@ class HeldPlan:
         return [self.program.names[i] for i in np.flatnonzero(which).tolist()]
 
     def _multipliers(self, on_bound: Mask, on_row: Mask) -> tuple[Array, Array]:
-        """(m,) those of the rows that leave the least of the Lagrangian's gradient, and what they leave (n,)."""
+        """Return the multipliers (m,) that minimize the Lagrangian's gradient, and the remaining gradient (n,)."""
         free, rows = np.flatnonzero(~(self.fixed | on_bound)), np.flatnonzero(on_row)
         jacobian = self.rows[rows.tolist(), free.tolist()]
         solution = _kkt(ca.DM.eye(len(free)), jacobian, -self.slope[free][:, None], np.zeros((len(rows), 1)))
@@ -215,7 +215,7 @@ class HeldPlan:
         return multipliers, left
 
     def _by_parameters(self, change: Change, multipliers: Array) -> tuple[Array, Array]:
-        """(p,) of the cost, (n + m, p) of the Lagrangian's gradient and of the rows, by differences of these."""
+        """Return derivatives (p,) of the cost and (n + m, p) of the Lagrangian's gradient and rows, by differences."""
 
         def at(column: int, step: float) -> Array:
             with change.moved(self.problem, column, step) as problem:
@@ -231,7 +231,7 @@ class HeldPlan:
 
 
 def _near(values: Array, bound: Array) -> Mask:
-    """Where `values` are not above `bound` by more than NEAR_BOUND; False where it is infinite."""
+    """Return a mask of `values` at most NEAR_BOUND above `bound`, False if it is infinite."""
     with np.errstate(invalid="ignore"):
         gap = values - bound
         finite = np.isfinite(gap)
@@ -240,21 +240,21 @@ def _near(values: Array, bound: Array) -> Mask:
 
 
 def _apart(values: Array, lower: Array, upper: Array) -> Array:
-    """(n,) how far values are from the nearer of their bounds, as a part of its size; inf where there is none."""
+    """Return the distance (n,) of values from the nearer bound, relative to the bound's size, inf if there is none."""
     with np.errstate(invalid="ignore"):
         sides = [np.abs(values - bound) / np.maximum(1.0, np.abs(bound)) for bound in (lower, upper)]
     return np.asarray(np.minimum(*[np.where(np.isfinite(side), side, np.inf) for side in sides]))
 
 
 def _crosses(distance: Array, derivative: Array, units: Array) -> Mask:
-    """(n,) what is 0 within NEAREST of a column's unit, its derivative being (n, p)."""
+    """Return a mask (n,) of distances with derivatives (n, p) that reach 0 within NEAREST of a column's unit."""
     noise = ROUNDED * np.max(np.abs(derivative), axis=0, initial=0.0)
     goes = np.where(np.abs(derivative) > noise, np.abs(derivative), 0.0) * units * NEAREST
     return np.asarray(np.any((goes > 0) & (goes >= (distance - LEFT)[:, None]), axis=1))
 
 
 def _kkt(hessian: Any, rows: Any, first: Array, second: Array) -> Array:
-    """The solution of [H A'; A 0] z = [first; second], sparse, where rows may say the same."""
+    """Solve the sparse system [H A'; A 0] z = [first; second], whose rows may be redundant."""
     m = rows.shape[0]
     exact = ca.blockcat([[hessian, rows.T], [rows, ca.DM(m, m)]])
     matrix = ca.blockcat([[hessian, rows.T], [rows, -SINGULAR * ca.DM.eye(m)]])
@@ -263,7 +263,7 @@ def _kkt(hessian: Any, rows: Any, first: Array, second: Array) -> Array:
         solution = solver.solve(matrix, right)
         for _ in range(REFINEMENTS):
             solution += solver.solve(matrix, right - ca.mtimes(exact, solution))
-    except RuntimeError as error:  # CasADi's, of a matrix without an inverse
+    except RuntimeError as error:  # CasADi's error for a singular matrix
         raise GradientError(FLAT) from error
     if not np.all(np.isfinite(np.asarray(solution))):
         raise GradientError(FLAT)

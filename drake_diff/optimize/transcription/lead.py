@@ -1,13 +1,13 @@
-"""Where the dynamics lead along a collocated motion with error control: from each knot, or from one state through all.
+"""Integration of the dynamics along a collocated motion with error control, from each knot or from the first state.
 
-`Lead` takes each interval in equal steps of the pair of Dormand and Prince, in twice as many wherever one of them has
-an error above its tolerance, so that an interval in which nothing bends costs six evaluations of the dynamics.
+`Lead` integrates each interval in equal steps of the Dormand-Prince pair. It doubles the steps if one of them has an
+error above its tolerance, so that a smooth interval costs six evaluations of the dynamics.
 
-No integrator sees a force or cost that acts between the points at which it evaluates them. So the functions of users
-are looked at so often that nothing moves by more than `WIDTH` in between: of a state's or input's range along
-the motion, or of a quarter of the way that it goes where that is longer, and of the duration where the cost depends on
-time. `Within` integrates intervals in which they do something in steps as short as that. A feature that is narrower
-than `WIDTH` may be missed. A motion of which an interval leads off by more than its whole range is not looked at.
+No integrator detects a force or cost that acts between the points at which it evaluates them. Users' functions are
+therefore evaluated at places so dense that nothing moves by more than `WIDTH` between them: of a state's or input's
+range along the motion, or of a quarter of its path length if that is longer, and of the duration if the cost depends on
+time. `Within` integrates the intervals in which these functions act in steps of this length. A feature narrower than
+`WIDTH` may be missed. Motions with an interval that deviates by more than its whole range are not checked.
 """
 
 from functools import cache
@@ -19,15 +19,15 @@ from drake_diff._base.arrays import Array, Indices
 from drake_diff.motion.tableaus import AT, DENSE, ERROR, STAGES
 from drake_diff.optimize.transcription.task import OptimalControl
 
-TOLERANCE = 1e-6  # of a state's range along the motion, in a step: a ten-thousandth of how far it may be off at all
-MOST_STEPS = 16  # of an interval, whatever their errors: stable where ten of the classical Runge-Kutta method are
-EASY = 1e-2  # of what is allowed: half as many steps would have 32 times the error
-SUBSTEPS = 10  # of the classical Runge-Kutta method in an interval in which nothing narrow is seen
-WIDTH = 1e-4  # of the scale of a state or input: the features that are seen
-LONGEST = 4.0  # ranges: what goes a longer way has a quarter of that for its scale
-MOST_PLACES = 400_000  # at which a motion is looked at (a longer one has a larger WIDTH), and evaluated in finer steps
-FEATURE = 1e-5  # of a state's range, or of the cost: what is between the points of an integration and changes less
-NARROW = 8  # steps of a tenth of an interval: what needs as many is narrow there
+TOLERANCE = 1e-6  # of a state's range along the motion, per step: a ten-thousandth of the allowed error
+MOST_STEPS = 16  # of an interval, for any error: stable wherever ten steps of the classical Runge-Kutta method are
+EASY = 1e-2  # of the allowed error: half as many steps would have 32 times the error
+SUBSTEPS = 10  # of the classical Runge-Kutta method in an interval without narrow features
+WIDTH = 1e-4  # of the scale of a state or input: width of the features that are resolved
+LONGEST = 4.0  # ranges: the scale of a longer path is a quarter of its length
+MOST_PLACES = 400_000  # at which a motion is checked (longer ones have a larger WIDTH), and evaluations in finer steps
+FEATURE = 1e-5  # of a state's range, or of the cost: smaller changes between integration points are ignored
+NARROW = 8  # steps per tenth of an interval: a feature that needs as many is narrow
 STAGE_WEIGHTS = tuple(np.array(weights) for weights in STAGES)
 
 
@@ -52,14 +52,14 @@ class PiecewiseMotion(Protocol):
 
 
 class Places:
-    """Where a motion is looked at: `points` (nx + nu, S) at `times` (S,) [s] in order, each for `dt` (S,) [s].
+    """Places of checks on a motion: `points` (nx + nu, S) at ordered `times` (S,) [s], each for `dt` (S,) [s].
 
-    There are `counts` (10 N,) in each tenth of an interval, from its `starts` on, on the parabola through its ends and
-    middle. `width` is that of the features that are seen.
+    Each tenth of an interval has `counts` (10 N,) of them from `starts` on, on the parabola through its ends and
+    middle. `width` is the width of the features that are resolved.
     """
 
     def __init__(self, motion: PiecewiseMotion, held: Array):
-        """`held` (N, 21, nx + nu) is the motion at every half of an interval's ten steps."""
+        """Create the places from `held` (N, 21, nx + nu), the motion at every half of an interval's ten steps."""
         count, parts = len(motion.lengths), 2 * SUBSTEPS
         moved = np.abs(np.diff(held, axis=1))
         scale = np.maximum(np.ptp(held, axis=(0, 1)), np.sum(moved, axis=(0, 1)) / LONGEST)
@@ -81,20 +81,20 @@ class Places:
         self.points = self.parabolas(np.ascontiguousarray(held.reshape(-1, held.shape[2]).T))
 
     def parabolas(self, base: Array) -> Array:
-        """(r, S) by what `base` (r, 21 N) is at every half of an interval's ten steps."""
+        """Return parabolas (r, S) through `base` (r, 21 N), the values at every half of an interval's ten steps."""
         parts = zip(self._weights, self._ends, strict=True)
         return np.asarray(sum(w * np.repeat(base[:, ends], self.counts, axis=1) for w, ends in parts))
 
 
 class Within:
-    """Where each knot of a motion leads within its interval, in ten or more steps of the classical Runge-Kutta method.
+    """Integration from each knot through its interval, in ten or more steps of the classical Runge-Kutta method.
 
     Attributes:
-        states: (11, N, nx + 1) the states at every tenth of the intervals, and what the way there costs.
-        errors: (N, nx + 1) what is left of their errors at the ends, where that was measured, else 0.
-        least: (N,) the fewest steps in an interval that see what the dynamics do there.
-        narrow: (N,) the intervals in which something acts over a small part of a tenth.
-        width: of the features that are seen, see above.
+        states: (11, N, nx + 1) the states at every tenth of the intervals, and the running cost's integral.
+        errors: (N, nx + 1) their remaining errors at the ends of the intervals, or 0 if these were not measured.
+        least: (N,) the least number of steps in an interval that resolves its dynamics.
+        narrow: (N,) a mask of the intervals in which a function acts over a small part of a tenth.
+        width: width of the features that are resolved, see the module.
     """
 
     def __init__(self, motion: PiecewiseMotion, held: Array):
@@ -102,7 +102,7 @@ class Within:
         self.nx, self.width, self.least = task.dynamics.nx, 0.0, np.ones(count, dtype=np.intp)
         self.narrow = np.zeros(count, dtype=bool)
         self.allowed = FEATURE * np.append(task.problem.state_scales(motion.xs), motion.cost_scale)
-        if task.is_map:  # the state is held until the next step
+        if task.is_map:  # the state is constant until the next step
             z, k = held[:, 0], np.arange(count)
             stepped = np.column_stack([task.moved(z, k), task.rates(z, motion.times(k, np.zeros(count)))])
             before = np.column_stack([z[:, : self.nx], np.zeros(count)])
@@ -114,13 +114,13 @@ class Within:
             self.errors = np.zeros(self.states.shape[1:])
             self.errors[:, -1] = np.abs(self.states[-1, :, -1] - halved) / 15  # by Simpson's rule over twice the steps
             gaps = np.abs(self.states[-1, :, :-1] - motion.xs[1:])
-            if np.all(FEATURE * gaps <= self.allowed[:-1]):  # else it is not the model's motion, whatever acts there
+            if np.all(FEATURE * gaps <= self.allowed[:-1]):  # otherwise the motion is not the model's
                 rows, steps = self._seen()
                 if len(rows):
                     self._refine(rows, steps)
 
     def _through(self, rows: Indices, steps: Indices) -> tuple[Array, Array]:
-        """(11, R, nx + 1) as `states`, in so many `steps` (10,) of each tenth; and (11, R) the running cost there."""
+        """Return `states` (11, R, nx + 1) for `steps` (10,) per tenth, and the running cost (11, R) at these states."""
         motion, task, nx = self.motion, self.motion.task, self.nx
         z, lengths = np.column_stack([motion.xs[rows], np.zeros(len(rows))]), motion.lengths[rows, None]
         states, costs = [z], list[Array]()
@@ -149,7 +149,7 @@ class Within:
         return np.array(states), np.array([*costs, k4[:, nx]])
 
     def _seen(self) -> tuple[Indices, Indices]:
-        """The intervals in which something is between the points of an integration, and (10,) the steps that see it."""
+        """Return the intervals with features between integration points, and the steps (10,) that resolve these."""
         motion, task, nx, none = self.motion, self.motion.task, self.nx, np.zeros(0, dtype=np.intp)
         functions = [f for f in (task.user_dynamics, task.user_rate) if f is not None]
         if not functions:
@@ -179,7 +179,7 @@ class Within:
         return rows, np.max(wanted[rows], axis=0, initial=1)
 
     def _refine(self, rows: Indices, steps: Indices) -> None:
-        """Integrate the intervals `rows` in `steps` (10,), in half as long ones until that changes nothing."""
+        """Integrate the intervals `rows` in `steps` (10,), and double the steps until the states do not change."""
         last, finer, evaluated = self._through(rows, steps)[0], steps > 1, 0
         while evaluated < MOST_PLACES:
             steps = np.where(finer, 2 * steps, steps)
@@ -194,10 +194,10 @@ class Within:
 
 
 class Lead:
-    """Where `motion` leads at every `substeps`-th part of its intervals, which start and end at its knots."""
+    """Integration along `motion`, sampled at `substeps` equal parts of each of its intervals."""
 
     def __init__(self, motion: PiecewiseMotion, substeps: int, least: Any = None):
-        """`least` (N,) are the fewest steps in each interval, 1 where None."""
+        """`least` (N,) are the least numbers of steps in each interval, by default 1."""
         self.motion, self.substeps = motion, substeps
         self.least = np.ones(len(motion.lengths), dtype=np.intp) if least is None else least
         self.nx = motion.task.dynamics.nx
@@ -206,12 +206,12 @@ class Lead:
         self._planned: dict[int, Array] = {}
 
     def from_state(self, x: Array, gains: Array | None) -> Array:
-        """(substeps N + 1, nx) from `x` (nx,), with feedback by `gains` (N, nu, nx) if there are."""
+        """Return states (substeps N + 1, nx) from `x` (nx,), with feedback `gains` (N, nu, nx) if given."""
         states, steps, slope = [x[None]], 1, None
         with np.errstate(all="ignore"):
             for k in range(len(self.motion.lengths)):
                 gain = None if gains is None else gains[k]
-                slope = slope if gains is None else None  # another gain acts from here on
+                slope = slope if gains is None else None  # the gain changes at the knot
                 within, steps, slope = self._through(k, states[-1][-1], gain, steps, slope)
                 states.append(within)
         return np.concatenate(states)
@@ -219,7 +219,7 @@ class Lead:
     def _through(
         self, k: int, x: Array, gain: Array | None, steps: int, slope: Array | None
     ) -> tuple[Array, int, Array]:
-        """(substeps, nx) through the interval `k`; in how many steps the next may be taken, and x' at the end."""
+        """Return states (substeps, nx) of the interval `k`, the number of steps for the next one, and x' at the end."""
         least = int(self.least[k])
         most = max(MOST_STEPS, 2 * least)
         steps = MOST_STEPS if not np.all(np.isfinite(x)) else max(steps, least)
@@ -239,9 +239,9 @@ class Lead:
     def _in_steps(
         self, k: int, x: Array, gain: Array | None, steps: int, slope: Array | None
     ) -> tuple[list[Array], list[Array], float]:
-        """The states at the ends of `steps` steps, the slopes (7, nx) of each, and the largest part of what is allowed.
+        """Return the states at the ends of `steps` steps, the slopes (7, nx) of each, and the largest relative error.
 
-        That is of their errors. Of steps whose error is too large only the first are taken.
+        Errors are relative to the allowed error. The integration stops after a step whose error is too large.
         """
         states, every, worst, dt = [x], [], 0.0, self.motion.lengths[k] / steps
         planned = self._plan(steps)[k]
@@ -267,7 +267,7 @@ class Lead:
         return self.motion.task.moved(np.concatenate((x, u))[None], np.array([k]))[0]
 
     def _plan(self, steps: int) -> Array:
-        """(N, steps, 7, nx + nu) the motion, inputs as the plant applies them, at the stages of `steps` steps."""
+        """Return the motion (N, steps, 7, nx + nu) at the stages of `steps` steps, inputs as the plant applies them."""
         if steps not in self._planned:
             count, tau = len(self.motion.lengths), (np.arange(steps)[:, None] + np.array((0.0, *AT))).ravel() / steps
             xs, us = self.motion.between(np.repeat(np.arange(count), len(tau)), np.tile(tau, count))
@@ -277,7 +277,7 @@ class Lead:
 
 @cache
 def _shown(substeps: int, steps: int) -> list[tuple[slice, Array]]:
-    """Of each of an interval's `steps`, which of `substeps` ends lie in it, and the weights of its slopes there."""
+    """Return, for each of `steps` in an interval, the slice of `substeps` ends in it and the weights of its slopes."""
     pairs, ends = [], np.arange(1, substeps + 1) / substeps * steps
     for i in range(steps):
         first, last = np.searchsorted(ends, [i, i + 1], side="right").tolist()

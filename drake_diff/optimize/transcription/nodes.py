@@ -1,8 +1,8 @@
-"""The program of a problem by collocation: the phases on their meshes one after the other, and what links them.
+"""The program of a problem by collocation: its phases on their meshes, in sequence, and the links between them.
 
-With the rates F at all nodes, an interval's defects are states @ x - T h slopes @ F. The Bernstein coefficients of
-bounded states are rows of the same form, those of bounded inputs linear ones. Path constraints, couplings and limits of
-rates add rows, resets link the ends of phases.
+With the rates F at all nodes, the defects of an interval are states @ x - T h slopes @ F. The Bernstein coefficients of
+bounded states are rows of the same form, and those of bounded inputs are linear rows. Path constraints, couplings and
+rate limits add rows, and resets link the ends of phases.
 """
 
 from collections.abc import Sequence
@@ -23,14 +23,14 @@ from drake_diff.optimize.transcription.task import OptimalControl
 
 
 def link_functions(problem: Problem | PhasedProblem) -> tuple[PointFunction, ...]:
-    """What each switch asks of the two states side by side, an expression if it can be."""
+    """Return the function of each switch on its two concatenated states, as a symbolic expression if possible."""
     if not isinstance(problem, PhasedProblem):
         return ()
     return tuple(constraint_function(s.link, len(s.columns), s.probe) for s in problem.switches)
 
 
 class Phase:
-    """Where in z the variables of a phase are: nodes row by row, coordinates of parameters, and a free duration."""
+    """The variables of a phase in z: nodes row by row, coordinates of parameters, and a free duration."""
 
     def __init__(self, task: OptimalControl, mesh: Array, functions: KnotFunctions):
         self.task, self.mesh, self.functions = task, mesh, functions
@@ -43,47 +43,47 @@ class Phase:
         self.size, self.first = len(self.lower), 0  # `first` is set by the program
 
     def columns(self, nodes: Indices) -> Indices:
-        """(K, nx + nu) the places in z of `nodes` (K,)."""
+        """Return the indices (K, nx + nu) in z of `nodes` (K,)."""
         return np.asarray(self.first + nodes[:, None] * self.width + np.arange(self.width))
 
     @property
     def coordinates_at(self) -> Indices:
-        """(np,) those of the parameters' coordinates."""
+        """The indices (np,) in z of the parameters' coordinates."""
         return self.first + self.every.size * self.width + np.arange(len(self.task.coordinates))
 
     @property
     def time_at(self) -> int | None:
-        """That of a free duration."""
+        """The index in z of a free duration, or None."""
         return self.first + self.size - 1 if self.free else None
 
     @property
     def names(self) -> list[str]:
-        """(size,) of the variables."""
+        """The names (size,) of the variables."""
         names = (*self.task.dynamics.state_names, *self.task.dynamics.input_names)
         others = self.task.problem.parameters.names if self.task.varied else ()
         return [f"{name} at node {k}" for k in self.every for name in names] + [*others, *["horizon"] * self.free]
 
     def pack(self, nodes: Array, horizon: float, parameters: Array | None = None) -> Array:
-        """(size,) the variables of `nodes` (K, nx + nu), a duration [s] and parameters (np,), the task's if None."""
+        """Return the variables (size,) for `nodes` (K, nx + nu), a duration [s] and parameters (np,), or the task's."""
         task = self.task
         if parameters is not None and task.varied is not None:
             task = task.at(np.clip(parameters, *task.problem.bounds_of_parameters()))
         return np.concatenate([nodes.ravel(), task.coordinates, [np.clip(horizon, *self.task.horizon)] * self.free])
 
     def unpack(self, z: Array) -> tuple[Array, float]:
-        """The nodes (K, nx + nu) and the duration [s] in all variables."""
+        """Return the nodes (K, nx + nu) and the duration [s] from all variables."""
         nodes = z[self.first : self.first + self.every.size * self.width].reshape(-1, self.width)
         return nodes, self.task.horizon[0] if self.time_at is None else float(z[self.time_at])
 
     def parameters(self, z: Array) -> Array:
-        """(np,) the values of the problem's parameters in all variables."""
+        """Return the values (np,) of the problem's parameters from all variables."""
         moved, problem = self.task.varied, self.task.problem
         if moved is None:
             return self.task.parameters
         return np.clip(moved.coordinates.to_values(z[self.coordinates_at]), *problem.bounds_of_parameters())
 
     def spans(self, z: Array) -> Array:
-        """(size,) how far its variables may go from z."""
+        """Return how far (size,) its variables may move from z."""
         (nodes, horizon), f = self.unpack(z), self.functions.dynamics
         points = np.hstack([nodes, np.tile(z[self.coordinates_at], (len(nodes), 1))])
         rows, columns = f.jacobian_at
@@ -97,7 +97,7 @@ class Phase:
         return np.concatenate([np.tile(of_node, len(nodes)), spans, [horizon] * self.free])
 
     def iterate(self, z: Array) -> Iterate:
-        """The motion, for callbacks."""
+        """Return the motion for callbacks."""
         problem, (nodes, horizon) = self.task.problem, self.unpack(z)
         vector = problem.parameters.at(self.parameters(z)) if self.task.varied else problem.parameters
         knots = np.array(nodes[:: self.task.scheme.nodes])
@@ -106,9 +106,9 @@ class Phase:
 
 
 class TranscribedProgram(BlockProgram):
-    """The program of phases, and of `links` and a horizon of `problem` where there are several.
+    """The program of phases, with the `links` and the horizon of `problem` if there are several.
 
-    `states_at` (N+1, nx), `inputs_at` (N+1, nu) and `horizon_at` are those of the first phase.
+    `states_at` (N+1, nx), `inputs_at` (N+1, nu) and `horizon_at` are the indices in z for the first phase.
     """
 
     horizon_unit = 1.0
@@ -146,15 +146,15 @@ class TranscribedProgram(BlockProgram):
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """(n,) of the variables."""
+        """The names (n,) of the variables."""
         return tuple(name for phase in self.phases for name in phase.names)
 
     def spans(self, z: Array) -> Array:
-        """(n,) see `Problem.search_spans`, of coordinates 1, and of a free duration its own."""
+        """Return the spans (n,) of `Problem.search_spans`, 1 for coordinates, and a free duration for itself."""
         return np.concatenate([phase.spans(z) for phase in self.phases])
 
     def iterates(self, z: Array) -> tuple[Iterate, ...]:
-        """The motion of each phase at z, for callbacks."""
+        """Return the motion of each phase at z, for callbacks."""
         return tuple(phase.iterate(z) for phase in self.phases)
 
     def _add_links(self, problem: PhasedProblem, links: Sequence[PointFunction]) -> None:
@@ -194,26 +194,26 @@ class TranscribedProgram(BlockProgram):
         self._add_inputs(phase)
 
     def _add_values(self, function: PointFunction, columns: Indices, lower: Array, upper: Array) -> None:
-        """Rows that keep the values of a function at points within limits (m,)."""
+        """Add rows that constrain the values of a function at points by limits (m,)."""
         rows = self.add_rows(np.tile(lower, len(columns)), np.tile(upper, len(columns)))
         self.add(function, columns).weigh(rows, np.arange(len(rows)), 1.0)
 
     def _add_defects(self, phase: Phase, dynamics: Term) -> None:
-        """The defects, and the Bernstein coefficients of bounded states."""
+        """Add the defects, and the Bernstein coefficients of bounded states."""
         scheme, b, every = phase.task.scheme, phase.task.bounds, np.arange(phase.nx)
         none = np.zeros((len(phase.mesh) - 1, len(scheme.states), phase.nx))
         self._add_intervals(phase, dynamics, scheme.states, scheme.slopes, every, none, none)
         bounded = np.flatnonzero((np.isfinite(b.x_lower) | np.isfinite(b.x_upper)) & (b.x_lower < b.x_upper))
         shape = len(phase.mesh) - 1, len(scheme.hull_states), len(bounded)
         lower, upper = (np.array(np.broadcast_to(side[bounded], shape)) for side in (b.x_lower, b.x_upper))
-        for k, node in ((0, 0), (-1, -1)):  # no limit for a coefficient of given numbers alone: nothing can keep it
+        for k, node in ((0, 0), (-1, -1)):  # no limit on coefficients of given numbers only
             given = np.flatnonzero(self._given(phase, phase.every[node])[bounded])
             ends = np.flatnonzero(scheme.hull_states[:, node])
             lower[k, ends[:, None], given], upper[k, ends[:, None], given] = -np.inf, np.inf
         self._add_intervals(phase, dynamics, scheme.hull_states, scheme.hull_slopes, bounded, lower, upper)
 
     def _given(self, phase: Phase, node: int) -> Any:
-        """(nx,) whether a node's state, and all that its rate depends on, are given."""
+        """Return a mask (nx,) of the states of a node that are given together with all variables of their rates."""
         places = np.concatenate([phase.columns(np.array([node]))[0], phase.coordinates_at])
         given = self.lower[places] == self.upper[places]
         rows, columns = phase.functions.dynamics.jacobian_at
@@ -230,7 +230,7 @@ class TranscribedProgram(BlockProgram):
         lower: Array,
         upper: Array,
     ) -> None:
-        """Rows states @ x - T h slopes @ F of each interval, for some coordinates, within limits (N, r, C)."""
+        """Add rows states @ x - T h slopes @ F for some coordinates in each interval, within limits (N, r, C)."""
         rows = self.add_rows(lower.ravel(), upper.ravel()).reshape(*lower.shape[:2], 1, len(coordinates))
         lengths = np.diff(phase.mesh)[:, None, None, None]
         nodes = _nodes(phase)[:, None, :, None]
@@ -238,9 +238,9 @@ class TranscribedProgram(BlockProgram):
         dynamics.weigh(rows, nodes * phase.nx + coordinates, -lengths * slopes[None, :, :, None], by_time=True)
 
     def _add_slopes(self, phase: Phase, dynamics: Term, limit: RateLimit) -> None:
-        """|slopes| <= limit at the ends of all intervals, where the slope of a line or parabola is largest.
+        """Constrain |slopes| <= limit at the ends of all intervals, where the slope of a line or parabola is largest.
 
-        As rows weights @ values within limit * T. With a free T there are two rows for each, one for either side.
+        The rows are weights @ values within limit * T. With a free T each limit has two rows, one for each side.
         """
         scheme, (entries, limits) = phase.task.scheme, limit.entries(phase.task.problem.system)
         ends = np.array([[-1.0, 0.0, 1.0]]) if limit.of_inputs and scheme.input_is_linear else scheme.end_slopes
@@ -260,7 +260,7 @@ class TranscribedProgram(BlockProgram):
                 self.add_linear(rows, phase.time_at, sign * most.ravel())
 
     def _add_inputs(self, phase: Phase) -> None:
-        """Inputs that are lines, or the inner Bernstein coefficient of bounded ones that are parabolas."""
+        """Constrain inputs to lines, or the inner Bernstein coefficient of bounded inputs that are parabolas."""
         scheme, b, nu = phase.task.scheme, phase.task.bounds, phase.task.dynamics.nu
         if scheme.nodes == 1:
             return
@@ -275,6 +275,6 @@ class TranscribedProgram(BlockProgram):
 
 
 def _nodes(phase: Phase) -> Indices:
-    """(N, s+1) those of each interval; neighbours share one."""
+    """Return the nodes (N, s+1) of each interval, of which adjacent intervals share one."""
     s = phase.task.scheme.nodes
     return np.asarray(s * np.arange(len(phase.mesh) - 1)[:, None] + np.arange(s + 1))

@@ -1,11 +1,11 @@
-"""A sparse program made of functions at many points, its exact derivatives, and IPOPT, which CasADi carries, on it.
+"""A sparse program of functions at many points, its exact derivatives, and its solution by IPOPT from CasADi.
 
-With z the variables, F_i the values of a function at points that are entries of z, and A, D_i, E_i constant and sparse,
+With z the variables, F_i the values of a function at points made of entries of z, and constant sparse A, D_i, E_i,
 
     [f; g] = A z + sum_i (D_i + z_t E_i) F_i(z),
 
-where z_t may be a duration. Jacobians J_i and Hessians H_i are computed point by point, all points of a function in one
-call, and summed up: the weights of F_i in the Lagrangian's second derivative are (D_i + z_t E_i)' [sigma; lambda].
+where z_t may be a duration. Jacobians J_i and Hessians H_i are computed point by point, in one call for all points of a
+function, and added: the weights of F_i in the Lagrangian's Hessian are (D_i + z_t E_i)' [sigma; lambda].
 """
 
 import math
@@ -44,57 +44,57 @@ OUTCOMES = {
     "Diverging_Iterates": Outcome.UNBOUNDED,
 }
 OPTIONS = {
-    "ipopt.mu_strategy": "adaptive",  # the monotone one ends minimum times of a pendulum as infeasible
-    "ipopt.max_hessian_perturbation": 1e8,  # of IPOPT's 1e20 it takes tens of iterations to come down again
-    # Larger pivots fill the factors where the final time is free, whose column is dense, up to ten times.
+    "ipopt.mu_strategy": "adaptive",  # the monotone strategy reports minimum-time problems of a pendulum as infeasible
+    "ipopt.max_hessian_perturbation": 1e8,  # after IPOPT's 1e20 it needs tens of iterations to decrease
+    # If the final time is free, its column is dense, and larger pivots fill the factors up to ten times more.
     "ipopt.mumps_pivtol": 1e-8,
     "ipopt.mumps_permuting_scaling": 0,
     "ipopt.mumps_scaling": 1,
     "print_time": False,
     "show_eval_warnings": False,
     "calc_lam_p": False,
-    "no_nlp_grad": True,  # CasADi makes no derivatives of what is called back
+    "no_nlp_grad": True,  # CasADi makes no derivatives of the callbacks
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
     "ipopt.print_user_options": "no",
-    "ipopt.option_file_name": "",  # else it reads ipopt.opt in the working directory, which can name files to write
+    "ipopt.option_file_name": "",  # else it reads ipopt.opt in the working directory, which can name output files
 }
-# From a line whose time is free: a search that begins well within its limits is quicker, and seldom ends in a motion
-# that takes half as long again as another one.
+# For a straight line with free time: a start well within the bounds is faster, and seldom results in a motion that
+# takes half as long again as another one.
 FAR = dict.fromkeys(["ipopt.bound_push", "ipopt.bound_frac"], 0.2)
-# From multipliers: a point that lies on its bounds stays there, and what is nearly right is not made wrong first.
+# For known multipliers: a point on its bounds stays there, and a nearly optimal point is not made worse first.
 WARM_START = {
     "ipopt.warm_start_init_point": "yes",
     "ipopt.mu_init": 1e-6,
     **dict.fromkeys([f"ipopt.warm_start_{option}" for option in ("bound_push", "bound_frac", "mult_bound_push")], 1e-6),
     **dict.fromkeys([f"ipopt.warm_start_slack_{option}" for option in ("bound_push", "bound_frac")], 1e-6),
 }
-RELAXED = 1e-6  # of the smallest bound: what a plan may be beyond it
-FLAT = 1e-8  # of the largest slope of a row: a row that has another one than at the guess
-ROUNDING = 1e-13  # of the size of a row: a change that is rounding
-TRIED = 0.1  # of the spans: how far from the guess the cost is looked at
-PRECISE = 0.1  # of the tolerance: a motion may stay well within the spans of its first guess
+RELAXED = 1e-6  # of the smallest bound: allowed violation by a plan
+FLAT = 1e-8  # of the largest slope: a row with a smaller one at the guess may have a larger one nearby
+ROUNDING = 1e-13  # of the size of a row: changes by rounding
+TRIED = 0.1  # of the spans: distance from the guess at which the cost is sampled
+PRECISE = 0.1  # of the tolerance: a motion may stay well within the spans of its initial guess
 NOT_FINITE = "IPOPT: Invalid Number Detected"
 
 
-COST = -1  # the row of the cost
+COST = -1  # the row index of the cost
 
 
 class Term:
-    """A function at points whose entries are z[columns], columns (K, width), and the rows that its values go into."""
+    """A function at points z[columns], columns (K, width), and the rows to which its values contribute."""
 
     def __init__(self, function: PointFunction, columns: Indices, time_at: int | None, time: float):
         self.function, self.columns, self.time_at, self.time = function, columns, time_at, time
         self._entries: dict[bool, list[Any]] = {False: [], True: []}
 
     def weigh(self, rows: Any, places: Any, weights: Any, *, by_time: bool = False) -> None:
-        """Add to `rows` what `weights` make of the values at `places`, counted point by point; times the duration."""
+        """Add `weights` times the values at flat `places` (point by point) to `rows`, `by_time` times the duration."""
         timed = by_time and self.time_at is not None
         weights = weights * self.time if by_time and not timed else weights
         self._entries[timed].append([a.ravel() for a in np.broadcast_arrays(rows, places, weights)])
 
     def matrix(self, count: int, *, by_time: bool) -> Any:
-        """(1 + count, K m) the weights, row 0 those of the cost; None where there are none."""
+        """Return the weights (1 + count, K m), with the cost in row 0, or None if there are none."""
         if not self._entries[by_time]:
             return None
         rows, places, weights = (np.concatenate(parts) for parts in zip(*self._entries[by_time], strict=True))
@@ -105,11 +105,11 @@ class Term:
 
 
 class BlockProgram:
-    """A program that grows by `add`, `add_rows` and `add_linear` until it is first evaluated; see the module.
+    """A program that is built by `add`, `add_rows` and `add_linear` before its first evaluation; see the module.
 
-    An error of the kinds `backs_off` makes an evaluation NaN, from which a search backs off: `refusals` counts them and
-    `refusal` is the last. The first other one is `error`, which ends the search. `why_not` says why there is no
-    Hessian, and `linearized` what that leaves out.
+    An error of a type in `backs_off` makes an evaluation NaN, and the search shortens its step. `refusals` counts such
+    errors, and `refusal` is the last one. The first other error is `error`, which ends the search. `why_not` states why
+    there is no Hessian, and `linearized` what the Hessian omits.
     """
 
     why_not = ""
@@ -125,15 +125,15 @@ class BlockProgram:
         self._sides: list[tuple[Array, Array]] = []
         self._linear: list[Any] = []
         self._at, self._known = b"", dict[str, Any]()
-        self._callbacks: list[Any] = []  # CasADi holds no reference to its callbacks
+        self._callbacks: list[Any] = []  # CasADi does not reference its callbacks
 
     def add(self, function: PointFunction, columns: Indices, time_at: int | None = None, time: float = 1.0) -> Term:
-        """A function at points of z; `time_at` is where in z the duration is that `by_time` multiplies with."""
+        """Add a function at points of z. `time_at` is the index in z of the duration that `by_time` multiplies with."""
         self.terms.append(Term(function, np.asarray(columns), time_at, time))
         return self.terms[-1]
 
     def add_rows(self, lower: Array, upper: Array) -> Indices:
-        """The numbers of new rows."""
+        """Add rows and return their indices."""
         first = sum(len(side) for side, _ in self._sides)
         self._sides.append((lower, upper))
         return np.arange(first, first + len(lower))
@@ -144,7 +144,7 @@ class BlockProgram:
 
     @cached_property
     def sides(self) -> tuple[Array, Array]:
-        """(lower, upper) of the rows."""
+        """The bounds (lower, upper) of the rows."""
         lower, upper = zip(*self._sides, strict=True) if self._sides else ((np.zeros(0),), (np.zeros(0),))
         return np.concatenate(lower), np.concatenate(upper)
 
@@ -161,7 +161,7 @@ class BlockProgram:
         return rows[nonzero] + 1, columns[nonzero], weights[nonzero]
 
     def _once(self, z: Array, name: str, make: Callable[[Term, Array], Array]) -> list[Array]:
-        """What `make` gives of each term at its points, computed once for each z."""
+        """Return `make` of each term at its points, computed once for each z."""
         key = z.tobytes()
         if key != self._at:
             self._at, self._known = key, {}
@@ -177,7 +177,7 @@ class BlockProgram:
         return self._once(z, "slopes", lambda term, points: np.asarray(term.function.jacobian(points)))
 
     def evaluate(self, z: Array) -> tuple[float, Array]:
-        """The cost and the rows (m,) at z (n,)."""
+        """Return the cost and the rows (m,) at z (n,)."""
         rows, columns, weights = self._of_linear
         total = np.bincount(rows, weights * z[columns], 1 + len(self.sides[0])).astype(float, copy=False)
         for term, (plain, timed), values in zip(self.terms, self._weights, self._values(z), strict=True):
@@ -188,15 +188,15 @@ class BlockProgram:
         return float(total[0]), total[1:]
 
     def gradient(self, z: Array) -> tuple[float, Array]:
-        """The cost and its gradient (n,)."""
+        """Return the cost and its gradient (n,)."""
         return self.evaluate(z)[0], self._jacobian_at[0] @ self._jacobian_parts(z)
 
     def jacobian(self, z: Array) -> Array:
-        """The nonzeros of the rows' Jacobian, where `jac_g` of `derivatives` has them."""
+        """Return the nonzeros of the rows' Jacobian, in the order of `jac_g` of `derivatives`."""
         return np.asarray(self._jacobian_at[1].matrix @ self._jacobian_parts(z))
 
     def _jacobian_parts(self, z: Array) -> Array:
-        """What the entries of the Jacobian are sums of: 1, and for each term what it adds to it."""
+        """Return the summands of the Jacobian's entries: 1, and the contributions of each term."""
         parts = [np.ones(1)]
         of_terms = zip(self.terms, self._weights, self._values(z), self._slopes(z), strict=True)
         for term, (plain, timed), values, slopes in of_terms:
@@ -206,7 +206,7 @@ class BlockProgram:
 
     @cached_property
     def _jacobian_at(self) -> tuple[Any, "_Sums"]:
-        """Of the gradient and of the Jacobian."""
+        """The maps from the summands to the gradient and to the Jacobian."""
         rows, columns, weights = self._of_linear
         entries, first = [(rows, columns, weights, np.zeros(len(rows), dtype=int))], 1
         for term, (plain, timed) in zip(self.terms, self._weights, strict=True):
@@ -231,7 +231,7 @@ class BlockProgram:
         return gradient, _Sums(rows[others] - 1, columns[others], weights[others], sources[others], first, shape)
 
     def hessian(self, z: Array, sigma: float, multipliers: Array) -> Array:
-        """The nonzeros of the upper triangle of d^2 (sigma f + multipliers' g) / dz^2."""
+        """Return the nonzeros of the upper triangle of d^2 (sigma f + multipliers' g) / dz^2."""
         pushed, parts = np.concatenate([[sigma], multipliers]), []
         for term, (plain, timed), slopes in zip(self.terms, self._weights, self._slopes(z), strict=True):
             f, shape = term.function, (len(term.columns), term.function.rows)
@@ -256,13 +256,13 @@ class BlockProgram:
         return _Sums(rows, columns, np.ones(count), np.arange(count), count, (self.size, self.size))
 
     def spans(self, z: Array) -> Array:
-        """(n,) how far the variables may go from the guess z (n,)."""
+        """Return how far (n,) the variables may move from the guess z (n,)."""
         return np.ones(self.size)
 
     def scales_at(self, z: Array) -> Scales:
-        """Those of a search from z (n,): a row by its largest slope, the cost by its own change over the spans.
+        """Return the scales of a search from z (n,): each row's largest slope, and the cost's change over the spans.
 
-        None where all of them are near 1.
+        Returns UNSCALED if all scales are near 1.
         """
         spans, sparsity = self.spans(z), self._jacobian_at[1].sparsity
         try:
@@ -273,24 +273,24 @@ class BlockProgram:
         rows = np.zeros(len(self.sides[0]))
         np.maximum.at(rows, sparsity.row(), np.nan_to_num(slopes, posinf=0.0))
         changes = [abs(cost), float(np.nan_to_num(np.abs(gradient), posinf=0.0) @ spans)]
-        flat = rows <= FLAT * np.max(rows, initial=0.0)  # as the square of a velocity from rest
+        flat = rows <= FLAT * np.max(rows, initial=0.0)  # such as the square of a velocity at rest
         for beside in (z - TRIED * spans, z + TRIED * spans):
             with np.errstate(all="ignore"):
                 changes.append(abs(self.cost_at(beside) - cost) / TRIED)
                 try:
                     moved = np.abs(self.evaluate(beside)[1] - values) if np.any(flat) else values
-                except self.backs_off:  # it stays flat as far as is known
+                except self.backs_off:  # it counts as flat
                     continue
             rows = np.maximum(rows, np.where(flat, np.nan_to_num(moved, posinf=0.0), 0.0) / TRIED)
         largest = max((change for change in changes if np.isfinite(change)), default=0.0)
         sizes = np.max(np.abs(np.nan_to_num([values, *self.sides], posinf=0.0, neginf=0.0)), axis=0)
-        rows = np.where(rows > ROUNDING * sizes, rows, sizes)  # a row that changes by rounding alone is a constant
-        rows, largest = np.where(rows > 1e-150, rows, 1.0), largest or 1.0  # whose products do not overflow
+        rows = np.where(rows > ROUNDING * sizes, rows, sizes)  # a row that only changes by rounding is constant
+        rows, largest = np.where(rows > 1e-150, rows, 1.0), largest or 1.0  # avoids overflow in products of scales
         every = np.concatenate([spans, rows, [largest]])
         return Scales(spans, rows, largest) if are_far_from_one(every) else UNSCALED
 
     def cost_at(self, z: Array) -> float:
-        """The cost alone at z (n,); NaN where a term has none there."""
+        """Return only the cost at z (n,), or NaN if a term cannot be evaluated."""
         rows, columns, weights = self._of_linear
         total = float(np.sum((weights * z[columns])[rows == 0]))
         for term, pair in zip(self.terms, self._weights, strict=True):
@@ -305,7 +305,7 @@ class BlockProgram:
         return total
 
     def nlp(self, scales: Scales) -> dict[str, Any]:
-        """x, f and g as CasADi's nlpsol takes them."""
+        """Return x, f and g for CasADi's nlpsol."""
         dense = [ca.Sparsity.dense(1, 1), ca.Sparsity.dense(len(self.sides[0]), 1)]
 
         def values(y: Array) -> tuple[float, Array]:
@@ -316,7 +316,7 @@ class BlockProgram:
         return {"x": self.z, "f": f, "g": g}
 
     def derivatives(self, exact: bool = True, scales: Scales | None = None) -> dict[str, Any]:
-        """CasADi Functions by the names of nlpsol's options, "hess_lag" only where `exact`; of the divided numbers."""
+        """Return CasADi Functions by nlpsol's option names, "hess_lag" only if `exact`, of numbers over `scales`."""
         by_variables, by_rows, by_cost = scales or Scales()
         columns = np.broadcast_to(by_variables, self.size)
         slopes = self._jacobian_at[1].sparsity
@@ -355,7 +355,7 @@ class BlockProgram:
 
 
 class _Sums:
-    """A sparse matrix, its nonzeros column by column `matrix` (nonzeros, sources) times a vector of sources."""
+    """A sparse matrix whose nonzeros, by columns, are `matrix` (nonzeros, sources) times a vector of sources."""
 
     def __init__(
         self, rows: Indices, columns: Indices, weights: Array, sources: Indices, count: int, shape: tuple[int, int]
@@ -368,7 +368,7 @@ class _Sums:
 
 
 class _Callback(ca.Callback):  # type: ignore[misc]
-    """A function of vectors, of which those without entries are left out; for errors see `BlockProgram`."""
+    """A function of vectors, without those that have no entries. For errors see `BlockProgram`."""
 
     def __init__(
         self, name: str, sizes: list[int], outputs: list[Any], evaluate: Callable[..., Any], owner: BlockProgram
@@ -393,7 +393,7 @@ class _Callback(ca.Callback):  # type: ignore[misc]
         return True
 
     def eval_buffer(self, arguments: Any, results: Any) -> int:
-        """1 where an error ends the search, which must not go through C++."""
+        """Return 1 if an error ends the search, because exceptions must not pass through C++."""
         given = [
             np.array(np.frombuffer(argument, float)) if size else np.zeros(0)
             for argument, size in zip(arguments, self.sizes, strict=True)
@@ -425,11 +425,11 @@ def solve_ipopt(
 ) -> NlpResult:
     """Solve `program` from `guess` (n,), with its `exact` Hessian or IPOPT's limited-memory one.
 
-    With `multipliers` the guess is taken for nearly optimal. `more` are options of nlpsol.
+    With `multipliers`, the guess is assumed to be nearly optimal. `more` are options of nlpsol.
 
-    `report` gets a line of progress a few times a second, with what `motions` makes of the iterate. Ctrl-C ends the
-    solve with the best iterate so far. An error that a function of the user's raised is raised again, but that of a
-    simulation or gradient is told.
+    `report` receives a line of progress a few times a second, with the `motions` of the iterate. Ctrl-C ends the solve
+    with the best iterate so far. An error raised by a user's function is raised again, except that errors of a
+    simulation or gradient are reported in the result.
     """
     options = OPTIONS | (WARM_START if multipliers else {}) | (more or {})
     options |= {
@@ -454,7 +454,7 @@ def solve_ipopt(
             return NlpResult(guess, Outcome.INTERRUPTED, f"stopped: {stopped}", ())
         by, lower, upper = scales.variables, *(side / scales.rows for side in program.sides)
         bounds = np.abs(np.concatenate([program.lower / by, program.upper / by]))
-        least = np.min(bounds[bounds > 0], initial=1.0)  # IPOPT moves bounds by 1e-8: much of a motor of 1e-4 N
+        least = np.min(bounds[bounds > 0], initial=1.0)  # IPOPT relaxes bounds by 1e-8, much for a motor of 1e-4 N
         options = {"ipopt.bound_relax_factor": min(1e-8, RELAXED * least)} | options
         solver = ca.nlpsol("solver", "ipopt", program.nlp(scales), options)
         known = {}
@@ -493,7 +493,7 @@ def solve_ipopt(
 
 
 def _stationarity(program: BlockProgram, derivatives: Any, solution: Any, scales: Scales) -> float:
-    """What IPOPT's multipliers leave of the Lagrangian's gradient, those of what does not hold the plan left out."""
+    """Return the Lagrangian's gradient with IPOPT's multipliers of active bounds and rows, over its largest term."""
     z, slope = solution["x"], ca.DM(derivatives["grad_f"](solution["x"], [])[1])
     rows, jacobian = derivatives["jac_g"](z, [])
     of_rows, of_variables = (
@@ -510,13 +510,13 @@ def _stationarity(program: BlockProgram, derivatives: Any, solution: Any, scales
 
 
 def _holding(multipliers: Array, values: Array, lower: Array, upper: Array) -> Array:
-    """The multipliers (m,), of numbers of size 1, of what lies on the side that they push from, 0 of all others."""
+    """Return the multipliers (m,), for numbers of size 1, on the active side of a bound, and 0 for others."""
     on_lower, on_upper = values <= lower + FEASIBILITY_TOLERANCE, values >= upper - FEASIBILITY_TOLERANCE
     return np.where(on_upper, np.maximum(multipliers, 0.0), 0.0) + np.where(on_lower, np.minimum(multipliers, 0.0), 0.0)
 
 
 class _IterateCallback(ca.Callback):  # type: ignore[misc]
-    """Called by the solver at every iterate: reports, keeps the best, says when to stop."""
+    """The solver's callback at every iterate. It reports, stores the best iterate, and stops the solver."""
 
     def __init__(
         self,
@@ -560,9 +560,9 @@ class _IterateCallback(ca.Callback):  # type: ignore[misc]
                 self.report.row(row, lambda: self.motions(x), printed=due)
             self.iterates += 1
             before, self.called = self.called, now()
-            if self.iterates > 2:  # the next one takes as long as the last, but for the first, which begins the solver
+            if self.iterates > 2:  # the next one takes as long as the last, except after the first, which starts IPOPT
                 check_time(ahead=self.called - before)
-        except Exception as error:  # of `report`; must not go through C++, the solve raises it
+        except Exception as error:  # from `report`; must not pass through C++, and is raised after the solve
             self.error = error
         stop = self.watch.stopped_by is not None or self.error is not None or self.program.error is not None
         np.frombuffer(results[0], float)[:] = float(stop)

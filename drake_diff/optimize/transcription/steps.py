@@ -1,12 +1,12 @@
-"""Shooting: a plan by Drake's own steps as a sparse program, z = [x_0, u_0, x_1, u_1, ..., x_N, parameters].
+"""Shooting: a plan in Drake's own steps as a sparse program, z = [x_0, u_0, x_1, u_1, ..., x_N, parameters].
 
     g = x_(k+1) - f(x_k, u_k, p),    d^2 (lambda' g) = -sum_k lambda_k' d^2 f
 
-Every state is a variable and every step a row, so that what a late input does need not be seen through all the steps
-before it (Bock and Plitt, "A multiple shooting algorithm for direct solution of optimal control problems", 1984, with a
-step to a segment). First derivatives are those of the steps, exact. Second ones are by blocks, as no two states are in
-one step's Jacobian but the first and the last of it: known, or central differences of the Jacobians, or learned from
-iteration to iteration. The same program says what is an optimum of plans by iLQR and by shooting alike.
+Every state is a variable and every step a row, so that the effect of a late input does not pass through all earlier
+steps (Bock and Plitt, "A multiple shooting algorithm for direct solution of optimal control problems", 1984, with one
+step per segment). First derivatives are the exact derivatives of the steps. Second derivatives are blocks, because a
+step's Jacobian contains only its first and last state: they are analytic, or central differences of the Jacobians, or
+learned over iterations. The same program defines the optimum for plans by iLQR and by shooting.
 """
 
 from collections.abc import Sequence
@@ -40,15 +40,15 @@ from drake_diff.optimize.program import Iterate, Iteration, Limits, Multipliers,
 from drake_diff.optimize.transcription.expressions import joined_function
 from drake_diff.optimize.transcription.program import COST, BlockProgram, solve_ipopt
 
-ROUGH_DIFFERENCE = 1e-4  # of Jacobians that are differences themselves
+ROUGH_DIFFERENCE = 1e-4  # for Jacobians that are differences themselves
 ROUGH = "finite_difference"
 CHEAP = {
     "analytic",
     "implicit",
-}  # of all steps in one call: second derivatives by differences cost less than iterations
-SMALLEST_MOVE, SAFE_DIVISOR = 1e-7, 1e-6  # where symmetric rank one is not defined, or of rounding
-WITHIN = {"ipopt.bound_relax_factor": 0.0}  # beyond a limit the plant cuts inputs off
-SAME_MOTION = 1e-8  # of a state's range: a rollout that stays so near to the states of a program is its motion
+}  # methods with one call for all steps: differences for second derivatives cost less than iterations
+SMALLEST_MOVE, SAFE_DIVISOR = 1e-7, 1e-6  # least step and relative divisor of a symmetric rank one update
+WITHIN = {"ipopt.bound_relax_factor": 0.0}  # the plant clips inputs beyond a limit
+SAME_MOTION = 1e-8  # of a state's range: a rollout within this distance of a program's states is the same motion
 
 
 def solve_shooting(
@@ -61,13 +61,13 @@ def solve_shooting(
     values: Array | None = None,
     multipliers: Multipliers | None = None,
 ) -> tuple[NlpResult, Array, Array]:
-    """Solve `problem` from the guess xs (N+1, nx), us (N, nu), a rollout or not; gives (result, xs, us).
+    """Solve `problem` from the guess xs (N+1, nx), us (N, nu), a rollout or not. Return (result, xs, us).
 
     The search starts from the parameters `values` (np,), by default those of the problem's `design`, and from
-    `multipliers`, those of a similar search. The states are the rollout of the inputs where that stays at those of the
-    program, and else these themselves, which steps lead from to within the tolerance: an unstable motion leaves them
-    open loop. A point that cannot be stepped or differentiated is a step that was too long, which the message counts;
-    raises GradientError or SimulationError if the guess is such a point.
+    `multipliers` of a similar search. The returned states are the rollout of the inputs if it agrees with the program's
+    states. Otherwise they are the program's states, which satisfy the steps within the tolerance, because an unstable
+    motion deviates from them open loop. If a point cannot be simulated or differentiated, the step is shortened, and
+    the message counts such points. Raises GradientError or SimulationError if the guess is such a point.
     """
     program = StepProgram(problem, lenient=True)
     guess = np.clip(program.pack(xs, us, values), program.lower, program.upper)
@@ -102,10 +102,10 @@ def solve_shooting(
 
 
 class StepProgram(BlockProgram):
-    """The program of a `Problem` whose model takes discrete steps.
+    """The program of a `Problem` with a model in discrete steps.
 
-    `states_at` (N+1, nx), `inputs_at` (N, nu) and `parameters_at` (np,) say where in z they are. If `lenient`, the
-    Hessian goes without the steps' curvature where a point beside z cannot be stepped or differentiated.
+    `states_at` (N+1, nx), `inputs_at` (N, nu) and `parameters_at` (np,) are their indices in z. If `lenient`, the
+    Hessian omits the steps' curvature if a point near z cannot be simulated or differentiated.
     """
 
     backs_off = (GradientError, SimulationError)
@@ -144,7 +144,7 @@ class StepProgram(BlockProgram):
         running, final = (stage.cost for stage in costs_of(problem, probe[:, :nx], probe[:, nx:]).stages)
         times = h * np.arange(len(knots) + 1.0)
         term = self.add(_KnownCost(running, knots.shape[1], times[:-1]), knots, self.horizon_at, h)
-        unit = self.horizon_unit / len(knots) if design.moves_step else 1.0  # of a step's length, which is linear in c
+        unit = self.horizon_unit / len(knots) if design.moves_step else 1.0  # for a step's length, linear in c
         term.weigh(COST, np.arange(len(knots)), unit, by_time=True)
         self.add(_KnownCost(final, nx, times[-1:]), self.states_at[-1:]).weigh(COST, 0, 1.0)
         if problem.trajectory_cost is not None:
@@ -155,7 +155,7 @@ class StepProgram(BlockProgram):
             self.add(self._parameter_cost(), self.parameters_at[None]).weigh(COST, 0, 1.0)
 
     def _whole_motion(self, width: int) -> Called:
-        """`trajectory_cost` of all states and inputs."""
+        """Return the function `trajectory_cost` of all states and inputs."""
         cost: Any = self.problem.trajectory_cost
 
         def motion(points: Array) -> tuple[Array, Array]:
@@ -169,7 +169,7 @@ class StepProgram(BlockProgram):
         return Called(self.why_not, lambda z: np.array([[float(cost(*motion(z)))]]), linearize, 1, width)
 
     def _parameter_cost(self) -> Called:
-        """`parameter_cost` of the coordinates."""
+        """Return `parameter_cost` as a function of the coordinates."""
         cost: Any = self.problem.parameter_cost
 
         def linearize(points: Array) -> tuple[Array, Array]:
@@ -185,7 +185,7 @@ class StepProgram(BlockProgram):
 
     @property
     def horizon_at(self) -> int | None:
-        """Where the coordinate of a step's length is, in `horizon_unit`s [s] of all steps."""
+        """The index in z of the step length's coordinate, in units of `horizon_unit` [s] of all steps."""
         return self.size - 1 if self.design.moves_step else None
 
     @cached_property
@@ -198,7 +198,7 @@ class StepProgram(BlockProgram):
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """(n,) of the variables."""
+        """The names (n,) of the variables."""
         names = np.full(self.size, "", dtype=object)
         for positions, labels in (
             (self.states_at, self.problem.state_names),
@@ -210,22 +210,22 @@ class StepProgram(BlockProgram):
         return tuple(names)
 
     def pack(self, xs: Array, us: Array, values: Array | None = None) -> Array:
-        """z (n,) of xs (N+1, nx), us (N, nu) and the values of the problem's `design`, its own where None."""
+        """Return z (n,) from xs (N+1, nx), us (N, nu) and the values of the problem's `design`, by default its own."""
         z = np.empty(self.states_at.size + self.inputs_at.size + len(self.parameters_at))
         z[self.states_at], z[self.inputs_at] = xs, us
         z[self.parameters_at] = self.design.of_values(self.design.vector.values if values is None else values)
         return z
 
     def motion(self, z: Array) -> tuple[Array, Array, Array]:
-        """xs (N+1, nx), us (N, nu) and the values (np,) of the problem's `design` at z (n,)."""
+        """Return xs (N+1, nx), us (N, nu) and the values (np,) of the problem's `design` at z (n,)."""
         return z[self.states_at], z[self.inputs_at], self.design.values(z[self.parameters_at])
 
     def vector(self, z: Array) -> ParameterVector:
-        """The parameters of the steps at z (n,)."""
+        """Return the parameters of the steps at z (n,)."""
         return self.design.at(z[self.parameters_at])
 
     def spans(self, z: Array) -> Array:
-        """(n,) see `Problem.search_spans`, of coordinates 1."""
+        """Return the spans (n,) of `Problem.search_spans`, and 1 for coordinates."""
         xs, us, values = self.motion(z)
         along = self.steps.along(z[self.blocks])
         slopes = np.array([np.hstack([d.A - np.eye(len(d.A)), d.B]) for d in along]) / self.design.time_step(values)
@@ -235,13 +235,13 @@ class StepProgram(BlockProgram):
         return spans
 
     def require(self, z: Array) -> None:
-        """Raise GradientError or SimulationError where a step at z (n,) cannot be taken or differentiated."""
+        """Raise GradientError or SimulationError if a step at z (n,) cannot be simulated or differentiated."""
         self.steps.along(z[self.blocks])
 
     def optimum_at(self, z: Array, tolerance: float) -> NlpResult | None:
-        """z (n,) with multipliers of 0 if it keeps every row and the cost has no slope there; None else.
+        """Return z (n,) with multipliers of 0 if it satisfies every row and the cost has no slope, or else None.
 
-        An interior-point method would leave such a point for the middle of the bounds.
+        An interior point method would move such a point to the middle of the bounds.
         """
         cost, gradient = self.gradient(z)
         rows, (lower, upper) = self.evaluate(z)[1], self.sides
@@ -254,7 +254,7 @@ class StepProgram(BlockProgram):
         return NlpResult(z, Outcome.SOLVED, message, table, stationarity=0.0, multipliers=multipliers)
 
     def iterates(self, z: Array) -> tuple[Iterate, ...]:
-        """The motion at z, for callbacks."""
+        """Return the motion at z, for callbacks."""
         xs, us, values = self.motion(z)
         times = frozen(self.design.time_step(values) * np.arange(len(xs)))
         return (Iterate(self.problem, times, frozen(xs), frozen(us), self.vector(z), by_steps=True),)
@@ -267,7 +267,7 @@ class StepProgram(BlockProgram):
 
 
 class _KnownCost(PointFunction):
-    """A cost at the knots of known `times`."""
+    """A cost at knots with known `times`."""
 
     rows = 1
 
@@ -301,12 +301,12 @@ class Steps(PointFunction):
         )
         self.jacobian_at = np.repeat(np.arange(self.rows), self.width), np.tile(np.arange(self.width), self.rows)
         self.hessian_at = np.triu_indices(self.width)
-        self.methods: set[str] = set()  # where Jacobians came from
+        self.methods: set[str] = set()  # sources of the Jacobians
         self._kept: tuple[bytes, list[StepDerivatives]] = b"", []
-        self._last: tuple[Array, Array, Array] | None = None  # a point, its Jacobians, and the curvature learned so far
+        self._last: tuple[Array, Array, Array] | None = None  # a point, its Jacobians, and the learned curvature
 
     def along(self, points: Array) -> list[StepDerivatives]:
-        """The derivatives of the N steps, computed once; GradientError or SimulationError where one is refused."""
+        """Return the derivatives of the N steps, computed once. Raises GradientError or SimulationError."""
         if self._kept[0] != points.tobytes():
             self._kept = points.tobytes(), self._taken(points)
         return self._kept[1]
@@ -319,7 +319,7 @@ class Steps(PointFunction):
         return derivatives
 
     def _inputs(self, points: Array) -> Array:
-        """(N, nu) taken inside their bounds by rounding: beyond an actuator's limit the plant cuts an input off."""
+        """Return the inputs (N, nu), moved by rounding inside their bounds, beyond which the plant clips an input."""
         b, us = self.problem.bounds, points[:, self.rows : self.knot]
         us = np.where(us >= b.u_upper, np.nextafter(b.u_upper, b.u_lower), us)
         return np.where(us <= b.u_lower, np.nextafter(b.u_lower, b.u_upper), us)
@@ -331,12 +331,12 @@ class Steps(PointFunction):
         return self._dense(points[0], self.along(points)).reshape(len(points), -1)
 
     def _dense(self, point: Array, steps: Sequence[StepDerivatives]) -> Array:
-        """(N, nx, w) the Jacobians."""
+        """Return the Jacobians (N, nx, w)."""
         c = point[self.knot :]
         return np.array([np.hstack([d.A, d.B, self.design.pull_back(c, d.C)]) for d in steps])
 
     def hessian(self, points: Array, weights: Array, jacobian: Array) -> Array:
-        """Known where it can be, else differences of Jacobians, or learned where these are not cheap."""
+        """Return the analytic curvature if known, or differences of Jacobians, or a learned one if these are slow."""
         steps, xs, known = self.along(points), points[:, : self.rows], None
         if not self.design.vector.parameters and self.problem.has_model:
             ends = np.array([d.x_next for d in steps])
@@ -351,7 +351,7 @@ class Steps(PointFunction):
         return np.asarray(curvature[:, *self.hessian_at])
 
     def _learned(self, points: Array, jacobians: Array, weights: Array) -> Array:
-        """The same as far as the Jacobians at the points before tell, block by block, by symmetric rank one.
+        """Learn the curvature from the Jacobians at previous points, block by block, by symmetric rank one updates.
 
         Griewank and Toint, "Partitioned variable metric updates for large structured optimization problems", 1982.
         """
@@ -367,9 +367,9 @@ class Steps(PointFunction):
         return np.array(learned)
 
     def _differences(self, points: Array, weights: Array) -> Array:
-        """(N, w, w) the same by central differences of the Jacobians."""
+        """Return the curvature (N, w, w) by central differences of the Jacobians."""
         lower, upper = np.full(self.width, -np.inf), np.full(self.width, np.inf)
-        inputs = slice(self.rows, self.knot)  # beyond their bounds the plant may cut them off
+        inputs = slice(self.rows, self.knot)  # the plant may clip inputs beyond their bounds
         lower[inputs], upper[inputs] = self.problem.bounds.u_lower, self.problem.bounds.u_upper
         fraction = ROUGH_DIFFERENCE if ROUGH in self.methods else DIFFERENCE
         curvature = np.zeros((*points.shape, self.width))

@@ -1,18 +1,18 @@
-"""What a transcription solves, and the collocation schemes as tableaus.
+"""The optimal control problem of a transcription, and the collocation schemes as tableaus.
 
-Over an interval of length h with nodes 0 ... s (ends and, for Hermite-Simpson, the middle) they ask for
+Over an interval of length h with nodes 0 ... s (ends and, for Hermite-Simpson, the middle) the equations are
 
     sum_j states[i, j] x_j - h sum_j slopes[i, j] f(x_j, u_j) = 0,    cost = h sum_j weights[j] L(x_j, u_j),
 
-and their motion between nodes is x' the polynomial through f_j, u the polynomial through u_j (Betts, "Practical
-Methods for Optimal Control", ch. 4; Kelly, SIAM Review 59(4), 2017). Hermite-Simpson is in separated form: midpoint
-states are variables, so that bounds hold there too. Order: 2 and 4. "drake" is what Drake's DirectCollocation
-transcribes: Hermite-Simpson with the mean of its neighbours for the midpoint's input, and the cost by the trapezoid
-rule, which makes the optimum of order 2.
+Between nodes, x' is the polynomial through f_j and u the polynomial through u_j (Betts, "Practical Methods for Optimal
+Control", ch. 4; Kelly, SIAM Review 59(4), 2017). Hermite-Simpson is in separated form: midpoint states are variables
+with bounds. The orders are 2 and 4. "drake" is the transcription of Drake's DirectCollocation: Hermite-Simpson whose
+midpoint input is the mean of its neighbours, and the cost by the trapezoid rule, which reduces the order of the optimum
+to 2.
 
-A polynomial lies within the range of its Bernstein coefficients, so that bounds of these bound the whole motion:
-of a cubic the inner two are x_0 + h f_0 / 3 and x_1 - h f_1 / 3, of a parabola the inner one is x_0 + h f_0 / 2 or, by
-its values, 2 u_mid - (u_0 + u_1) / 2. Bounds of the nodes alone let an input between them be 1/8 above.
+A polynomial lies within the range of its Bernstein coefficients, so that bounds on these bound the whole motion. The
+inner two of a cubic are x_0 + h f_0 / 3 and x_1 - h f_1 / 3. The inner one of a parabola is x_0 + h f_0 / 2 or, from
+its values, 2 u_mid - (u_0 + u_1) / 2. Bounds on nodes alone allow an excess of 1/8 between them.
 """
 
 import copy
@@ -46,7 +46,7 @@ AtPlaces = Callable[[Array, Array], Array]  # knots (S, nx + nu) and times (S,) 
 
 @dataclass(frozen=True, eq=False)
 class Scheme:
-    """A tableau: rows of `states` and `slopes` (r, s+1), and the `basis` (s+1, d+1): polynomials in tau, 0 to 1.
+    """A tableau: rows of `states` and `slopes` (r, s+1), and the `basis` (s+1, d+1) of polynomials in tau, 0 to 1.
 
     The inner Bernstein coefficients of a state are hull_states @ x - h hull_slopes @ f, each (p, s+1).
     """
@@ -61,49 +61,49 @@ class Scheme:
 
     @property
     def nodes(self) -> int:
-        """s: nodes of an interval but the last, which is the next one's first."""
+        """The number s of an interval's nodes without the last, which is the first of the next interval."""
         return len(self.basis) - 1
 
     @cached_property
     def weights(self) -> Array:
-        """(s+1,) the quadrature of an interval of length 1."""
+        """The quadrature weights (s+1,) of an interval of length 1."""
         return np.array([0.5, 0, 0.5]) if self.input_is_linear else self.integrated(np.ones(1))[0]
 
     @cached_property
     def end_slopes(self) -> Array:
-        """(e, s+1) the weight of each node's value in the slope by tau at the ends of an interval: one of a line."""
+        """The weights (e, s+1) of nodes in the slope with respect to tau at an interval's ends, one for a line."""
         tau = np.array([0.0, 1.0] if self.basis.shape[1] > 2 else [0.0])
         powers = np.arange(1, self.basis.shape[1])
         return np.asarray(tau[:, None] ** (powers - 1) * powers @ self.basis[:, 1:].T)
 
     def at(self, tau: Array) -> Array:
-        """(S, s+1) the weight of each node's value at `tau` (S,) within an interval."""
+        """Return the weights (S, s+1) of the nodes' values at `tau` (S,) within an interval."""
         return np.asarray(tau[:, None] ** np.arange(self.basis.shape[1]) @ self.basis.T)
 
     def integrated(self, tau: Array) -> Array:
-        """(S, s+1) the integrals of `at` from 0 to `tau` (S,)."""
+        """Return the integrals (S, s+1) of `at` from 0 to `tau` (S,)."""
         powers = np.arange(1, self.basis.shape[1] + 1)
         return np.asarray(tau[:, None] ** powers / powers @ self.basis.T)
 
     def node_fractions(self, mesh: Array) -> Array:
-        """(K,) where the nodes of `mesh` (N+1,) lie, both from 0 to 1; K = s N + 1."""
+        """Return the places (K,) of the nodes of `mesh` (N+1,), both from 0 to 1, with K = s N + 1."""
         inner = np.arange(self.nodes) / self.nodes
         return np.append((mesh[:-1, None] + np.diff(mesh)[:, None] * inner).ravel(), 1.0)
 
     def node_weights(self, mesh: Array) -> Array:
-        """(K,) the weight of each node in the integral over a horizon of 1."""
+        """Return the weights (K,) of the nodes in the integral over a horizon of 1."""
         weights = np.zeros(self.nodes * (len(mesh) - 1) + 1)
         for k, h in enumerate(np.diff(mesh)):
             weights[self.nodes * k : self.nodes * (k + 1) + 1] += h * self.weights
         return weights
 
     def per_interval(self, nodes: Array) -> Array:
-        """(N, s+1, ...): the nodes (K, ...) of each interval; neighbours share one."""
+        """Return the nodes (K, ...) of each interval (N, s+1, ...), of which adjacent intervals share one."""
         starts = np.arange(0, len(nodes) - 1, self.nodes)
         return np.asarray(nodes[starts[:, None] + np.arange(self.nodes + 1)])
 
     def interval_defects(self, h: Array, xs: Array, fs: Array) -> Array:
-        """(N, r, nx) from lengths h (N,) [s], states xs and rates fs (N, s+1, nx); in the state's units."""
+        """Return residuals (N, r, nx) in states' units from lengths h (N,) [s], states xs and rates fs (N, s+1, nx)."""
         return np.asarray(self.states @ xs - h[:, None, None] * (self.slopes @ fs))
 
 
@@ -122,40 +122,40 @@ _TRAPEZOID = (
     np.array([[-0.5, 0]]),
 )
 _MAP = np.array([[0.0, 1]]), np.array([[1.0, 0]]), np.array([[1.0], [0]]), np.zeros((0, 2)), np.zeros((0, 2))
-MAP = "map"  # of a DiscreteMap: x_1 - f(x_0, u_0) = 0 with intervals of length 1, and inputs that are held
+MAP = "map"  # for a DiscreteMap: x_1 - f(x_0, u_0) = 0 with intervals of length 1 and constant inputs
 SCHEMES = {
     "hermite_simpson": Scheme(4, *_SIMPSON),
     "trapezoid": Scheme(2, *_TRAPEZOID),
     "drake": Scheme(2, *_SIMPSON, input_is_linear=True),
     MAP: Scheme(1, *_MAP),
 }
-INSIDE = 2e-8  # of a bound of parameters: twice what IPOPT relaxes it by, which must not make a mass negative
+INSIDE = 2e-8  # of a bound of parameters: twice IPOPT's relaxation, which must not make a mass negative
 DEFAULT_SCHEME = "hermite_simpson"
 
 
 def default_scheme(problem: Any) -> str:
-    """The scheme where none is asked for."""
+    """Return the default scheme."""
     return MAP if problem.is_map else DEFAULT_SCHEME
 
 
 class KnownRate:
-    """A ConstantCost or a QuadraticCost at many knots, as `Pointwise` gives those of any other function."""
+    """A ConstantCost or a QuadraticCost at many knots, with the methods of `Pointwise`."""
 
     def __init__(self, f: ConstantCost | QuadraticCost, nx: int):
         self.f, self.nx = f, nx
 
     def values(self, knots: Array) -> Array:
-        """(K, 1) at `knots` (K, nx + nu)."""
+        """Return the values (K, 1) at `knots` (K, nx + nu)."""
         return np.asarray(self.f(knots[:, : self.nx], knots[:, self.nx :]))[:, None]
 
     def linearize(self, knots: Array) -> tuple[Array, Array]:
-        """(K, 1) and the gradients (K, 1, nx + nu)."""
+        """Return the values (K, 1) and the gradients (K, 1, nx + nu)."""
         derivatives = [differentiate_cost(self.f, k[: self.nx], k[self.nx :]) for k in knots]
         return np.array([[v] for v, _, _ in derivatives]), np.array([[np.concatenate(g)] for _, *g in derivatives])
 
 
 class TimedRate:
-    """A TimedCost at many knots, of which the times are known."""
+    """A TimedCost at many knots with known times."""
 
     def __init__(self, cost: TimedCost, nx: int, nu: int, probe: Array):
         self.cost, self.width = cost, nx + nu
@@ -164,21 +164,21 @@ class TimedRate:
         self.inner = Pointwise("running_cost", self.f, nx, (), self.probe)
 
     def with_known(self, knots: Array, times: Array) -> Array:
-        """(K, nx + nu + p) `knots` (K, nx + nu) with what the cost needs to know at `times` (K,) [s]."""
+        """Return `knots` (K, nx + nu) with the cost's parameters at `times` (K,) [s], (K, nx + nu + p)."""
         return np.hstack([knots, self.cost.known_at(times)])
 
     def values(self, knots: Array) -> Array:
-        """(K, 1) at knots (K, nx + nu + p)."""
+        """Return the values (K, 1) at knots (K, nx + nu + p)."""
         return self.inner.values(knots)
 
     def linearize(self, knots: Array) -> tuple[Array, Array]:
-        """(K, 1) and the gradients (K, 1, nx + nu), by state and input alone."""
+        """Return the values (K, 1) and the gradients (K, 1, nx + nu) with respect to state and input only."""
         values, rows = self.inner.linearize(knots)
         return values, rows[:, :, : self.width]
 
 
 def values_of_many(form: Any, points: Array) -> Array:
-    """(S, r) a function at very many points: by its expression where it has one and does not take columns."""
+    """Return a function's values (S, r) at very many points, by an expression if it has one and takes no columns."""
     if not isinstance(form, Pointwise) or form.takes_columns:
         return np.asarray(form.values(points))
     from drake_diff.optimize.knots import Traced, trace  # loads CasADi
@@ -189,7 +189,7 @@ def values_of_many(form: Any, points: Array) -> Array:
 
 
 def constraint_form(c: Constraint, nx: int, probe: Array) -> Pointwise:
-    """What a constraint limits at knots [x, u]; `probe` (3, nx + nu) are some. GradientError where it has no slope."""
+    """Return a constraint's function of knots [x, u], checked at `probe` (3, nx + nu), or raise GradientError."""
     function: Any = c.function if c.takes_input else lambda x, u: c.function(x)
     size = len(c.lower)
     return Pointwise(
@@ -202,7 +202,7 @@ def constraint_form(c: Constraint, nx: int, probe: Array) -> Pointwise:
 
 
 def user_rate(problem: Problem, probe: Array) -> AtPlaces | None:
-    """See `OptimalControl.user_rate`; `probe` (3, nx + nu) are knots to try functions at."""
+    """Return `OptimalControl.user_rate`. `probe` (3, nx + nu) are knots to check functions at."""
     parts = [_tracking(cost, problem.nx) for cost in _parts_of(problem.total_running_cost) if _is_table(cost)]
     parts += [cost.values_of_many for cost in user_costs(problem, probe)]
     return None if not parts else lambda knots, times: np.asarray(sum(term(knots, times) for term in parts))
@@ -218,23 +218,23 @@ def _tracking(cost: TrackingCost, nx: int) -> AtPlaces:
 
 @dataclass(frozen=True, eq=False)
 class UserCost:
-    """A function of the user that is a part of the cost, "running" or "final", of knots [x, u] and times [s]."""
+    """A user's function that is a part of the "running" or "final" cost, of knots [x, u] and times [s]."""
 
     name: str
     form: Pointwise
-    points: Callable[[Array, Array], Array]  # what `form` takes of knots and times
+    points: Callable[[Array, Array], Array]  # the argument of `form` from knots and times
 
     def values(self, knots: Array, times: Array) -> Array:
-        """(K,) as the function is called."""
+        """Return the values (K,) by calls of the function."""
         return self.form.values(self.points(knots, times))[:, 0]
 
     def values_of_many(self, knots: Array, times: Array) -> Array:
-        """(K, 1) as `values_of_many`."""
+        """Return the values (K, 1) by `values_of_many`."""
         return values_of_many(self.form, self.points(knots, times))
 
 
 def user_costs(problem: Problem, probe: Array, *, final: bool = False) -> list[UserCost]:
-    """The functions of the user in the running cost and, where they are asked for, in the final cost."""
+    """Return the user's functions in the running cost and, if `final`, in the final cost."""
     nx, nu, costs = problem.nx, problem.nu, list[UserCost]()
     for cost in _parts_of(problem.total_running_cost):
         if isinstance(cost, TimedCost) and not _is_table(cost):
@@ -255,7 +255,7 @@ def _of_state(cost: Any) -> Callable[[Any, Any], Any]:
 
 
 def _parts_of(cost: Any) -> list[Any]:
-    """The terms of a running cost of which nothing is known."""
+    """Return the terms of a running cost whose form is unknown."""
     if isinstance(cost, SumOfCosts):
         return [leaf for term in cost.costs for leaf in _parts_of(term)]
     if isinstance(cost, WithGoals):
@@ -264,12 +264,12 @@ def _parts_of(cost: Any) -> list[Any]:
 
 
 class OptimalControl:
-    """What `problem` asks of a collocation scheme; ModelError where its model has no continuous form.
+    """The optimal control problem of `problem` in a scheme. Raises ModelError if its model has no continuous form.
 
-    `dynamics` are those at the parameters' own values; where they are optimized, `varied` are those that a program has,
-    of knots [x, u, c] with c (np,) the parameters' coordinates, and `parameter_cost` is one of knots [c].
+    `dynamics` have the parameters' own values. If these are optimized, a program uses `varied`, the dynamics at knots
+    [x, u, c] with c (np,) the parameters' coordinates, and `parameter_cost` is a cost of knots [c].
 
-    Raises InputError or GradientError where a cost is no function that can be differentiated.
+    Raises InputError or GradientError if a cost is not a differentiable function.
     """
 
     def __init__(self, problem: Problem, scheme: str):
@@ -297,47 +297,47 @@ class OptimalControl:
             self.rate = KnownRate(running, nx)
         else:
             self.rate = Pointwise("running_cost", running, nx, (), self.dynamics.probe())
-        self.final: Pointwise | None = None  # of knots [x, u], whose inputs have no part in it
+        self.final: Pointwise | None = None  # of knots [x, u], independent of the inputs
         if cost is not None:
             self.final = Pointwise("final_cost", lambda x, u: cost(x), nx, (), self.dynamics.probe())
 
     def moved(self, knots: Array, k: Indices) -> Array:
-        """(K, nx) what the dynamics say at `knots` (K, nx + nu) in the intervals `k` (K,): rates, or a map's states."""
+        """Return rates, or a map's states, (K, nx) at `knots` (K, nx + nu) in the intervals `k` (K,)."""
         dynamics = self.dynamics
         return dynamics.values(knots, k) if isinstance(dynamics, DiscreteMap) else dynamics.values(knots)
 
     def linearized(self, knots: Array, k: Indices) -> Array:
-        """(K, nx, nx + nu) the Jacobians of the same."""
+        """Return the Jacobians (K, nx, nx + nu) of `moved`."""
         dynamics = self.dynamics
         return (dynamics.linearize(knots, k) if isinstance(dynamics, DiscreteMap) else dynamics.linearize(knots))[1]
 
     def interval_of(self, count: int) -> Indices:
-        """(K,) the interval that each of `count` nodes begins or lies in; the last node is the last interval's."""
+        """Return the interval (K,) that each of `count` nodes starts or lies in, and the last one for the last node."""
         return np.minimum(np.arange(count) // self.scheme.nodes, (count - 1) // self.scheme.nodes - 1)
 
     def within(self, nodes: Array) -> Array:
-        """`nodes` (K, nx + nu), their inputs within bounds."""
+        """Clip the inputs of `nodes` (K, nx + nu) to their bounds."""
         nodes[:, self.dynamics.nx :] = np.clip(nodes[:, self.dynamics.nx :], self.bounds.u_lower, self.bounds.u_upper)
         return nodes
 
     @property
     def parameters(self) -> Array:
-        """(np,) the values of the problem's parameters that `dynamics` have."""
+        """The values (np,) of the problem's parameters in `dynamics`."""
         return self.dynamics.parameters.values
 
     def at(self, values: Array) -> "OptimalControl":
-        """The same with the parameters at `values` (np,)."""
+        """Return the same task with the parameter values `values` (np,)."""
         task = copy.copy(self)
         task.dynamics = self.dynamics.at(values)
         return task
 
     @property
     def coordinates(self) -> Array:
-        """(np,) those of `parameters` where they are optimized, else (0,)."""
+        """The coordinates (np,) of `parameters` if these are optimized, else (0,)."""
         return np.zeros(0) if self.varied is None else self.varied.coordinates.from_values(self.parameters)
 
     def coordinate_limits(self) -> tuple[Array, Array]:
-        """(lower, upper), each as `coordinates`."""
+        """Return the bounds (lower, upper) of `coordinates`."""
         if self.varied is None:
             return np.zeros(0), np.zeros(0)
         lower, upper = (self.varied.coordinates.from_values(side) for side in self.problem.bounds_of_parameters())
@@ -353,9 +353,9 @@ class OptimalControl:
 
     @cached_property
     def user_dynamics(self) -> AtPlaces | None:
-        """(S, nx) the rates at knots (S, nx + nu) and times (S,) [s]; None of equations that bend nowhere suddenly.
+        """The rates (S, nx) at knots (S, nx + nu) and times (S,) [s], or None for equations without sudden changes.
 
-        Those are a model's own, unless systems of its diagram exert forces.
+        A model's own equations have none, unless systems of its diagram exert forces.
         """
         form = self.dynamics.form
         if self.is_map or (not isinstance(form, Pointwise) and not getattr(form, "may_jump", True)):
@@ -364,21 +364,21 @@ class OptimalControl:
 
     @cached_property
     def user_rate(self) -> AtPlaces | None:
-        """(S, 1) what functions and tables of the user are of the running cost; None where there are none."""
+        """The part (S, 1) of the running cost from users' functions and tables, or None if there are none."""
         return None if self.is_map else user_rate(self.problem, self.dynamics.probe())
 
     def rates(self, knots: Array, times: Array) -> Array:
-        """(K,) the running cost at `knots` (K, nx + nu) and `times` (K,) [s]."""
+        """Return the running cost (K,) at `knots` (K, nx + nu) and `times` (K,) [s]."""
         with_known = self.rate.with_known(knots, times) if isinstance(self.rate, TimedRate) else knots
         return self.rate.values(with_known)[:, 0]
 
     @cached_property
     def couplings(self) -> tuple[BoundCoupling, ...]:
-        """The problem's, on its knots."""
+        """The problem's couplings on its knots."""
         return self.problem.coupled(input_at_end=not self.is_map)
 
     def nodes_of(self, constraint: Constraint, mesh: Array) -> Indices:
-        """The nodes of `mesh` (N+1,) where `constraint` holds: its knots, or all nodes but a given first one."""
+        """Return the nodes of `mesh` (N+1,) with `constraint`: its knots, or all nodes without a given first one."""
         knots = self.problem.knots_of(constraint, input_at_end=not self.is_map)
         if self.is_map:
             return np.array(knots)
@@ -388,12 +388,12 @@ class OptimalControl:
         return np.arange(nodes[0], nodes[-1] + 1) if constraint.whole else nodes
 
     def node_limits(self, mesh: Array) -> tuple[Array, Array]:
-        """(lower, upper), each (K, nx + nu): the bounds of the nodes, equal where an end or a waypoint is given."""
+        """Return the bounds (lower, upper) of the nodes, (K, nx + nu) each, equal for a given end or waypoint."""
         b, nx, count = self.bounds, self.dynamics.nx, len(self.scheme.node_fractions(mesh))
         sides = [np.tile(np.concatenate(s), (count, 1)) for s in ((b.x_lower, b.u_lower), (b.x_upper, b.u_upper))]
-        if self.scheme.input_is_linear:  # Drake bounds knots alone
+        if self.scheme.input_is_linear:  # Drake bounds only knots
             sides[0][1::2], sides[1][1::2] = -np.inf, np.inf
-        if self.is_map:  # there is no input after the last step
+        if self.is_map:  # no input after the last step
             sides[0][-1, nx:] = sides[1][-1, nx:] = np.clip(0.0, b.u_lower, b.u_upper)
         knots = self.nodes_at(range(self.problem.num_steps + 1), mesh)
         for side, states in zip(sides, self.problem.state_limits(), strict=True):
@@ -401,6 +401,6 @@ class OptimalControl:
         return sides[0], sides[1]
 
     def nodes_at(self, knots: Iterable[int], mesh: Array) -> Indices:
-        """The nodes that the problem's own `knots` are, which stay knots of a refined mesh."""
+        """Return the nodes of the problem's own `knots`, which remain knots of a refined mesh."""
         fractions = np.linspace(0, 1, self.problem.num_steps + 1)[list(knots)]
         return self.scheme.nodes * np.argmin(np.abs(mesh[None] - fractions[:, None]), axis=1)
