@@ -1,4 +1,4 @@
-"""Engines and recordings side by side, and why they differ."""
+"""Comparison of engines and recordings, and the causes of their differences."""
 
 from drake_diff._base import attach_stub as _attach_stub
 

@@ -1,9 +1,9 @@
-"""What each engine does, and which term makes two engines' steps differ: inertia, bias, actuation, damping, a law.
+"""Motions and Jacobians of engines, and attribution of the difference of two steps: inertia, bias, actuation, ...
 
-Jacobians are checked against differences of the engine's own steps: one that is not the derivative of its own step
-must not be used for gradients, whatever it agrees with. To attribute a difference both steps are written as Euler steps
-from the engines' own terms, one term of the other is put in at a time, and what that changes is the term's effect. A
-recording has no terms: its steps are tried as the reference's by another scheme; `dd.explain` seeks what else differs.
+Jacobians are checked against differences of the engine's own steps: a Jacobian that is not the derivative of its own
+step must not be used for gradients, even if it agrees with another engine. To attribute a difference, both steps are
+written as Euler steps with the engines' own terms. The effect of a term is the change when it is replaced by the other
+engine's. Recordings have no terms: other schemes of the reference are tried. `dd.explain` searches for other causes.
 """
 
 import json
@@ -36,35 +36,35 @@ BROKE_OFF = "broke off"
 
 @dataclass(frozen=True)
 class ComparisonOptions:
-    """How engines are timed, differenced and attributed."""
+    """Options for timing, differences and attribution."""
 
-    timed: int = 15  # calls whose median is told, after one that may compile
-    longest: float = 1.0  # [s] less are timed where they take so long
-    # An engine's derivative that is made of differences is good to 1e-8 of the row's largest entry, and the certificate
-    # allows a hundred times what it is told was left unsolved.
+    timed: int = 15  # timed calls whose median is reported, after a first call that may compile
+    longest: float = 1.0  # [s] total time after which fewer calls are timed
+    # Derivatives by finite differences are accurate to 1e-8 of the row's largest entry, and the certificate allows a
+    # hundred times the given solver tolerance.
     differences_leave: float = 1e-10
-    single: float = 1e-2  # of the largest entry: as far as differences of single precision tell
-    window: float = 2.0  # steps by which Drake's limits look ahead, at the joint's speed
-    pushed: float = 1e-3  # of the largest generalized force: below it are what solvers leave, 1e-6, and rounding
-    closes: float = 0.01  # of the gap may be left by a change that explains it
+    single: float = 1e-2  # relative to the largest entry: accuracy of differences in single precision
+    window: float = 2.0  # number of steps that Drake's limits look ahead, at the joint's speed
+    pushed: float = 1e-3  # relative to the largest generalized force: solver residuals (1e-6) and rounding are below
+    closes: float = 0.01  # fraction of the gap that may remain after a change that explains it
 
 
 COMPARE = ComparisonOptions()
 
-# Steps of differences for engines without derivatives: where rounding and truncation are both small.
+# Difference steps for engines without derivatives, chosen so that rounding and truncation errors are both small.
 DIFFERENCE_STEP: dict[Precision, float] = {"float64": 1e-5, "float32": 1e-2}
 AGREES = "agree"
-NO_DERIVATIVE = (NotOfferedError, GradientError, SimulationError)  # the last: shapes that AutoDiffXd refuses
+NO_DERIVATIVE = (NotOfferedError, GradientError, SimulationError)  # the last: shapes that AutoDiffXd does not support
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class EngineMotion:
-    """What one engine, or a recording, did. `status` is "ok", or what its solver said first, and when."""
+    """The motion of an engine or recording. `status` is "ok", or the first message of its solver, with the time."""
 
     times: Array  # (n,) [s]
     xs: Array  # (n, nx)
     us: Array  # (n - 1, nu)
-    energy: Array | None  # (n,) [J] kinetic and potential; None where it does not compute it
+    energy: Array | None  # (n,) [J] kinetic and potential; None if the engine does not compute it
     depth: Array | None  # (n,) [m] deepest overlap
     status: str
 
@@ -73,12 +73,12 @@ class EngineMotion:
 
     @property
     def energy_change(self) -> float | None:
-        """[J] from first to last state, inputs' work and damping included; None where there is no energy."""
+        """The change [J] from first to last state, including inputs' work and damping; None without energies."""
         return None if self.energy is None else float(self.energy[-1] - self.energy[0])
 
 
 def move(engine: Engine, x0: Array, us: Array) -> EngineMotion:
-    """The motion from `x0` (nx,) under `us` (N, nu), up to the first step that the engine cannot take."""
+    """Simulate from `x0` (nx,) under `us` (N, nu), up to the first step that the engine cannot take."""
     h, xs, status = engine.contract.time_step, [x0], "ok"
     for k, u in enumerate(us):
         try:
@@ -92,7 +92,7 @@ def move(engine: Engine, x0: Array, us: Array) -> EngineMotion:
 
 
 def measured(engine: Engine, times: Array, xs: Array, us: Array, status: str = "ok") -> EngineMotion:
-    """The motion `xs` (n, nx) with the energies and overlaps that `engine` finds in it."""
+    """Return the motion `xs` (n, nx) with the energies and penetration depths that `engine` computes."""
 
     energy, depth = ([_offered_by(ask, x) for x in xs] for ask in (engine.energy, engine.contact_depth))
     energies, depths = (None if None in values else frozen(np.array(values)) for values in (energy, depth))
@@ -107,7 +107,7 @@ def _offered_by(ask: Callable[..., T], *arguments: Any) -> T | None:
 
 
 def seconds(call: Callable[[], Any]) -> float | None:
-    """The median time of `call`, its first run, which may compile, left out; None where there is none."""
+    """Return the median time of `call` without its first run, which may compile; None if it is not supported."""
     try:
         call()
     except NO_DERIVATIVE:
@@ -122,10 +122,10 @@ def seconds(call: Callable[[], Any]) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class JacobianAt:
-    """[A B] (2 nv, 2 nv + nu) of one engine's step at one state, on the tangent space.
+    """The Jacobian [A B] (2 nv, 2 nv + nu) of one engine's step at one state, on the tangent space.
 
-    `own` says whether it is the derivative of the engine's own step: the certificate's verdict, in single precision
-    "agree" or "undecided"; None where it is made of differences.
+    `own` tells whether it is the derivative of the engine's own step. It is the certificate's verdict, or in single
+    precision "agree" or "undecided". It is None if the Jacobian is by differences.
     """
 
     state: str  # "start", "free", "contact", "deepest"
@@ -138,7 +138,7 @@ class JacobianAt:
 def jacobian_at(
     engine: Engine, space: TangentSpace, names: tuple[str, ...], state: str, x: Array, u: Array
 ) -> JacobianAt:
-    """The engine's Jacobian at `x` (nx,) and `u` (nu,), with the certificate; `names` (nu,) are the inputs'."""
+    """Return the engine's Jacobian at `x` (nx,) and `u` (nu,), with its certificate; `names` (nu,) are of inputs."""
     size, precision = space.size + len(u), engine.contract.precision
 
     def step(d: Array) -> Array:
@@ -159,7 +159,7 @@ def jacobian_at(
         return JacobianAt(
             state, frozen(jacobian), derivatives.method, AGREES if gap <= COMPARE.single else "undecided", None
         )
-    # What the engine's solver leaves unsolved of a step in contact, relative.
+    # The relative residual that the engine's solver leaves for a step in contact.
     unsolved = (engine.contract.solver_tolerance or 0.0) if engine.contact_depth(x) else 0.0
     by_differences = COMPARE.differences_leave if "differences" in derivatives.method else 0.0
     certificate = certify_displacement(
@@ -171,7 +171,7 @@ def jacobian_at(
 
 
 def rollout_jacobian(engine: Engine, space: TangentSpace, motion: EngineMotion) -> Array | Refusal:
-    """(size, size) d x_N / d x_0 along the engine's own motion; or why one of its steps has no derivative."""
+    """Return d x_N / d x_0 (size, size) along the engine's motion, or a Refusal if a step has no derivative."""
     product = np.eye(space.size)
     for x, u, x_next in zip(motion.xs, motion.us, motion.xs[1:], strict=False):
         try:
@@ -185,16 +185,16 @@ def rollout_jacobian(engine: Engine, space: TangentSpace, motion: EngineMotion) 
 
 
 INTEGRATOR, CONTACT_LAW, LIMIT_LAW, UNEXPLAINED = "integrator", "contact law", "limit law", "unexplained"
-# How well a scheme must give a step to be the engine's, relative to the state: rounding, and no force.
+# Relative tolerance within which a scheme must reproduce an engine's step: for rounding, but not for a force.
 FITS: dict[Precision, float] = {"float64": 1e-9, "float32": 1e-4}
 
 
 class EulerScheme(NamedTuple):
-    """How a step is taken from its terms; the first of each is Drake's."""
+    """A scheme of an Euler step; the defaults are Drake's."""
 
-    damping: str = "implicit"  # explicit: by v, not by v'
-    position: str = "v'"  # v: positions move with the velocity before the step
-    turn: str = "first term"  # exponential: of the rotation h w
+    damping: str = "implicit"  # or "explicit": with v instead of v'
+    position: str = "v'"  # or "v": positions use the velocity before the step
+    turn: str = "first term"  # or "exponential": of the rotation h w
 
     def __str__(self) -> str:
         return f"damping {self.damping}, positions by {self.position}, rotations by the {self.turn}"
@@ -206,22 +206,22 @@ SCHEMES = tuple(
 
 
 class Terms(NamedTuple):
-    """Of one engine at one state and input, in Drake's coordinates; the names are those of the effects."""
+    """The terms of one engine at one state and input, in Drake's coordinates; their names are those of the effects."""
 
     inertia: Array  # (nv, nv) M(q)
     bias: Array  # (nv,)
-    actuation: Array  # (nv,) B u, cut at the effort limits
+    actuation: Array  # (nv,) B u, with u clipped to the effort limits
     damping: Array  # (nv,)
     time_step: float
 
 
 @dataclass(frozen=True)
 class Attribution:
-    """`gap`: the largest difference of the two steps, quaternions of norm 1; `effects`: of each term, largest first.
+    """The cause of a difference: `gap` is the largest entry, with unit quaternions; `effects` are largest first.
 
-    `responsible` is the name of the largest effect, "" where the steps are the same. `assumed` is what an engine does
-    not offer, and is taken to be the other's. `as_if` is the scheme by which the reference takes the step of a
-    recording, "" where none does.
+    `responsible` is the name of the largest effect, or "" if the steps are equal. `assumed` lists the terms that an
+    engine does not offer, which are taken from the other. `as_if` is the scheme with which the reference reproduces
+    the step of a recording, or "".
     """
 
     gap: float
@@ -235,13 +235,13 @@ class Attribution:
 def attribute(
     coordinates: Coordinates, first: Engine, second: Engine, x: Array, u: Array, steps: tuple[Array, Array]
 ) -> Attribution:
-    """What makes the `steps` (nx,) that `first` and `second` took from `x` (nx,) under `u` (nu,) differ."""
+    """Attribute the difference of the `steps` (nx,) of `first` and `second` from `x` (nx,) under `u` (nu,)."""
     q, v = x[: coordinates.nq], x[coordinates.nq :]
     masses, no_mass = _offered((first, second), "M(q)", lambda engine: engine.mass_matrix(q), np.eye(len(v)))
     biases, no_bias = _offered((first, second), "bias(q, v)", lambda engine: engine.bias(q, v), np.zeros(len(v)))
     a, b = (
         Terms(
-            M,  # of a closed form the forces are what M makes of its accelerations
+            M,  # a closed form has no forces, so they are M times its accelerations
             *(engine.terms(M, x, u) if isinstance(engine, ClosedForm) else (bias, *forces(engine.contract, u))),
             engine.contract.time_step,
         )
@@ -253,7 +253,7 @@ def attribute(
         misfits = {scheme: _size(after - euler(coordinates, x, terms, scheme)) for scheme in SCHEMES}
         best = min(misfits, key=lambda scheme: misfits[scheme])
         fits = misfits[best] <= FITS[engine.contract.precision] * max(1.0, _size(after))
-        schemes.append(best if fits else SCHEMES[0])  # where none gives the step, something else is at work
+        schemes.append(best if fits else SCHEMES[0])  # if none fits, the cause is something else
     scheme_a, scheme_b = schemes
     base = euler(coordinates, x, a, scheme_a)
     effects = {
@@ -270,7 +270,7 @@ def attribute(
 
 
 def euler(coordinates: Coordinates, x: Array, terms: Terms, scheme: EulerScheme) -> Array:
-    """(nx,) the step from `x` with these terms, quaternions of norm 1."""
+    """Return the state (nx,) after a step from `x` with these terms, with unit quaternions."""
     q, v, h = x[: coordinates.nq], x[coordinates.nq :], terms.time_step
     implicit = terms.damping if scheme.damping == "implicit" else np.zeros(len(v))
     force = terms.actuation - terms.bias - (terms.damping - implicit) * v
@@ -284,7 +284,7 @@ def euler(coordinates: Coordinates, x: Array, terms: Terms, scheme: EulerScheme)
 
 
 def of_norm_one(coordinates: Coordinates, x: Array, near: Array) -> Array:
-    """`x` with quaternions of norm 1, of q and -q the one that is near that of the state `near`."""
+    """Return `x` with unit quaternions, with the sign that is closer to the state `near`."""
     x = np.array(x, dtype=float)
     for i, _ in coordinates.free:
         quaternion = x[i : i + 4] / np.linalg.norm(x[i : i + 4])
@@ -295,7 +295,7 @@ def of_norm_one(coordinates: Coordinates, x: Array, near: Array) -> Array:
 def _offered(
     engines: tuple[Engine, Engine], name: str, ask: Callable[[Engine], Array], otherwise: Array
 ) -> tuple[list[Array], list[str]]:
-    """What both say, and who says nothing: an engine that does not offer it gets the other's."""
+    """Return both engines' values and the missing ones; an engine that does not offer a value gets the other's."""
     answers = [_offered_by(ask, engine) for engine in engines]
     known = next((value for value in answers if value is not None), otherwise)
     missing = [f"{name} of {e.name}" for e, value in zip(engines, answers, strict=True) if value is None]
@@ -303,7 +303,7 @@ def _offered(
 
 
 def forces(contract: EngineContract, u: Array) -> tuple[Array, Array]:
-    """B u and the joints' damping, (nv,) each."""
+    """Return B u and the joints' damping, (nv,) each."""
     limits = np.array(contract.effort_limits)
     actuation = np.array(contract.actuation, dtype=float).reshape(len(contract.actuation), len(u))
     damping = [[0.0] * 6 if joint.kind == "quaternion_floating" else [joint.damping] for joint in contract.joints]
@@ -318,15 +318,15 @@ def what_is_left(
     steps: tuple[Array, Array],
     left: Array | None = None,
 ) -> str:
-    """What makes `steps` differ that no Euler step explains: a law that is at work, if any.
+    """Return the law (contact, limit, integrator) that explains a difference that no Euler step explains, if any.
 
-    `left` (nx,) is that difference, that of the steps where it is not given. A joint's limit pushes this joint alone,
-    and Drake's acts up to WINDOW steps ahead of it; what touches pushes all joints that it moves.
+    `left` (nx,) is the difference; by default, that of the steps. A joint limit acts on its joint alone, and Drake's
+    limit acts up to COMPARE.window steps ahead. Contact acts on all joints that move the bodies in contact.
     """
     after_a, after_b = (of_norm_one(coordinates, after, x) for after in steps)
     push = _push(coordinates, first, x, after_b - after_a if left is None else left, after_a)
     joints = _joints_near_limits(coordinates, (first, second), x, (after_a, after_b))
-    joints = joints if push <= joints else set()  # something pushes joints that are at no limit
+    joints = joints if push <= joints else set()  # a force acts on joints that are not at a limit
     if _touching((first, second), (x, *steps)) and not (push and joints and len(push) < coordinates.nv):
         return CONTACT_LAW
     if joints and (push or left is None):
@@ -335,7 +335,7 @@ def what_is_left(
 
 
 def _push(coordinates: Coordinates, engine: Engine, x: Array, left: Array, after: Array) -> set[int]:
-    """The velocities on which the force acts that changes the velocity by `left`; none where that is rounding."""
+    """Return the velocities on which the force of the velocity change `left` acts; none if it is rounding."""
     change = left[coordinates.nq :]
     if _size(change) <= FITS[engine.contract.precision] * max(1.0, _size(after)):
         return set()
@@ -352,7 +352,7 @@ def _touching(engines: tuple[Engine, Engine], states: tuple[Array, ...]) -> bool
 def _joints_near_limits(
     coordinates: Coordinates, engines: tuple[Engine, Engine], x: Array, after: tuple[Array, Array]
 ) -> set[int]:
-    """The velocities of the joints that pass a limit, or would within WINDOW steps at the largest of their speeds."""
+    """Return the velocities of joints that pass a limit, or would within COMPARE.window steps at their top speed."""
     velocities = set()
     for engine in engines:
         joints = [joint for joint in engine.contract.joints if joint.kind != "quaternion_floating"]
@@ -379,7 +379,7 @@ LAWS_OF_STEPS: Mapping[str, EulerScheme] = {
 
 
 def precision_of(recording: Recording) -> Precision:
-    """As the facts tell, else float64."""
+    """Return the precision in the recording's facts, else float64."""
     precision = recording.facts.get("precision", "float64")
     if precision not in PRECISIONS:
         raise InputError(f"recording {recording.name}: precision", got=precision, expected="float64 or float32")
@@ -387,7 +387,7 @@ def precision_of(recording: Recording) -> Precision:
 
 
 def told_lines(recording: Recording, reference: DrakeEngine) -> tuple[ContractLine, ...]:
-    """A line per quantity of a match: what no fact tells of is different, for that reason."""
+    """Return one line per quantity of a contract; a quantity without a fact is "different" because it is unknown."""
     ours, lines = reference.contract, []
     texts = {"integrator": ours.integrator, "contact law": ours.contact_law, "limit law": ours.limit_law}
     numbers = {"time step": (ours.time_step,), "gravity": ours.gravity}
@@ -424,7 +424,7 @@ def _numbers(recording: Recording, quantity: str, text: str, count: int) -> Arra
 
 
 def advanced(reference: DrakeEngine, x: Array, u: Array, count: int) -> Array:
-    """(nx,) `count` of the reference's steps after `x`."""
+    """Return the state (nx,) after `count` steps of the reference from `x`."""
     for _ in range(count):
         x = reference.step(x, u)
     return x
@@ -433,7 +433,7 @@ def advanced(reference: DrakeEngine, x: Array, u: Array, count: int) -> Array:
 def attribute_recorded(
     reference: DrakeEngine, x: Array, u: Array, count: int, after: Array, tolerance: float
 ) -> Attribution:
-    """What makes the recorded state `after` (nx,) differ from that which `count` steps of the reference lead to."""
+    """Attribute the difference of the recorded state `after` (nx,) from that after `count` reference steps."""
     coordinates = coordinates_of(reference.model)
     theirs, ours = (of_norm_one(coordinates, state, x) for state in (after, advanced(reference, x, u, count)))
     gap, schemes = float(np.abs(theirs - ours).max()), (SCHEMES[0], SCHEMES[0])
@@ -454,7 +454,7 @@ def attribute_recorded(
 
 
 def _stepped(reference: DrakeEngine, x: Array, u: Array, count: int, scheme: EulerScheme) -> Array:
-    """(nx,) where `count` Euler steps of the reference's terms lead by another scheme."""
+    """Return the state (nx,) after `count` Euler steps with the reference's terms and another scheme."""
     nq, contract = reference.model.nq, reference.contract
     actuation, damping = forces(contract, u)
     for _ in range(count):

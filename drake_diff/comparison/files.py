@@ -1,6 +1,6 @@
-"""A comparison saved: its record, a trace of every engine's motion, a replay with the engines as ghosts, a page.
+"""Files of a comparison: its record, a trace of every engine's motion, a replay with the engines as ghosts, and a page.
 
-With recordings, their arrays and the model file too, so that `verify` compares them and looks for their causes again.
+Recordings are saved as arrays together with the model file, so that `verify` can repeat the comparison and the causes.
 """
 
 import json
@@ -38,8 +38,8 @@ from drake_diff.runs.provenance import (
 )
 
 TRACE, REPLAY, PAGE, TEMPLATE = "trace.mcap", "replay.html", "comparison.html", "comparison.html.j2"
-MOTION = "motion"  # among the data: the name of what every engine was given
-# Of ghosts: the second and further colours of the page's plots, the first being the reference's.
+MOTION = "motion"  # name of the common first state and inputs, in the record's data
+# Colours of ghosts: those of the page's plots from the second on, as the first one is the reference's.
 COLOURS = (
     (0.85, 0.4, 0.04), (0.06, 0.54, 0.42), (0.64, 0.22, 0.61), (0.43, 0.42, 0), (0.32, 0.38, 0.43), (0.76, 0.09, 0.36),
     (0.48, 0.29, 0.07), (0.04, 0.38, 0.72),
@@ -53,20 +53,20 @@ def save_comparison(
 ) -> ComparisonRecord:
     """Write a comparison as a directory: record.json, trace.mcap, replay.html and comparison.html.
 
-    Recordings, where all of them take no more than 64 MiB, are kept in it, and with them the model file. All of it is
-    written beside `directory`, and takes its place at the end.
+    Recordings are also saved, together with the model file, if their total size is at most 64 MiB. The files are
+    written to a temporary directory, which replaces `directory` at the end.
 
     Args:
-        comparison: from `dd.compare`.
-        directory: where to write; an earlier run there is replaced.
-        causes: by the name of a recording, what `drake_diff.identification.cause_of` says of it.
+        comparison: the result of `dd.compare`.
+        directory: where to write; an earlier run is replaced.
+        causes: by the name of a recording, the result of `drake_diff.identification.cause_of`.
 
     Returns:
         The record in record.json, which `dd.verify` checks against the other files.
 
     Raises:
-        InputError: `directory` holds what no run wrote, or two recordings with causes have the same name.
-        WriteError: the disk is full, or does not let a file be written.
+        InputError: `directory` has files that are not from a run, or two recordings with causes have the same name.
+        WriteError: the disk is full, or a file cannot be written.
 
     Example:
         >>> import tempfile
@@ -83,7 +83,7 @@ def save_comparison(
 def write_comparison(
     comparison: Comparison, folder: Path, *, causes: Mapping[str, records.CauseEvidence] = NONE
 ) -> ComparisonRecord:
-    """Write what `save_comparison` does into `folder`, which `written_whole` gave."""
+    """Write the files of `save_comparison` into `folder`, which is from `written_whole`."""
     from drake_diff.pages.meshcat import write_replay
 
     names = [recording.name for recording in comparison.recordings]
@@ -100,7 +100,7 @@ def write_comparison(
 
 
 def _saved_recordings(comparison: Comparison) -> tuple[Recording, ...]:
-    """All recordings, or none where they are too large together."""
+    """Return all recordings, or none if their total size is too large."""
     return comparison.recordings if sum(map(size_of, comparison.recordings)) <= LARGEST else ()
 
 
@@ -117,7 +117,7 @@ def _keep(folder: Path, comparison: Comparison) -> None:
 def record_of(
     comparison: Comparison, name: str, causes: Mapping[str, records.CauseEvidence] = NONE
 ) -> ComparisonRecord:
-    """The record of `comparison`, but for the files."""
+    """Return the record of `comparison`, without the list of files."""
     fields = {
         "verdict": "pass" if comparison.holds else "fail",
         "sentence": str(comparison),
@@ -155,7 +155,7 @@ def _begun(name: str, model: Model) -> ComparisonRecord:
 
 
 def _data(comparison: Comparison, causes: Mapping[str, records.CauseEvidence]) -> DataBoundary:
-    """What all were given, and the recordings."""
+    """Return the data of the comparison: the common motion, and the recordings."""
     motion = _use(MOTION, "the first state and the inputs that every engine was given", comparison.x0, comparison.us)
     recordings = [
         _use(e.engine, f"a recording of {len(e.motion.xs)} states", e.motion.times, e.motion.xs, e.motion.us)
@@ -174,12 +174,12 @@ def _use(name: str, what: str, *arrays: Array) -> DataUse:
 
 
 def hash_of_arrays(*arrays: Array) -> str:
-    """The hash of their numbers, one after the other."""
+    """Return the hash of the arrays' numbers, concatenated."""
     return sha256(b"".join(np.asarray(array, dtype=float).tobytes() for array in arrays)).hexdigest()
 
 
 def row_of(e: Compared, cause: records.CauseEvidence | None) -> records.EngineEvidence:
-    """What the record says of an engine or a recording."""
+    """Return the record's entry for an engine or a recording."""
     same = ("engine", "version", "precision", "verdict", "sentence", "final_gap", "rollout_gap", "gradient")
     return records.EngineEvidence(
         **{name: getattr(e, name) for name in same}, contract=[records.LineEvidence(**vars(line)) for line in e.lines],
@@ -216,13 +216,13 @@ def _rows(matrix: Array) -> list[records.Numbers]:
 
 
 def write_comparison_trace(path: Path, comparison: Comparison) -> None:
-    """Write every engine's states, energy and overlap under a topic of its name, and all bodies' frames."""
+    """Write every engine's states, energy and penetration under a topic with its name, and all bodies' frames."""
     metadata = {"model": comparison.model.name, "time_axis": "simulated", "engines": ", ".join(slugs(comparison))}
     model, kind, channels = comparison.model, TYPES["Diagnostics"], []
     motions = dict(zip(slugs(comparison), (e.motion for e in comparison.engines), strict=True))
     contract = model.contract
     for slug, motion in motions.items():
-        topic, missing = f"/{slug}", np.full(len(motion.times), np.nan)  # where the engine does not compute it
+        topic, missing = f"/{slug}", np.full(len(motion.times), np.nan)  # if the engine does not compute it
         measures = [missing if values is None else values for values in (motion.energy, motion.depth)]
         rows = [
             (nanoseconds(t), kind.cls(energy_total=energy, max_penetration=depth))
@@ -234,7 +234,7 @@ def write_comparison_trace(path: Path, comparison: Comparison) -> None:
             Channel(f"{topic}/diagnostics", kind.cls, rows, {"units": kind.units}),
         ]
     times = comparison.reference.motion.times
-    # No frames of what was sampled otherwise.
+    # Motions with other sample times have no frames.
     alike = {s: m for s, m in motions.items() if np.allclose(m.times, times[: len(m.times)])}
     channels.append(transform_channel(model, times, {f"{s}/": m.xs for s, m in alike.items()}))
     write_mcap(path, channels, metadata, {})
@@ -254,12 +254,12 @@ def _scene(comparison: Comparison) -> Any:
     return replace(scene, ghosts=tuple(replace(ghost, framed=False) for ghost in scene.ghosts))
 
 
-SAME_TIME = 1e-6  # [s] clocks in single precision are within it
-MOST_PLOTS = 12  # of coordinates; those whose motions are furthest apart
+SAME_TIME = 1e-6  # [s] tolerance for clocks in single precision
+MOST_PLOTS = 12  # plots of the coordinates with the largest differences
 
 
 def write_comparison_page(path: Path, comparison: Comparison, record: ComparisonRecord, replay: Path) -> None:
-    """Write the page of `comparison` with its `record` and the page `replay`, which has the engines as ghosts."""
+    """Write the page of `comparison` with its `record` and the page `replay`, which shows the engines as ghosts."""
     write_page(
         path, TEMPLATE, record=_fields_of(record), data=comparison_data(comparison),
         view=replay.read_text(encoding="utf-8"), most_plots=MOST_PLOTS,
@@ -268,11 +268,11 @@ def write_comparison_page(path: Path, comparison: Comparison, record: Comparison
 
 def _fields_of(record: ComparisonRecord) -> dict[str, Any]:
     fields: dict[str, Any] = json.loads(canonical(record.model_dump(mode="json")))
-    return fields  # in the order in which the record is written
+    return fields  # in the order of the written record
 
 
 def made_of_record(folder: Path, record: ComparisonRecord) -> Reproduced:
-    """The sentence and the pages of a record, with the plots and the motion that those in `folder` have."""
+    """Regenerate the sentence and the pages of a record, with the plots and the motion of those in `folder`."""
     from drake_diff.pages.meshcat import replay_again
 
     sentence = {"sentence": sentence_of(record.engines)}
@@ -286,7 +286,7 @@ def made_of_record(folder: Path, record: ComparisonRecord) -> Reproduced:
 
 
 def comparison_data(comparison: Comparison) -> dict[str, Any]:
-    """What the page draws (see `page_data`), with the certificates that do not agree."""
+    """Return the data of the page's plots (see `page_data`), with the certificates that do not agree."""
     certificates = [j.certificate for e in comparison.engines for j in e.jacobians]
     doubtful = [c for c in certificates if c is not None and c.verdict != "agree"]
     plots = [*_gap_plots(comparison), *_measure_plots(comparison), *_coordinate_plots(comparison)]
@@ -294,9 +294,9 @@ def comparison_data(comparison: Comparison) -> dict[str, Any]:
 
 
 def _gap_plots(comparison: Comparison) -> Iterator[Plot]:
-    """Against Drake: where a gap arises, and what becomes of it."""
+    """Yield plots of the gap of each step from Drake's, and of the distance from Drake's motion."""
     ours = comparison.reference.motion
-    reference = Line("drake, the reference", np.full(len(ours.times), np.nan))  # keeps the colours of the other plots
+    reference = Line("drake, the reference", np.full(len(ours.times), np.nan))  # empty, keeps colours as in other plots
     steps, distances = [reference], [reference]
     for e in comparison.engines[1:]:
         steps.append(Line(e.engine, _on(ours.times, e.motion, np.append(e.step_gaps, np.nan))))
@@ -310,7 +310,7 @@ def _gap_plots(comparison: Comparison) -> Iterator[Plot]:
 
 
 def _measure_plots(comparison: Comparison) -> Iterator[Plot]:
-    """Energy and penetration, as each engine finds them."""
+    """Yield plots of the energy and penetration that each engine computes."""
     times, energies, depths = comparison.reference.motion.times, [], []
     for e in comparison.engines:
         if e.motion.energy is not None:
@@ -324,7 +324,7 @@ def _measure_plots(comparison: Comparison) -> Iterator[Plot]:
 
 
 def _coordinate_plots(comparison: Comparison) -> Iterator[Plot]:
-    """Those coordinates whose motions are furthest apart, in the order of the state."""
+    """Yield plots of the coordinates with the largest differences, in the order of the state."""
     model, times = comparison.model, comparison.reference.motion.times
     units = [c.unit for c in (*model.contract.positions, *model.contract.velocities)]
     motions = [[_on(times, e.motion, e.motion.xs[:, i]) for e in comparison.engines] for i in range(model.nx)]
@@ -335,7 +335,7 @@ def _coordinate_plots(comparison: Comparison) -> Iterator[Plot]:
 
 
 def _on(times: Array, motion: EngineMotion, values: Array) -> Array:
-    """`values` (n,) of a motion at `times`, NaN where it has none."""
+    """Return `values` (n,) of a motion at `times`, NaN where it has no sample."""
     sampled = np.full(len(times), np.nan)
     indices = np.searchsorted(times, motion.times - SAME_TIME)
     known = (indices < len(times)) & (np.abs(times[np.minimum(indices, len(times) - 1)] - motion.times) < SAME_TIME)

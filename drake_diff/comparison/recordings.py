@@ -1,10 +1,10 @@
-"""Recorded motions of a model: read from CSV, MCAP and ROS 2 messages, checked, and saved as arrays in a run.
+"""Recorded motions of a model: reading from CSV, MCAP and ROS 2 messages, checks, and storage as arrays in a run.
 
-Of ROS 2 messages, in a bag or in one MCAP file, the time is that of their headers. sensor_msgs/JointState
-(/joint_states, or the only one) has joints by name, efforts being their actuators' inputs; nav_msgs/Odometry, or
-geometry_msgs/PoseStamped and TwistStamped, a free body each. Of several bodies the messages are told apart by the
-frame of the body, or by the body's name in that of the topic. A bag cut short is refused; another byte is noticed only
-where the writer left a checksum, which rosbags does not.
+ROS 2 messages, in a bag or in one MCAP file, have the time of their headers. sensor_msgs/JointState (/joint_states, or
+the only topic of this type) gives joints by name, with efforts as the inputs of their actuators. nav_msgs/Odometry, or
+geometry_msgs/PoseStamped and TwistStamped, give one free body. With several bodies, a message belongs to the body
+of its frame, or to the body whose name is part of the topic's name. A truncated bag is refused. A changed byte is
+detected only if the writer added a checksum, which rosbags does not.
 """
 
 import csv
@@ -36,16 +36,16 @@ from drake_diff.model.tangent import tangent_space
 
 JOINTS, ODOMETRY = "sensor_msgs/msg/JointState", "nav_msgs/msg/Odometry"
 POSE, TWIST = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TwistStamped"
-ROS2 = "cdr"  # how its messages are encoded
+ROS2 = "cdr"  # encoding of ROS 2 messages
 USED = (JOINTS, ODOMETRY, POSE, TWIST)
 Stamped = dict[int, Any]  # messages by time [ns]
-Source = tuple[str, str]  # a topic, and the frame of the body that its messages are of, empty where they say none
+Source = tuple[str, str]  # a topic, and the body frame in its messages, or "" if they have none
 
 
 def read_ros2(path: Path, model: Model) -> tuple[tuple[Array, Array, Array], Mapping[str, str]]:
-    """(times (n,) from 0, xs (n, nx), us (n - 1, nu)), and the metadata record "contract" of an MCAP file.
+    """Return (times (n,) from 0, xs (n, nx), us (n - 1, nu)), and the metadata record "contract" of an MCAP file.
 
-    InputError, naming message and time, where a joint, a twist or an effort is missing.
+    Raises InputError that names message and time if a joint, a twist or an effort is missing.
     """
     try:
         from rosbags.typesys import Stores, get_typestore
@@ -68,7 +68,7 @@ def _frame_of_body(kind: str, message: Any) -> str:
 
 
 def _messages(path: Path) -> tuple[list[tuple[str, str, bytes]], Mapping[str, str]]:
-    """Topic, type and bytes of what is used, and the metadata record "contract" of an MCAP file."""
+    """Return topic, type and bytes of the messages used, and the metadata record "contract" of an MCAP file."""
     from rosbags.rosbag2 import Reader
 
     files, rows, facts = sorted(path.glob("*.mcap")) if path.is_dir() else [path], [], dict[str, str]()
@@ -81,7 +81,7 @@ def _messages(path: Path) -> tuple[list[tuple[str, str, bytes]], Mapping[str, st
     for file in path.glob("*.db3"):
         with closing(sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro", uri=True)) as base:
             (others,) = base.execute("SELECT count(*) FROM sqlite_master WHERE type IN ('view', 'trigger')").fetchone()
-        if others:  # which can stand for rows without end
+        if others:  # views and triggers can generate endless rows
             raise ArtifactError(f"{file}: expected tables of messages alone, got {others} views and triggers")
     with Reader(path) as bag:
         wanted = [c for c in bag.connections if c.msgtype in USED]
@@ -89,7 +89,7 @@ def _messages(path: Path) -> tuple[list[tuple[str, str, bytes]], Mapping[str, st
 
 
 class _Found:
-    """Messages by their kind and source, and where in a state what they say belongs."""
+    """Messages by type and source, and their conversion to states."""
 
     def __init__(self, path: str, model: Model):
         self.path, self.model, self.description = path, model, describe_whole(model)
@@ -123,14 +123,14 @@ class _Found:
         return np.array([time - stamps[0] for time in stamps]) / 1e9, xs, us
 
     def _places(self, link: Link) -> tuple[int, int]:
-        """Where q and v of a joint begin, in those of the model."""
+        """Return the first indices of a joint in q and v of the model."""
         coupling = self.model.coupling
         if coupling is None:
             return link.q_start, link.v_start
         return int(np.searchsorted(coupling.own_q, link.q_start)), int(np.searchsorted(coupling.own_v, link.v_start))
 
     def _common(self, parts: Mapping[str, Mapping[int, Any]]) -> list[int]:
-        """The times that all parts have; InputError for one that some lack."""
+        """Return the times of all parts. Raises InputError for a time that a part lacks."""
         every = sorted({time for messages in parts.values() for time in messages})
         for time in every:
             there = [name for name, messages in parts.items() if time in messages]
@@ -161,7 +161,7 @@ class _Found:
         return next(iter(sources.values()))
 
     def _of_body(self, kind: str, link: Link) -> Stamped:
-        """The messages of one free body, by their frame, else by the topic's name; of an only body the only ones."""
+        """Return the messages of a free body by their frame, else by topic name; an only body has the only messages."""
         names, sources = _names(link.body), self.sources[kind]
         by_frame = [source for source in sources if source[1].strip("/") in names]
         by_topic = [source for source in sources if any(f"/{name}/" in f"/{source[0].strip('/')}/" for name in names)]
@@ -194,7 +194,7 @@ class _Found:
 
 
 def _names(body: str) -> set[str]:
-    """How frames and topics may call a body: ROS has no :: in names."""
+    """Return the names that frames and topics may use for a body, as ROS names cannot contain "::"."""
     return {body, body.replace("::", "/"), body.replace("::", "_")}
 
 
@@ -204,36 +204,36 @@ def _listed(sources: Mapping[Source, Stamped]) -> str:
 
 
 def _base(pose: Any, twist: Any, in_body: bool) -> Array:
-    """(13,) q and v of the free body, in Drake's coordinates."""
+    """Return q and v (13,) of the free body, in Drake's coordinates."""
     p, r, w, v = pose.position, pose.orientation, twist.angular, twist.linear
     q = np.array([r.w, r.x, r.y, r.z, p.x, p.y, p.z])
     parts = np.array([[w.x, w.y, w.z], [v.x, v.y, v.z]])
     return np.concatenate([q, (parts @ rotation(q[:4]).T if in_body else parts).ravel()])
 
 
-# What may be told of the engine, numbers as JSON: the time step [s], gravity (3,) [m/s^2], seeds.
+# Allowed facts of an engine; numbers are JSON: the time step [s], gravity (3,) [m/s^2], seeds.
 FACTS = (
     "engine", "version", "precision", "time step", "integrator", "contact law", "limit law", "gravity",
     "seeds", "reset distribution",
 )  # fmt: skip
-NORM_TOLERANCE = 1e-3  # of a quaternion's norm: float32 and five printed digits are within it, another order is not
-CLOCK_TOLERANCE = 1e-3  # of a time step: printed times and nanoseconds are within it
+NORM_TOLERANCE = 1e-3  # of a quaternion's norm: allows float32 and five printed digits, but not another order
+CLOCK_TOLERANCE = 1e-3  # relative to a time step: allows printed times and nanoseconds
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Recording(ShowsItsRepr):
-    """A motion of a model that was recorded elsewhere, for `dd.compare`.
+    """A recorded motion of a model, for `dd.compare` and `dd.identify`.
 
     Args:
-        name: what the engine is called.
-        version: of the engine.
+        name: the name of the engine.
+        version: the version of the engine.
         times: (n,) [s], increasing, a whole number of the model's time steps apart.
         xs: (n, nx) states in Drake's coordinates.
-        us: (n - 1, nu) inputs, each held until the next time.
-        facts: what is known of the engine's contract, by quantity: "precision", "time step", "integrator",
+        us: (n - 1, nu) inputs, each constant until the next time.
+        facts: known facts of the engine's contract, by quantity: "precision", "time step", "integrator",
             "contact law", "limit law", "gravity", "seeds", "reset distribution".
-        outputs: what sensors read, for `dd.identify`: (n,) by column, BODY.position_x, BODY.gyro_x, BODY.accel_x (or y,
-            z) or JOINT.force; NaN is what was not measured.
+        outputs: sensor readings for `dd.identify`: (n,) by column, BODY.position_x, BODY.gyro_x, BODY.accel_x (or y,
+            z) or JOINT.force; NaN if not measured.
 
     Example:
         >>> fall = dd.Recording("lab", "1.0", times=[0, 0.01], xs=[[0, 0], [0, 0]], us=[[0]])
@@ -254,7 +254,7 @@ class Recording(ShowsItsRepr):
 
 
 def check_recording(recording: Recording, model: Model) -> None:
-    """Refuse what cannot be a motion of `model`: ShapeError, NonFiniteError, InputError, naming recording and row."""
+    """Raise ShapeError, NonFiniteError or InputError, with recording and row, if this is not a motion of `model`."""
     subject = f"recording {recording.name}"
     times = finite_array(f"{subject}: times", recording.times, ("n",))
     if len(times) < 2:
@@ -281,16 +281,16 @@ def check_recording(recording: Recording, model: Model) -> None:
 
 
 def check_sizes(subject: str, values: Array, names: Sequence[str]) -> None:
-    """InputError, naming sample and column, where one of `values` (n, len(names)) is beyond `LARGEST_NUMBER`."""
+    """Raise InputError, with sample and column, if any of `values` (n, len(names)) exceeds `LARGEST_NUMBER`."""
     for k, j in np.argwhere(np.abs(values) > LARGEST_NUMBER)[:1]:
         expected = f"at most {LARGEST_NUMBER:g} in magnitude"
         raise InputError(f"{subject}: {names[j]} at sample {k}", got=values[k, j], expected=expected)
 
 
 def steps_between(recording: Recording, time_step: float) -> int:
-    """How many steps of `time_step` [s] lie between samples. InputError where that is no whole number, always the same.
+    """Return the number of steps of `time_step` [s] between samples. Raises InputError if it is not a constant integer.
 
-    Both times of a sample may be off by the clock's rounding, a thousandth of a step.
+    Periods may be off by the clock's rounding, a thousandth of a step.
     """
     periods = np.diff(recording.times)
     count = max(1, round(float(periods[0]) / time_step))
@@ -306,10 +306,10 @@ def steps_between(recording: Recording, time_step: float) -> int:
 
 
 Motion = tuple[Array, Array, Array]  # times (n,) [s], xs (n, nx), us (n - 1, nu)
-LARGEST_NUMBER = 1e12  # of a recording, in any unit: of more, what is computed from squares and products overflows
+LARGEST_NUMBER = 1e12  # of a recording, in any unit: above, squares and products may overflow
 LONGEST_LINE = 2**20  # characters of a line of a CSV file
 MOST_NUMBERS = 2**25  # of a recording: 256 MiB
-BLOCK = 10_000  # rows that are read at once
+BLOCK = 10_000  # number of rows that are read at once
 PACKED = {
     b"\x1f\x8b": "a file packed by gzip", b"PK\x03\x04": "a zip archive", b"\x28\xb5\x2f\xfd": "a file packed by zstd",
     b"\xfd7zXZ": "a file packed by xz", b"BZh": "a file packed by bzip2", b"\xff\xfe": "text in UTF-16",
@@ -322,27 +322,27 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None, g
     """Read a motion of `model` from a CSV file, an MCAP file or the directory of a ROS 2 bag.
 
     A CSV file has a header row and a row per sample. Its columns, in any order, are `time`, `model.state_names` and
-    `model.input_names`; `position.JOINT` and `velocity.JOINT` may stand for a joint of one degree of freedom. Inputs
-    are held until the next sample and may be empty in the last row. With `gaps` it may have columns of sensors, called
-    as in `Recording`. An MCAP file has the channels /state and /input that this package writes, or ROS 2 messages as
-    `recordings_ros2` describes.
+    `model.input_names`. Joints with one degree of freedom may use `position.JOINT` and `velocity.JOINT` instead. Inputs
+    are constant until the next sample and may be empty in the last row. With `gaps`, columns of sensors are allowed,
+    with names as in `Recording`. An MCAP file has the channels /state and /input as written by this package, or ROS 2
+    messages (JointState, Odometry, PoseStamped and TwistStamped).
 
-    What is known of the engine is a JSON object in NAME.contract.json beside the recording NAME, or the metadata
-    record "contract" of the MCAP file, with any of the facts of `Recording` and "engine" and "version".
+    Facts of the engine are in a JSON object in NAME.contract.json in the folder of the recording NAME, or in the
+    metadata record "contract" of the MCAP file: any of the facts of `Recording`, and "engine" and "version".
 
     Args:
         path: the file or directory.
-        model: the model whose motion it is.
+        model: the model that moved.
         name: a name for the engine, in place of the file's.
-        gaps: whether a CSV file may lack columns of states, or have empty cells in them: what was not measured is NaN.
+        gaps: whether a CSV file may lack columns of states, or have empty cells in them; missing states become NaN.
 
     Returns:
         A `Recording`, for `dd.compare(model, recordings=[...])`.
 
     Raises:
-        InputError, UnknownNameError: the recording does not fit the model; names file, line and column.
+        InputError, UnknownNameError: the recording does not fit the model; the message has file, line and column.
         ArtifactError: the log is damaged.
-        MissingDependencyError: a ROS 2 bag, and rosbags is not installed.
+        MissingDependencyError: rosbags, which a ROS 2 bag needs, is not installed.
 
     Example:
         >>> import pathlib, tempfile
@@ -378,7 +378,7 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None, g
 
 
 def with_own_names(recordings: Sequence[Recording]) -> list[Recording]:
-    """The same, those whose name was there before with a number behind it: they come from files called alike."""
+    """Return the recordings with unique names: a number is appended to a repeated name, as from files of one name."""
     renamed: list[Recording] = []
     for recording in recordings:
         names, count = [previous.name for previous in renamed], 1
@@ -391,7 +391,7 @@ def with_own_names(recordings: Sequence[Recording]) -> list[Recording]:
 
 
 def write_csv(recording: Recording, model: Model, path: Path) -> None:
-    """Write times, states and inputs as `read_recording` reads them; no input begins at the last sample."""
+    """Write times, states and inputs in the format of `read_recording`; the last row has no inputs."""
     if np.shape(recording.xs)[1] != model.nx or np.shape(recording.us)[1] != model.nu:
         got = f"{np.shape(recording.xs)[1]} states and {np.shape(recording.us)[1]} inputs"
         raise InputError(f"recording {recording.name}", got=got, expected=f"{model.nx} and {model.nu}")
@@ -405,7 +405,7 @@ def write_csv(recording: Recording, model: Model, path: Path) -> None:
 
 
 def _contract_facts(path: Path) -> dict[str, str]:
-    """What stands beside the recording; numbers stay JSON."""
+    """Read the facts in the recording's .contract.json file; numbers stay JSON."""
     beside = path.with_name((path.name if path.is_dir() else path.stem) + ".contract.json")
     if not beside.exists():
         return {}
@@ -419,7 +419,7 @@ def _contract_facts(path: Path) -> dict[str, str]:
 
 
 def is_output(column: str) -> bool:
-    """Whether a column is called as what a sensor reads."""
+    """Return whether a column has the name of a sensor reading."""
     return re.fullmatch(r".+\.((position|gyro|accel)_[xyz]|force)", column) is not None
 
 
@@ -448,7 +448,7 @@ def _read_csv(path: Path, model: Model, gaps: bool) -> tuple[Motion, dict[str, A
 
 
 def _rows_of_csv(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """The number of the last line and the cells of each row that is not empty; InputError where it is no such text."""
+    """Yield last line number and cells of each row that is not empty. Raises InputError if it is not CSV in UTF-8."""
     with plain_file(path, links=True) as file:
         start = file.peek(len(max(PACKED, key=len)))
         for kind in (kind for first, kind in PACKED.items() if start.startswith(first)):
@@ -470,7 +470,7 @@ def _lines(path: Path, text: io.TextIOWrapper) -> Iterator[str]:
 
 
 def _no_text(path: Path) -> InputError:
-    """What to raise of a file that is not in UTF-8, with the line and the byte in it."""
+    """Return the error for a file that is not in UTF-8, with the line and the byte."""
     with plain_file(path, links=True) as file:
         for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), b""), start=1):
             try:
@@ -484,7 +484,7 @@ def _no_text(path: Path) -> InputError:
 def _numbers_of(
     path: Path, rows: Iterator[tuple[int, list[str]]], columns: list[tuple[str, int]], width: int
 ) -> tuple[list[int], Array]:
-    """(n,) the lines, and (n, len(columns)) the numbers in some columns, by name and place; NaN of an empty cell."""
+    """Return the line numbers (n,) and the values (n, len(columns)) of some columns; NaN for an empty cell."""
     lines, blocks = list[int](), [np.zeros((0, len(columns)))]
     while block := list(islice(rows, BLOCK)):
         for line, row in block:
@@ -518,7 +518,7 @@ def _number(subject: str, text: str) -> float:
 
 
 def _columns(path: Path, model: Model, header: list[str], wanted: Sequence[str], spared: Sequence[str]) -> list[int]:
-    """Where each wanted column stands; -1 of those that may be missing and are."""
+    """Return the index of each wanted column, or -1 for a column in `spared` that is missing."""
     by_joint = {}
     for label, joint in labelled(joints(model.plant)).items():
         q, v = model.places(joint)
@@ -555,22 +555,22 @@ def _read_mcap(path: Path, model: Model) -> tuple[Motion, Mapping[str, str]]:
 
 
 RECORDINGS, ARRAYS = "recordings", "arrays.npz"
-LARGEST = 64 * 2**20  # bytes of a recording that is kept
-OUTPUT = "output "  # before the name of a sensor's column, among the arrays
+LARGEST = 64 * 2**20  # largest size of a saved recording [bytes]
+OUTPUT = "output "  # prefix of the arrays of sensor columns
 
 
 def place_of(i: int) -> str:
-    """Where the arrays of recording i are, in the directory."""
+    """Return the path of the arrays of recording i in the directory."""
     return f"{RECORDINGS}/{i}/{ARRAYS}"
 
 
 def size_of(recording: Recording) -> int:
-    """How many bytes its arrays have."""
+    """Return the size of a recording's arrays in bytes."""
     return sum(array.nbytes for array in _arrays(recording).values())
 
 
 def write_arrays(path: Path, recording: Recording) -> None:
-    """Write times, states, inputs and what sensors read; the same ones give the same bytes."""
+    """Write times, states, inputs and sensor readings; equal recordings give equal bytes."""
     buffer = io.BytesIO()
     np.savez(buffer, **_arrays(recording))
     make_folder(path.parent)
@@ -584,7 +584,7 @@ def _arrays(recording: Recording) -> dict[str, Any]:
 
 
 def read_arrays(path: Path, name: str, version: str, facts: Mapping[str, str]) -> Recording:
-    """The recording whose arrays are at `path`; ArtifactError where they are none of a recording."""
+    """Read the recording with arrays at `path`. Raises ArtifactError if they are not a recording's."""
     arrays = arrays_of(path)
     missing = {"times", "xs", "us"} - arrays.keys()
     if missing:

@@ -1,4 +1,4 @@
-"""What a comparison found of each engine, what that amounts to, and the same in sentences."""
+"""Results of a comparison: the findings for each engine, verdicts, and sentences."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,9 +20,9 @@ from drake_diff.runs.other_records import EngineEvidence
 
 Verdict = Literal["same", "other law", "other model", "unexplained"]
 Gradient = Literal["its own step's", "not its own step's", "undecided", "none"]
-# One step against the reference's, relative to the state where that is above 1: rounding in solves with M.
+# Difference of one step from the reference's, relative to max(1, state): rounding in solves with M.
 STEP_TOLERANCE: dict[Precision, float] = {"float64": 1e-10, "float32": 1e-4}
-# Relative to the largest entry: what differences of a step, which some engines offer as its derivative, leave.
+# Relative to the largest entry: accuracy of finite differences, which some engines offer as derivatives.
 JACOBIAN_TOLERANCE: dict[Precision, float] = {"float64": 1e-8, "float32": 1e-2}
 PHRASES: Mapping[Verdict, str] = {
     "same": "the same simulation as Drake",
@@ -36,11 +36,11 @@ TRUST: Mapping[Gradient, str] = {
     "undecided": "undecided",
     "none": "none offered",
 }
-# What the contact law, whatever its form, is applied to.
+# The contract lines that any contact law depends on.
 OF_CONTACT = (
     "shapes", "poses", "contact pairs", "friction", "stiffness", "dissipation", "contact margin", "other contact terms",
 )  # fmt: skip
-# By term of a step: the lines of a contract that can explain it.
+# For each term of a step, the contract lines that can explain a difference in it.
 TELLS: Mapping[str, tuple[str, ...]] = {
     "inertia": ("mass", "center of mass", "inertia", "frames", "armature", "joint types", "joint order and names"),
     "bias": (
@@ -66,7 +66,7 @@ class StateProbe(NamedTuple):
 
 @dataclass(frozen=True)
 class Refused:
-    """An engine that is not compared: not installed, or without something that the model has."""
+    """An engine that is not compared: it is not installed, or does not support the model."""
 
     engine: str
     reason: str
@@ -75,73 +75,73 @@ class Refused:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Compared:
-    """One engine, or a recording (which has no Jacobians and no times), beside the reference."""
+    """The comparison of one engine, or of a recording (without Jacobians and times), with the reference."""
 
     engine: str
     version: str
     precision: Precision
-    lines: tuple[ContractLine, ...]  # of its contract against the reference's
+    lines: tuple[ContractLine, ...]  # of its contract compared with the reference's
     motion: EngineMotion
-    step_gaps: Array  # (n - 1,) of each of its steps to the reference's from the same state
-    first: Attribution  # of the first step that is apart, or of the first of all
-    largest: Attribution  # of the largest gap
-    final_gap: float  # of the last state that both have, on the tangent space
+    step_gaps: Array  # (n - 1,) of each of its steps from the reference's step from the same state
+    first: Attribution  # of the first step above the tolerance, or of the first step of all
+    largest: Attribution  # of the step with the largest gap
+    final_gap: float  # of the last common state, on the tangent space
     jacobians: tuple[JacobianAt, ...] = ()
-    jacobian_gaps: Array = field(default_factory=lambda: frozen([]))  # per state, of the reference's largest entry
-    laws: tuple[str, ...] = ()  # per state, that which is at work there (contact, a limit, the integrator), else ""
+    jacobian_gaps: Array = field(default_factory=lambda: frozen([]))  # per state, relative to the reference's largest
+    laws: tuple[str, ...] = ()  # per state, the law that acts (contact, limit, integrator), or ""
     rollout_jacobian: Array | None = None
-    rollout_gap: float | None = None  # relative to the reference's largest entry; None where one of the two broke off
+    rollout_gap: float | None = None  # relative to the reference's largest entry; None if one of the two ended early
     seconds_per_step: float | None = None
     seconds_per_jacobian: float | None = None
-    function: UserFunction | None = None  # what is known of a user's own equations
+    function: UserFunction | None = None  # the facts of a user's own equations
 
     @property
     def is_recorded(self) -> bool:
-        """Whether it is a recording, and no engine."""
+        """Whether it is a recording and not an engine."""
         return not self.jacobians and self.seconds_per_step is None
 
     @property
     def different(self) -> tuple[ContractLine, ...]:
-        """The lines of the contract that are different."""
+        """The contract lines that differ."""
         return tuple(line for line in self.lines if line.verdict == "different")
 
     @property
     def broken(self) -> tuple[ContractLine, ...]:
-        """The lines that make it another model.
+        """The contract lines that make it another model.
 
-        They differ without being the engine's doing, or the engine lacks what contact acts on, and contact is at work.
+        They differ for no reason of the engine, or the engine lacks a contact quantity and contact occurs.
         """
         at_work = {self.first.responsible, self.largest.responsible, *(self.laws[i] for i in self.other_states)}
         return tuple(line for line in self.different if _breaks(line, "contact law" in at_work))
 
     @cached_property
     def first_apart(self) -> int | None:
-        """The first step whose gap is above the tolerance."""
+        """The first step with a gap above the tolerance."""
         return first_above(self.step_gaps, self.precision)
 
     @property
     def told(self) -> tuple[ContractLine, ...]:
-        """The lines that explain the terms responsible; none where one of the terms is explained by no line."""
+        """The lines that explain the responsible terms; empty if a term has no explanation."""
         lines = [self.tells(term) for term in sorted({self.first.responsible, self.largest.responsible})]
         return tuple(dict.fromkeys(x for group in lines for x in group)) if all(lines) else ()
 
     def tells(self, term: str) -> tuple[ContractLine, ...]:
-        """The lines that are different and explain a term."""
+        """Return the differing lines that explain a term."""
         known = [line for line in self.different if line.reason not in UNKNOWN]
         return tuple(line for line in known if line.quantity in TELLS.get(term, ()))
 
     @property
     def other_states(self) -> tuple[int, ...]:
-        """The states at which its Jacobian is not the reference's."""
+        """The indices of the states at which its Jacobian differs from the reference's."""
         return tuple(int(i) for i in np.flatnonzero(~(self.jacobian_gaps <= JACOBIAN_TOLERANCE[self.precision])))
 
     @property
     def verdict(self) -> Verdict:
-        """How it relates to the reference.
+        """The relation to the reference.
 
-        "same": every step and Jacobian is the reference's. "other model": the contract is broken. "other law": they
-        differ, and the contract explains what is at work. "unexplained": nothing explains it. The steps of a recording
-        are also explained, as a law or as the model, by a single change of the reference that reproduces them.
+        "same": every step and Jacobian agrees with the reference. "other model": the contract is broken. "other law":
+        they differ, and the contract explains the difference. "unexplained": nothing explains it. The steps of a
+        recording are also explained, as "other law", if another scheme of the reference reproduces them.
         """
         if self.broken:
             return "other model"
@@ -155,7 +155,7 @@ class Compared:
 
     @property
     def gradient(self) -> Gradient:
-        """Whether its Jacobians are the derivatives of its own steps, at all states that were looked at."""
+        """Whether its Jacobians are the derivatives of its own steps, at all tested states."""
         verdicts = {j.own for j in self.jacobians if j.own is not None}
         if not verdicts:
             return "none"
@@ -165,7 +165,7 @@ class Compared:
 
     @property
     def sentence(self) -> str:
-        """What it is beside Drake, where they part, and why."""
+        """A sentence on its relation to Drake, and on the place and the cause of the first difference."""
         clauses, gap = [PHRASES[self.verdict]], _largest(self.step_gaps)
         if self.first_apart is None:
             clauses.append(f"each of {len(self.step_gaps)} steps within {gap} of Drake's")
@@ -202,17 +202,17 @@ class Compared:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
-    """One model in several engines, from `dd.compare`; the first of `engines` is Drake, the reference.
+    """The comparison of one model in several engines, from `dd.compare`; the first engine is Drake, the reference.
 
     Attributes:
         model: the model.
-        x0: (nx,) where the motion starts.
-        us: (N, nu) its inputs.
-        states: the states at which Jacobians were compared, with a name each.
+        x0: (nx,) the first state of the motion.
+        us: (N, nu) the inputs of the motion.
+        states: the named states at which Jacobians were compared.
         engines: per engine a `verdict` ("same", "other law", "other model", "unexplained"), a `sentence`, `step_gaps`
-            (N,), `jacobian_gaps`, and in `first` and `largest` the term that is responsible.
-        refused: engines that were not compared, and why.
-        recordings: those that were given.
+            (N,), `jacobian_gaps`, and the responsible terms in `first` and `largest`.
+        refused: engines that were not compared, with the reasons.
+        recordings: the given recordings.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -233,12 +233,12 @@ class Comparison:
 
     @property
     def reference(self) -> Compared:
-        """Drake, as the model is set."""
+        """Drake with the model's settings."""
         return self.engines[0]
 
     @property
     def holds(self) -> bool:
-        """Whether there are engines beside Drake, each the same or apart by a law that its contract explains."""
+        """Whether there are engines besides Drake, and all are the same or differ by a law that a contract explains."""
         return len(self.engines) > 1 and all(e.verdict in ("same", "other law") for e in self.engines)
 
     def __repr__(self) -> str:
@@ -254,7 +254,7 @@ class Comparison:
 
 
 def sentence_of(engines: Sequence[Compared | EngineEvidence]) -> str:
-    """Which engines are the same as the first, which are not, and whose gradients are those of their own steps."""
+    """Return a sentence on which engines agree with the first, and whose gradients are those of their own steps."""
     others = engines[1:]
     kinds = {phrase: [e.engine for e in others if e.verdict == v] for v, phrase in PHRASES.items()}
     parts = [f"{_list(names)}: {phrase}" for phrase, names in kinds.items() if names]
@@ -268,23 +268,23 @@ def sentence_of(engines: Sequence[Compared | EngineEvidence]) -> str:
 
 
 def _breaks(line: ContractLine, touched: bool) -> bool:
-    """Whether a line that is different makes another model, where contact is at work or not."""
+    """Return whether a differing line makes it another model; `touched` tells whether contact occurs."""
     return line.reason not in UNKNOWN and is_another_model(line, touched)
 
 
 def first_above(gaps: Array, precision: Precision) -> int | None:
-    """The first step whose gap is above the tolerance."""
+    """Return the first step with a gap above the tolerance, or None."""
     above = np.flatnonzero(~(gaps <= STEP_TOLERANCE[precision]))
     return int(above[0]) if len(above) else None
 
 
 def slugs(comparison: Comparison) -> list[str]:
-    """Names of the engines that can be parts of a topic; the place keeps them apart."""
+    """Return names of the engines for use in topics; the index makes them unique."""
     return [slug(i, e.engine) for i, e in enumerate(comparison.engines)]
 
 
 def slug(i: int, name: str) -> str:
-    """Such a name, of engine i."""
+    """Return the name of engine i for use in topics."""
     return f"{i}_" + re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
 
 

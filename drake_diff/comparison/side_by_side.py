@@ -1,7 +1,7 @@
-"""The same model in every engine: one motion, its steps and their derivatives, side by side, and why they differ.
+"""Comparison of one model in several engines: a motion, its steps, their derivatives, and the causes of differences.
 
-Drake, as the model is set, is the reference. Every step of another engine is compared with the reference's step from
-the same state, so that a gap is where it arises and not what has become of it.
+Drake with the model's settings is the reference. Every step of another engine is compared with the reference's step
+from the same state, so that a gap shows where it arises and does not accumulate.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from drake_diff.model.model import Model
 from drake_diff.model.tangent import sample_states, tangent_space
 from drake_diff.motion.rollout import check_inputs
 
-DURATION, MOST_STEPS = 1.0, 500  # [s]; of a motion that is not given
+DURATION, MOST_STEPS = 1.0, 500  # [s] and number of steps of a default motion
 
 
 def compare(
@@ -51,29 +51,29 @@ def compare(
 ) -> Comparison:
     """Run the same model in several engines and report where and why they differ from Drake.
 
-    Every engine runs one motion; each of its steps is compared with Drake's step from the same state, and its
-    Jacobians with Drake's and with differences of its own steps.
+    Every engine runs one motion. Each of its steps is compared with Drake's step from the same state. Its Jacobians are
+    compared with Drake's and with finite differences of its own steps.
 
     Args:
         model: the model; Drake with its settings is the reference.
         engines: names for `load_engine`, "drake:similar" or "drake:lagged:implicit" for Drake with other settings,
-            `Engine` objects, or your own equations as an `engines.ClosedForm`. Without it: every engine there is that
-            has all of the model's contacts, and Drake's other contact approximations where something can touch.
-        recordings: motions recorded elsewhere, from `read_recording`. Each recorded step is compared with as many
-            steps of Drake as lie between its samples; a recording has no Jacobians.
-        x0: start (nx,); without it the first recording's, or else a random state that touches nothing.
-        us: inputs (N, nu); without them the first recording's if it also gives the start, or else one second of
+            `Engine` objects, or your own equations as an `engines.ClosedForm`. Default: every engine that supports all
+            of the model's contacts, and Drake's other contact approximations if contact is possible.
+        recordings: motions from `read_recording`. Each recorded step is compared with the steps of Drake between its
+            samples; a recording has no Jacobians.
+        x0: start (nx,). Default: that of the first recording, or else a random state without contact.
+        us: inputs (N, nu). Default: those of the first recording if it also gives the start, or else one second of
             constant random inputs.
         num_steps: the number of steps N of a motion without `us`.
-        seed: seed of what is random.
+        seed: seed of random states and inputs.
 
     Returns:
         A `Comparison`: per engine a verdict, the gaps of steps and Jacobians, and the term that causes them. Engines
-        that are not installed or cannot have the model are listed in `refused`.
+        that are not installed or do not support the model are listed in `refused`.
 
     Raises:
         InputError: an argument does not fit the model.
-        ModelError: no engine but Drake can have this model.
+        ModelError: no engine but Drake supports this model.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -116,9 +116,9 @@ def compare(
 
 
 def compare_recordings(model: Model, recordings: Sequence[Recording]) -> Comparison:
-    """What `compare` says of the recordings alone, where it was not told how the motion starts.
+    """Compare recordings alone, with the start of the first recording, as `compare` does.
 
-    No Jacobian is taken: there are no `states`. `engines` and `recordings` are those that could be compared, in order.
+    No Jacobians are computed, so `states` is empty. `engines` and `recordings` are the comparable ones, in order.
     """
     for recording in recordings:
         check_recording(recording, model)
@@ -136,7 +136,7 @@ def compare_recordings(model: Model, recordings: Sequence[Recording]) -> Compari
 
 
 def _motion_of(recording: Recording, model: Model) -> tuple[Array, Array]:
-    """Its first state (nx,) and its inputs (N, nu), step by step of the model."""
+    """Return a recording's first state (nx,), and its inputs (N, nu) at each step of the model."""
     return recording.xs[0], np.repeat(recording.us, steps_between(recording, model.time_step), axis=0)
 
 
@@ -145,14 +145,14 @@ def _stuck(source: Engine | Recording, error: SimulationError) -> Refused:
 
 
 def default_engines(model: Model) -> tuple[str, ...]:
-    """Drake's other contact approximations, where something can touch, every other engine, and what is none."""
+    """Return Drake's other contact approximations if contact is possible, all other engines, and names in ELSEWHERE."""
     contact = model.contract.contact
     others = [a for a in ("sap", "similar", "lagged") if contact.collision_pairs and a != contact.approximation]
     return (*(f"drake:{a}" for a in others), *(name for name in ENGINES if name != "drake"), *ELSEWHERE)
 
 
 def _checked_engine(engine: Engine, reference: DrakeEngine) -> Engine:
-    """InputError for a closed form of other coordinates than the reference's."""
+    """Return the engine. Raises InputError for a closed form with other coordinates than the reference's."""
     if isinstance(engine, ClosedForm):
         ours, theirs = reference.contract, engine.contract
         for what in ("joints", "inputs"):
@@ -163,7 +163,7 @@ def _checked_engine(engine: Engine, reference: DrakeEngine) -> Engine:
 
 
 def _check_contact(reference: Engine, engine: Engine) -> None:
-    """ModelError for an engine that has no contact, or not of all pairs: nobody asked for it by name."""
+    """Raise ModelError for an engine that was not named by the user and lacks contact, or contact of some pairs."""
     lines = contact_lines(Match(reference, engine))
     lacking = [line for line in lines if line.quantity in MUST_HAVE and line.verdict == "different" and line.reason]
     if lacking:
@@ -173,7 +173,7 @@ def _check_contact(reference: Engine, engine: Engine) -> None:
 
 
 class _Panel:
-    """What each engine is asked, at the motion's start and deepest overlap, a state sampled free and one touching."""
+    """The test of each engine: at the motion's start, its deepest penetration, a sampled free and a contact state."""
 
     def __init__(self, model: Model, reference: DrakeEngine, x0: Array, us: Array):
         self.space, self.names, self.model = tangent_space(model), model.input_names, model
@@ -182,7 +182,7 @@ class _Panel:
         self.motion = move(reference, x0, us)
 
     def look(self, seed: int) -> None:
-        """Choose the states at which Jacobians are compared, and take the reference's: a recording has none."""
+        """Choose the states at which Jacobians are compared, and compute the reference's Jacobians."""
         motion = self.motion
         self.probes = [StateProbe("start", motion.xs[0], motion.us[0])]
         self.probes += [
@@ -201,7 +201,7 @@ class _Panel:
         product = self.product if is_reference else rollout_jacobian(engine, self.space, motion)
         gaps, precision = self._step_gaps(motion), engine.contract.precision
         has = None if isinstance(product, Refusal) else product
-        rollout_gap = None  # where one of the two has no derivative, or broke off before the other
+        rollout_gap = None  # if one of the two has no derivative, or ended before the other
         if has is not None and not isinstance(self.product, Refusal) and len(motion.us) == len(self.motion.us):
             rollout_gap = _gap(self.product, has)
         laws = []
@@ -238,7 +238,7 @@ class _Panel:
         )  # fmt: skip
 
     def _final_gap(self, xs: Array, count: int = 1) -> float:
-        """On the tangent space, of the last of `xs`, `count` steps apart, that the reference's motion has too."""
+        """Return the gap of the last state common with the reference, on the tangent space; `count` steps per state."""
         ours = self.motion.xs[::count]
         k = min(len(xs), len(ours)) - 1
         return float(np.abs(self.space.minus(xs[k], ours[k])).max())
@@ -247,7 +247,7 @@ class _Panel:
         return tuple(jacobian_at(engine, self.space, self.names, *probe) for probe in self.probes)
 
     def _step_gaps(self, motion: EngineMotion, count: int = 1) -> Array:
-        """Relative to the state after the step where that is above 1; states are `count` steps apart."""
+        """Return the gap of each step, relative to max(1, state after it); states are `count` steps apart."""
         gaps = []
         for x, u, after in zip(motion.xs, motion.us, motion.xs[1:], strict=False):
             ours = attribution.advanced(self.reference, x, u, count)
@@ -262,5 +262,5 @@ class _Panel:
 
 
 def _gap(reference: Array, other: Array) -> float:
-    """The largest difference of entries, relative to the reference's largest."""
+    """Return the largest difference of entries, relative to the reference's largest entry."""
     return float(np.abs(other - reference).max() / np.abs(reference).max())

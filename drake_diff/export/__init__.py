@@ -1,4 +1,4 @@
-"""A model written for simulators that cannot be loaded here."""
+"""Export of a model for simulators that drake_diff cannot run itself."""
 
 from drake_diff._base import attach_stub as _attach_stub
 

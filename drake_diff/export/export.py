@@ -1,7 +1,7 @@
-"""A model for an engine that cannot be loaded here: model file, contract, states to start from, and what to record.
+"""Export of a model for an engine that drake_diff cannot run: model file, contract, first states, and instructions.
 
-`read_recording` and `compare` take what comes back. Nothing is written unless the file, read back, says what the plant
-does.
+The recordings made there are for `read_recording` and `compare`. Nothing is written unless the file, when read back,
+agrees with the plant.
 """
 
 import csv
@@ -37,20 +37,20 @@ from drake_diff.mechanics.description import Description, Follower, describe_who
 from drake_diff.model.model import Model, load_model
 from drake_diff.model.tangent import ATTEMPTS, DEPTH, EFFORT, REACH, SPEED, sample_states
 
-# What Drake does not read in a format, or it cannot say: contract.json has it, as the README tells.
+# The quantities that Drake does not read in a format, or a format lacks: they are in contract.json, as README.md says.
 IN_THE_CONTRACT = {
     "urdf": ("contact pairs",),
     "sdf": ("contact pairs",),
     "mjcf": ("contact pairs", "friction", "stiffness", "dissipation"),
 }
 SUFFIX = {"urdf": ".urdf", "sdf": ".sdf", "mjcf": ".xml"}
-STEP_TOLERANCE = 1e-12  # relative: rounding of numbers that are written and read again
+STEP_TOLERANCE = 1e-12  # relative: rounding of numbers that are written and read back
 
 
 def written(form: str, description: Description, time_step: float) -> str:
-    """The text of a urdf, sdf or mjcf: of a model that can touch something the very MJCF that is compared.
+    """Return the text of a urdf, sdf or mjcf; with contact pairs, the MJCF is the one that `compare` uses.
 
-    MissingDependencyError where this needs MuJoCo, which makes of solref and of its own masses a stiffness.
+    Raises MissingDependencyError if MuJoCo is needed: it derives a stiffness from solref and its own masses.
     """
     if form == "urdf":
         return urdf(description)
@@ -64,9 +64,9 @@ def written(form: str, description: Description, time_step: float) -> str:
 
 
 def complaints(form: str, model: Model, text: str) -> list[str]:
-    """What of `model` the file `text` does not say, by each reader: Drake, and of MJCF MuJoCo where it is installed.
+    """Return the differences of `text` from `model`, by each reader: Drake, and for MJCF MuJoCo if it is installed.
 
-    Drake reads no springs in MJCF: of a model with springs only MuJoCo reads it, or nobody does, which is a complaint.
+    Drake reads no springs in MJCF, so only MuJoCo reads a model with springs; without MuJoCo that is a complaint.
     """
     description, gravity = describe_whole(model), model.plant.gravity_field().gravity_vector()
     springs = any(link.stiffness for link in description.links)
@@ -83,8 +83,8 @@ def complaints(form: str, model: Model, text: str) -> list[str]:
                     engine: Any = load_engine("mujoco", model.whole, path=path)
                 else:
                     with warnings.catch_warnings():
-                        warnings.simplefilter("ignore", ModelWarning)  # of what is other engines' alone
-                        # Drake reads gravity of no format.
+                        warnings.simplefilter("ignore", ModelWarning)  # elements for other engines only
+                        # Drake does not read gravity from any format.
                         found_there = load_model(
                             path, time_step=model.time_step, gravity=gravity,
                             contact_approximation=model.contract.contact.approximation,
@@ -105,14 +105,14 @@ def complaints(form: str, model: Model, text: str) -> list[str]:
                 wrong = [line for line in lines if line.verdict == "different" and line.quantity not in LAWS]
                 if reader == "drake":
                     wrong = [line for line in wrong if line.quantity not in IN_THE_CONTRACT[form]]
-                else:  # shapes that MJCF is not written for are left out, with their pairs
+                else:  # shapes that cannot be written in MJCF are omitted, with their pairs
                     wrong = [line for line in wrong if not line.reason]
                 problems += [f"read by {reader}, {line.quantity}: {line.detail}" for line in wrong]
     return problems
 
 
 def _followers_in_mujoco(path: Path) -> tuple[tuple[Follower, ...], Path]:
-    """The joints that follow others in an MJCF, by MuJoCo, and a file with all else of it, which is an engine."""
+    """Return the mimic joints of an MJCF as MuJoCo reads them, and a file without them for the engine."""
     from drake_diff.engines.mujoco import followers_in
 
     tree = ElementTree.parse(path)
@@ -124,7 +124,7 @@ def _followers_in_mujoco(path: Path) -> tuple[tuple[Follower, ...], Path]:
 
 
 def _followers_by_sdf(text: str) -> list[Follower]:
-    """The joints that follow others by SDF's own element, which Drake does not read."""
+    """Return the mimic joints of SDF's own <mimic> element, which Drake does not read."""
     followers = []
     for joint in ElementTree.fromstring(text).iter("joint"):
         mimic = joint.find("axis/mimic")
@@ -138,7 +138,7 @@ def _followers_by_sdf(text: str) -> list[Follower]:
 
 
 def _other_followers(wanted: Sequence[Follower], read: Sequence[Follower]) -> list[str]:
-    """Joints that follow others otherwise than they should, or not at all."""
+    """Return complaints about mimic joints that are missing or have other relations than they should."""
     meant, there = ({f.joint: f for f in side} for side in (wanted, read))
     problems = []
     for joint in sorted(meant.keys() | there.keys()):
@@ -153,12 +153,12 @@ def _same(a: Sequence[float], b: Sequence[float]) -> bool:
 
 
 def _other_materials(form: str, wanted: Description, read: Description) -> list[str]:
-    """Friction and softness of shapes that came back otherwise, whether or not they can touch something there."""
+    """Return complaints about friction and compliance of shapes that differ, even if the shapes have no contact."""
     problems = []
     for g in wanted.geometries if form != "mjcf" else ():
         name = collision_name(g.name) if form == "sdf" else g.name
         theirs = [x.material for x in read.geometries if x.name.rsplit("#", 1)[0].endswith(name)]
-        if theirs:  # else it is left out, and told
+        if theirs:  # otherwise the shape is omitted, which the README says
             for quantity, value in g.material.items():
                 other = theirs[0].get(quantity)
                 if other is None or abs(other - value) > STEP_TOLERANCE * abs(value):
@@ -167,7 +167,7 @@ def _other_materials(form: str, wanted: Description, read: Description) -> list[
 
 
 class _Named(DrakeEngine):
-    """The plant, its inputs named as the format names them."""
+    """The plant with the input names of the format."""
 
     def __init__(self, model: Model, form: str):
         super().__init__(model)
@@ -180,7 +180,7 @@ class _Named(DrakeEngine):
 
 
 class _Unlimited(DrakeEngine):
-    """What was read, without the limits that stand for none."""
+    """The plant that was read, with limits that stand for "no limit" removed."""
 
     @property
     def contract(self) -> EngineContract:
@@ -248,7 +248,7 @@ OF_TARGET: Mapping[str, str] = {
   randomization events, no observation noise; log the seed all the same, and the reset distribution. Isaac Lab 3 has
   quaternions as x y z w, before it w x y z; the CSV has w x y z""",
 }
-TARGETS = {"gazebo": "sdf", "isaaclab": "urdf", "urdf": "urdf", "sdf": "sdf", "mjcf": "mjcf"}  # the format of each
+TARGETS = {"gazebo": "sdf", "isaaclab": "urdf", "urdf": "urdf", "sdf": "sdf", "mjcf": "mjcf"}  # format by target
 DISTRIBUTION = (
     f"positions uniform in the middle 90 % of their limits, else within {REACH:g} m or pi rad of the default; "
     f"quaternions uniform on the sphere; velocities normal with deviation {SPEED:g}, cut at their limits; inputs "
@@ -259,25 +259,25 @@ DISTRIBUTION = (
 
 
 def export_model(model: Model, directory: str | Path, *, target: str, states: int = 20, seed: int = 0) -> list[Path]:
-    """Write a model for another simulator, with what is needed to compare it with Drake afterwards.
+    """Write a model for another simulator, with the files for a later comparison with Drake.
 
-    The new directory holds the model file (and a USD file for isaaclab, where usd-core is installed), contract.json
-    (what Drake uses), initial_states.csv and inputs.csv (where to start, and the input to hold), and README.md (what
-    to set, what to record and how to compare). Nothing is written where a check fails.
+    The new directory has the model file (and a USD file for isaaclab, if usd-core is installed), contract.json (Drake's
+    settings), initial_states.csv and inputs.csv (first states and constant inputs), and README.md (settings, recording
+    and comparison). Nothing is written if a check fails.
 
     Args:
         model: the model.
-        directory: a directory that does not exist yet, in one that does.
+        directory: a directory that does not exist yet, in an existing one.
         target: "gazebo" (SDF), "isaaclab" (URDF), "urdf", "sdf" or "mjcf".
-        states: how many states to sample.
+        states: the number of states to sample.
         seed: seed of the states.
 
     Returns:
-        The paths of the files that were written.
+        The paths of the written files.
 
     Raises:
         UnknownNameError, InputError: an unknown target, or a directory that exists.
-        ModelError: the format cannot say all of this model, or no other engine can have it.
+        ModelError: the format cannot represent this model, or no other engine supports it.
 
     Example:
         >>> import pathlib, tempfile
@@ -345,7 +345,7 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
 
 
 def _followers_text(followers: Sequence[Follower]) -> str:
-    """In the README."""
+    """Return the README's text on mimic joints."""
     if not followers:
         return "none."
     listed = "; ".join(map(str, followers))
@@ -356,7 +356,7 @@ def _followers_text(followers: Sequence[Follower]) -> str:
 
 
 def _whole(model: Model, x: Array) -> Array:
-    """The state of all joints."""
+    """Return the state of all joints, including mimic joints."""
     return x if model.coupling is None else np.asarray(model.coupling.state(x))
 
 

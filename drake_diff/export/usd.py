@@ -1,7 +1,7 @@
-"""Drake's plant as USD with UsdPhysics, in the float32 that its schemas have; the frames are those of `urdf`.
+"""Drake's plant as USD with UsdPhysics, in the float32 of its schemas; the frames are those of `urdf`.
 
-Angles of joints are in degrees there, and so are limits and damping. Joint damping is a drive to velocity 0, which
-PhysX takes implicitly; armature and stiffness of contact are PhysX's own attributes.
+USD has joint angles, limits and damping in degrees. Joint damping is a drive to velocity 0, which PhysX integrates
+implicitly. Armature and contact stiffness are PhysX's own attributes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,14 +22,14 @@ except ImportError as error:
 
 ROOT, GROUND, MATERIALS = "/robot", "/fixed_to_the_world", "/materials"
 SHAPES = ("Sphere", "Box", "Cylinder", "Capsule", "HalfSpace")
-MIMIC = "NewtonMimicAPI"  # of newton-usd-schemas, which Newton and Isaac Sim read
+MIMIC = "NewtonMimicAPI"  # a schema of newton-usd-schemas, which Newton and Isaac Sim read
 
 
 def usd(description: Description) -> str:
-    """The text of a .usda file, with friction of each shape, and the pairs that may touch; `lost` is what it lacks.
+    """Return the text of a .usda file, with the friction of each shape and the contact pairs; `lost` lists the rest.
 
-    ModelError where a link has no mass or moment of inertia, which USD takes for one to be computed from its shapes,
-    where a name is none of USD's, and where a joint follows one of another type.
+    Raises ModelError if a link has no mass or moment of inertia (USD would compute it from shapes), if a name is not
+    valid in USD, or if a joint follows a joint of another type.
     """
     anchored = _anchored(description)
     moving = [link for link in description.links if link.body not in anchored]
@@ -65,7 +65,7 @@ def usd(description: Description) -> str:
 
 
 def _refuse(moving: Sequence[Link], followers: Sequence[Follower]) -> None:
-    """ModelError for what USD cannot hold."""
+    """Raise ModelError for models that USD cannot represent."""
     kinds = {link.joint: link.kind for link in moving}
     for follower in followers:
         if kinds[follower.joint] != kinds[follower.leader]:
@@ -81,7 +81,7 @@ def _refuse(moving: Sequence[Link], followers: Sequence[Follower]) -> None:
 
 
 def lost(description: Description) -> tuple[str, ...]:
-    """What of contact and actuators the file cannot say, by name."""
+    """Return the properties of contact and actuators that the file lacks, with names."""
     kinds = {g.name: shape_of(g)[0] or type(g.shape).__name__ for g in description.geometries}
     losses = [f"the shape of {name} ({kind})" for name, kind in kinds.items() if kind not in SHAPES]
     sides = {g.name: g.material for g in description.geometries}
@@ -112,7 +112,7 @@ def _set_pose(shape: Any, X: RigidTransform) -> None:
 
 
 def _anchored(description: Description) -> set[str]:
-    """The world and the bodies that are welded to it: in USD, shapes that do not move, without mass or joint."""
+    """Return the world and the bodies welded to it, which in USD are static shapes without mass or joint."""
     bodies = {"world"}
     for link in description.links:
         if link.kind == "weld" and link.parent in bodies:
@@ -160,7 +160,7 @@ def _add_joint(stage: Any, link: Link, zero: AtZero, anchored: set[str]) -> None
 
 
 def _unit_of(links: Sequence[Link], joint: str) -> float:
-    """How much of USD's unit of position is 1 rad or 1 m of this joint."""
+    """Return 1 rad or 1 m of this joint in USD's unit of position."""
     return 180 / np.pi if any(x.joint == joint and x.kind == "revolute" for x in links) else 1.0
 
 
@@ -196,7 +196,7 @@ def _add_geometry(stage: Any, number: int, geometry: Geometry, X: RigidTransform
 
 
 def _add_material(stage: Any, number: int, geometry: Geometry, prim: Any) -> None:
-    """Restitution 0; friction is averaged, which of two that are the same is Drake's."""
+    """Add a material with restitution 0; friction is averaged, which agrees with Drake for equal coefficients."""
     material = UsdShade.Material.Define(stage, f"{MATERIALS}/material_{number}")
     physics = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
     physics.CreateRestitutionAttr(0.0)
@@ -214,7 +214,7 @@ def _add_material(stage: Any, number: int, geometry: Geometry, prim: Any) -> Non
 
 
 def _filter_pairs(description: Description, prims: Mapping[str, Any]) -> None:
-    """Pairs that Drake does not let touch do not touch."""
+    """Exclude the contact pairs that Drake excludes."""
     touching = {frozenset(pair.names) for pair in description.pairs}
     body = {g.name: g.body for g in description.geometries}
     for i, name in enumerate(prims):

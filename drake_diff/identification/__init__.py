@@ -1,4 +1,4 @@
-"""Which numbers of a model are wrong, from recordings of its motion."""
+"""Identification of wrong model parameters from recordings of the model's motion."""
 
 from drake_diff._base import attach_stub as _attach_stub
 

@@ -1,8 +1,8 @@
-"""What may be changed in a model, and where each change fits best.
+"""Candidate changes of a model, and the search for the values at which each change fits best.
 
-One pass of derivatives along the measured motion takes first states and gaps out of the least squares, which leaves
-|b - R dz|^2 in all changes together. What some of them promise is then a problem of a few numbers, in their own columns
-of R alone. Those that promise most go on by steps of Gauss and Newton, and what comes near the noise is fitted.
+One differentiation along the measured motion eliminates the first states and the gaps from the least squares, which
+leaves |b - R dz|^2 in all changes together. The decrease predicted for a few changes needs only their columns of R.
+The candidates with the largest predicted decrease take Gauss-Newton steps; those near the noise level are fitted fully.
 """
 
 import time
@@ -44,19 +44,19 @@ from drake_diff.identification.unknowns import (
 )
 from drake_diff.model.model import Model
 
-FALSE_NAME = 0.003  # of right models in which some change is named
-SAME = 6.0  # of a score: evidence of 20 to 1, below which two changes are not told apart
-LONGEST_SEARCH = 45.0  # [s] of processor time, after which no further change is tried
+FALSE_NAME = 0.003  # fraction of correct models for which a change is named
+SAME = 6.0  # difference of scores (odds of 20 to 1) below which two changes are not distinguished
+LONGEST_SEARCH = 45.0  # [s] of processor time after which no further change is tried
 
 
 class Tried(NamedTuple):
-    """A change that was fitted to its end."""
+    """A change whose fit is complete."""
 
     names: tuple[str, ...]
     score: float
-    pull: float  # how far it is from the file's values, as the fit weighs that
+    pull: float  # squared distance from the file's values, as the fit weights it
     freedom: float
-    doubt: str  # why it does not explain the recordings; empty where it does
+    doubt: str  # why the change does not explain the recordings; empty if it does
     values: dict[str, Any]
     intervals: dict[str, Array]
     z: Array
@@ -69,20 +69,20 @@ class Tried(NamedTuple):
 
 @dataclass(eq=False)
 class Ranking:
-    """Judges fitted changes of a model, and says which of them have the evidence; it ends after LONGEST_SEARCH."""
+    """The judgement of fitted changes of a model and of their evidence; the search ends after LONGEST_SEARCH."""
 
     model: Model
     chart: Chart
     pieces: list[Excerpt]
-    stated: Array  # (2 nv,) the noise, NaN where it is not known
+    stated: Array  # (2 nv,) the given noise; NaN if unknown
     evidence: dict[str, float] = field(default_factory=dict)
     begun: float = field(default_factory=time.process_time)
     ended_early: bool = False
-    jumps: ClassVar[bool] = False  # whether the motion jumps, as through impacts
+    jumps: ClassVar[bool] = False  # whether the motion has jumps, as at impacts
 
     @property
     def is_late(self) -> bool:
-        """Whether no further change is tried."""
+        """Whether the search has used up its time."""
         self.ended_early = self.ended_early or time.process_time() - self.begun > LONGEST_SEARCH
         return self.ended_early
 
@@ -92,7 +92,7 @@ class Ranking:
 
     @property
     def price(self) -> float:
-        """Of each number of a change, by BIC."""
+        """The penalty for each parameter of a change, according to BIC."""
         return float(np.log(self.count))
 
     @cached_property
@@ -121,11 +121,11 @@ class Ranking:
         return candidate.score + candidate.pull + candidate.freedom * self.price
 
     def least(self, freedom: float, count: int) -> float:
-        """By how much a score must fall, where so many changes were tried."""
+        """Return by how much a score must fall if `count` changes were tried."""
         return max(float(stats.chi2.isf(FALSE_NAME / max(count, 1), freedom)), freedom * self.price)
 
     def enough(self, base: Tried, tried: Sequence[Tried], count: int) -> list[Tried]:
-        """The changes that explain and have the evidence, best first, and not told from the best."""
+        """Return the changes that explain the recordings with enough evidence and are close to the best, best first."""
         candidates = [
             candidate
             for candidate in tried
@@ -135,7 +135,7 @@ class Ranking:
         return [candidate for candidate in candidates if self.bic(candidate) - self.bic(candidates[0]) < SAME]
 
     def named(self, named: Sequence[Tried], how: str = "") -> Explanation:
-        """The first of some changes with the others as alternatives; `how` says by which motion."""
+        """Return an explanation by the first change, with the others as alternatives; `how` names the motion law."""
         texts = [" and ".join(self.changed(candidate, name) for name in candidate.names) for candidate in named]
         explains = "this explains" if len(named[0].names) == 1 else "these two explain"
         tail = f"{explains} the recording" if len(named) == 1 else "the recording cannot tell"
@@ -154,16 +154,16 @@ class Ranking:
         return changed_to(name, value, interval, *self.of_model(name))
 
     def of_model(self, name: str) -> tuple[Array, str]:
-        """What a quantity is in the model, and its unit."""
+        """Return the model's value of a quantity, and its unit."""
         raise NotImplementedError
 
     def ended(self, sentence: str) -> str:
-        """The sentence, with that the search was ended where it was."""
+        """Return the sentence, with a note if the search ended early."""
         late = f" The search was ended after {LONGEST_SEARCH:.3g} s of processor time."
         return sentence + late if self.ended_early else sentence
 
     def nothing(self, how: str = "") -> Explanation:
-        """Of a model that is right."""
+        """Return the explanation for a correct model."""
         return Explanation((), {}, {}, (), True, f"Nothing: the model explains it{how}.", self.evidence)
 
     def unexplained(self, sentence: str) -> Explanation:
@@ -171,31 +171,31 @@ class Ranking:
 
 
 LONGEST_DELAY = 0.1  # [s]
-DELAYS = (0.25, 0.75, 1.5, 3, 5.5, 8)  # of a sample, from which a delay is looked for
-LEVELS = (0.85, 0.6, 0.35)  # of an input's largest value, from which its limit is looked for
-CUT = 0.6  # the level at which a limit promises something
-PARTS = (1, 2, 4, 5, 10, 20)  # of a sample: Euler steps that are tried
-SETTLING, SETTLES = 8, 0.8  # steps by which segments settle, and the part of what was left that each must leave at most
-PLAUSIBLE = 1.5  # times the squares that can be noise: what leaves more is not fitted to its end beside another
-STEPS, ROUNDS = 8, 4  # of Gauss and Newton, and of estimating the noise
-SAME_NOISE = 0.03  # what is left of its error changes a score by less than 0.001 of how many numbers were measured
-LOOKED_AT = 8  # changes that enter the race, of those that promise most: of those of one number, and of others
-RACE = (5, 4, 3, 2, 2, 1)  # so many stay after each step of Gauss and Newton
-FALLS = 0.7  # what does not fall to this part of what was left before is out of the race, after its first step
-HALVED = 3  # times: steps by which a change that makes motion stiff has none
-CLOSE = 1.0  # of the squares: what a step may still gain where two changes are told apart
-TOLD_APART = 20.0  # of the squares: what leaves so much more than a change that explains is not fitted to its end
+DELAYS = (0.25, 0.75, 1.5, 3, 5.5, 8)  # in sample periods: initial guesses of a delay
+LEVELS = (0.85, 0.6, 0.35)  # fractions of an input's largest value: initial guesses of its limit
+CUT = 0.6  # fraction of an input's largest value at which its limit is linearized
+PARTS = (1, 2, 4, 5, 10, 20)  # numbers of Euler steps per sample that are tried
+SETTLING, SETTLES = 8, 0.8  # maximum number of refinement steps of segment starts; required ratio of successive losses
+PLAUSIBLE = 1.5  # times the largest loss of pure noise: a candidate above it is not fitted fully if another one is
+STEPS, ROUNDS = 8, 4  # maximum numbers of Gauss-Newton steps, and of rounds of noise estimation
+SAME_NOISE = 0.03  # relative tolerance; the error changes a score by less than 0.001 times the number of measurements
+LOOKED_AT = 8  # maximum number of candidates that take steps: of one parameter, and also of several
+RACE = (5, 4, 3, 2, 2, 1)  # number of candidates that remain after each Gauss-Newton step
+FALLS = 0.7  # a candidate is dropped if a step after its first does not reduce the loss by this factor
+HALVED = 3  # maximum number of halvings of the integration step if a change makes the motion stiff
+CLOSE = 1.0  # decrease of the loss below which no further step is taken before candidates are compared
+TOLD_APART = 20.0  # loss in excess of the best candidate's, above which a candidate is not fitted fully
 
 
 @dataclass(frozen=True, eq=False)
 class WithLimits:
-    """A law whose steps also change by what a limit at CUT takes off an input."""
+    """A motion law whose derivatives include the effect of an input's limit at the level CUT."""
 
     law: TreeMotion
     unknowns: Unknowns
 
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
-        """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
+        """Return the derivatives of each step with respect to the state (K, M, nx, nx) and to z (K, M, nx, np)."""
         by_x, by_z = self.law.slopes(z, xs, hs, us)
         columns = self.unknowns.columns
         for unknown, s in self.unknowns.items():
@@ -212,25 +212,25 @@ class WithLimits:
 
 @dataclass(frozen=True, eq=False)
 class Promise:
-    """Some changes together, by the linearized motion."""
+    """The prediction of the linearized motion for some changes made together."""
 
     members: tuple[int, ...]
-    left: float  # of the squares, in units of the noise
-    freedom: float  # how many numbers the data can tell of them
-    step: Array  # of z of the members, one after the other
+    left: float  # remaining sum of squared residuals, in units of the noise
+    freedom: float  # effective number of parameters that the data determine
+    step: Array  # step in z of all members, concatenated
 
 
 NO_PROMISE = Promise((), np.inf, 0.0, np.zeros(0))
-Chosen = dict[tuple[str, ...], Promise]  # changes by the names of what they change
+Chosen = dict[tuple[str, ...], Promise]  # predictions by the names of the changed quantities
 
 
 class View:
-    """The least squares in all changes, linearized at one motion."""
+    """The least-squares problem in all changes, linearized at one motion."""
 
     def __init__(self, fit: Fit, unknowns: Unknowns, z: Array, starts: Array, reduced: Reduced):
         self.fit, self.unknowns, self.z, self.starts, self.reduced = fit, unknowns, z, starts, reduced
         finite = np.isfinite(unknowns.widths)
-        pull = np.where(finite, unknowns.widths, np.inf) ** -2.0  # weak, to the file's values
+        pull = np.where(finite, unknowns.widths, np.inf) ** -2.0  # weak regularization towards the file's values
         offset = unknowns.z_start - z
         norms = np.linalg.norm(reduced.R, axis=0)
         scale = np.where(finite, unknowns.widths, 1e6 / np.where(norms > 0, norms, 1.0))
@@ -238,11 +238,11 @@ class View:
         self.freedoms = tuple(float(np.sum(size**2 / (1 + size**2))) for size in sizes)
         self.matrix = reduced.R.T @ reduced.R + np.diag(pull)
         self.right = reduced.R.T @ reduced.b + pull * offset
-        self.most = reduced.rest + float(reduced.b @ reduced.b + np.sum(pull * offset**2))  # where nothing changes
+        self.most = reduced.rest + float(reduced.b @ reduced.b + np.sum(pull * offset**2))  # loss without a change
         self.lower = unknowns.bounds[0] - z
 
     def promise(self, members: tuple[int, ...]) -> Promise | None:
-        """The best step of some members; None where it leads out of bounds."""
+        """Predict the best step of some changes; return None if it leaves the bounds."""
         columns = np.concatenate([np.arange(*self.unknowns.slices[i].indices(len(self.z))) for i in members])
         H, g = self.matrix[np.ix_(columns, columns)], self.right[columns]
         scale = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
@@ -256,13 +256,13 @@ class View:
         return Promise(members, self.most - gain, sum(self.freedoms[i] for i in members), step)
 
     def promises(self, changes: Iterable[tuple[int, ...]], price: float) -> list[Promise]:
-        """Those that lower what is left by more than the price of their numbers, best first."""
+        """Return the predictions whose decrease exceeds the price of their parameters, best first."""
         promises = (self.promise(members) for members in changes)
         good = [p for p in promises if p is not None and self.most - p.left > price * p.freedom]
         return sorted(good, key=lambda promise: promise.left + price * promise.freedom)
 
     def ahead(self, promise: Promise) -> tuple[Array, Array]:
-        """(z of all changes, starts of the segments) after the step."""
+        """Return (z of all changes, starts of the segments) after the predicted step."""
         dz = np.zeros_like(self.z)
         columns = [range(s.start, s.stop) for s in (self.unknowns.slices[i] for i in promise.members)]
         dz[[column for entries in columns for column in entries]] = promise.step
@@ -273,17 +273,17 @@ class View:
 
 @dataclass(eq=False)
 class Runner:
-    """A change on its way to where it fits best, by full steps of Gauss and Newton."""
+    """A candidate change that is fitted by full Gauss-Newton steps."""
 
     names: tuple[str, ...]
     fit: Fit
     z: Array
     starts: Array
-    left: float  # of the squares, after the next step
+    left: float  # sum of squared residuals that the latest step predicts
     freedom: float
 
     def step(self) -> bool:
-        """Whether there is a motion to step from, if need be by steps that are shorter and stay so."""
+        """Take a Gauss-Newton step, shortening the integration steps if needed; return False if no motion exists."""
         reduced = self._reduced()
         for _ in range(HALVED):
             shorter = self.fit.shorter
@@ -308,15 +308,15 @@ class Runner:
 
 @dataclass(eq=False, kw_only=True)
 class Candidates(Ranking):
-    """Everything that may be changed, and the motion of the model as it is; `prepare` comes first."""
+    """All candidate changes, and the motion of the unchanged model; `prepare` must be called first."""
 
     tree: Tree
-    by_delay: dict[float, Array] = field(default_factory=dict)  # starts of segments that settled at a delay
-    step: float | None = None  # [s] of the Euler steps that stand for the motion; None for continuous time
+    by_delay: dict[float, Array] = field(default_factory=dict)  # refined segment starts, by delay [s]
+    step: float | None = None  # [s] length of the Euler steps; None for continuous time
 
     @cached_property
     def unknowns(self) -> Unknowns:
-        """Everything that is tried."""
+        """All quantities that are tried."""
         measured = np.any([np.isfinite(p.ys).any(axis=0) for p in self.pieces], axis=0)
         singles = {i for i, _ in self.chart.coordinates.single} | set(range(self.model.nq, self.model.nx))
         biases = {f"{name}.{BIAS}" for i, name in enumerate(self.model.state_names) if measured[i] and i in singles}
@@ -333,36 +333,36 @@ class Candidates(Ranking):
 
     @cached_property
     def of_inputs(self) -> list[int]:
-        """The changes of how inputs act."""
+        """The indices of the changes of input delays and input limits."""
         return [i for i, unknown in enumerate(self.unknowns.each) if unknown.quantity in (DELAY, LIMIT)]
 
     def of(self, names: Sequence[str]) -> Unknowns:
-        """Those called so; where inputs act later, the motion has its steps cut where they change."""
+        """Return the unknowns with these names; with a delay, integration steps end where the inputs change."""
         chosen = (unknown for unknown in self.unknowns.each if unknown.name in names)
         shifting = (replace(unknown, shifts=unknown.quantity == DELAY) for unknown in chosen)
         return Unknowns(tuple(shifting), as_in_files=True)
 
     def law(self, unknowns: Unknowns, longest: float, *, smooth: bool = True) -> TreeMotion:
-        """By Euler steps where they stand for the motion; Coulomb friction that is not smooth holds."""
+        """Return Euler steps if `step` is set, else continuous time; Coulomb friction sticks if not `smooth`."""
         if self.step is not None:
             return EulerMotion(self.model, self.tree, unknowns, self.step)
         return TreeMotion(self.model, self.tree, unknowns, longest, smooth=smooth, frozen=True)
 
     @property
     def period(self) -> float:
-        """[s]"""
+        """The median sample period [s] of the first piece."""
         return float(np.median(np.diff(self.pieces[0].times)))
 
     @property
     def euler_steps(self) -> list[float]:
-        """[s] lengths of steps of which a whole number lies between samples."""
+        """The lengths [s] of the Euler steps that are tried; a whole number of steps fits between samples."""
         periods = np.concatenate([np.diff(piece.times) for piece in self.cut])
         if self.chart.coordinates.free or np.ptp(periods) > 1e-6 * np.mean(periods):
             return []
         return [float(np.mean(periods)) / n for n in PARTS]
 
     def prepare(self) -> None:
-        """Steps, pieces and starts of segments with which the model as it is follows what was measured."""
+        """Choose steps, pieces and segment starts with which the unchanged model follows the measurements."""
         nothing = self.of(())
         fit, starts = self.problem(nothing, self.pieces).prepared(self.law(nothing, LONGEST))
         self.longest = fit.law.longest if isinstance(fit.law, TreeMotion) else LONGEST
@@ -370,9 +370,9 @@ class Candidates(Ranking):
         self.starts = self.settled(fit, nothing.z_start, starts)
 
     def settled(self, fit: Fit, z: Array, starts: Array) -> Array:
-        """Starts of the segments from which the motion is nearer to what each of them measured, by itself.
+        """Refine the starts of the segments by a fit of each segment to its own samples.
 
-        A guess by cubics knows nothing of inputs, which may change a velocity within a few samples.
+        The initial guess by cubics ignores inputs, which may change a velocity within a few samples.
         """
         s = fit.segments
         ends = [
@@ -397,7 +397,7 @@ class Candidates(Ranking):
         return starts
 
     def starts_at(self, delay: float) -> Array:
-        """The starts of segments that settle where inputs act so much later."""
+        """Return the refined segment starts for inputs that act later by `delay`."""
         known = self.by_delay if self.step is None else {}
         if delay not in known:
             late = self.of([f"model.{DELAY}"])
@@ -410,7 +410,7 @@ class Candidates(Ranking):
         return known[delay]
 
     def view(self, pieces: Sequence[Excerpt], z: Array, starts: Array) -> View | None:
-        """What everything promises there; None where there is no motion. Where z has a delay, inputs act later."""
+        """Linearize in all changes at z, which may include a delay; return None if no motion exists."""
         unknowns = self.unknowns
         if any(unknown.quantity == DELAY and z[s][0] > 0 for unknown, s in unknowns.items()):
             unknowns = self.of([unknown.name for unknown in unknowns.each])
@@ -425,18 +425,18 @@ class Candidates(Ranking):
         return left > HOPELESS**2 * self.count
 
     def is_behind(self, left: float, best: float) -> bool:
-        """Whether a change that leaves so much is told from the one that leaves least."""
+        """Return whether the sum of squares `left` is clearly larger than the smallest one, `best`."""
         return left - best > TOLD_APART * max(1.0, best / self.count)
 
     @cached_property
     def plausible(self) -> float:
-        """What a change may leave of the squares that explains, however they are weighted."""
+        """The largest sum of squares, for any weights, that a change that explains the recordings can leave."""
         numbers = np.isfinite(np.concatenate([piece.ys for piece in self.pieces])).sum(axis=0)
         seen = numbers[numbers > 0]
         return PLAUSIBLE * most_scatter(int(np.min(seen)), len(seen)) ** 2 * self.count
 
     def chosen(self, seen: View, changes: Iterable[tuple[int, ...]], most: int = LOOKED_AT) -> Chosen:
-        """Those that promise most: what has more numbers bends to more, and promises more than it does."""
+        """Return the best predictions; several parameters have a quota of their own, as they are overestimated."""
         unknowns, chosen = self.unknowns.each, Chosen()
         places = {True: most, False: most}
         for promise in seen.promises(changes, self.price):
@@ -447,11 +447,11 @@ class Candidates(Ranking):
         return chosen
 
     def tried(self, seen: View, chosen: Chosen, base: Tried) -> tuple[list[Tried], list[Runner]]:
-        """(those that are fitted, all that entered the race, best first); changes of how inputs act come last."""
+        """Return (fitted changes, all candidates, best first); delays and limits of inputs are tried last."""
         plain = {names: promise for names, promise in chosen.items() if not set(promise.members) & set(self.of_inputs)}
         candidates, runners = self.raced([self.runner(seen, p, names) for names, p in plain.items()], base)
         rest = {names: promise for names, promise in chosen.items() if names not in plain}
-        if any(candidate.explains for candidate in candidates):  # their searches take longer than the others together
+        if any(candidate.explains for candidate in candidates):  # delays and limits take the longest to search
             first = min(promise.left for promise in chosen.values())
             rest = {names: promise for names, promise in rest.items() if not self.is_behind(promise.left, first)}
         others: list[Runner] = []
@@ -475,7 +475,7 @@ class Candidates(Ranking):
     def from_several(
         self, names: tuple[str, ...], unknowns: Unknowns, z: Array, column: int, promise: Promise
     ) -> Runner:
-        """From the delay or limit from which steps leave least: a step sees only as far as inputs stay the same."""
+        """Start from the best of several delays or limits: a linear step is valid only while inputs are constant."""
         is_delay = column == unknowns.delay
         values = self.period * np.array(DELAYS) if is_delay else unknowns.start[column] * np.array(LEVELS)
         best, worse = self.running(names, unknowns, self.starts, z, promise), 0
@@ -486,7 +486,7 @@ class Candidates(Ranking):
             starts = self.starts_at(float(value)) if is_delay else self.starts
             runner = self.running(names, unknowns, starts, begin, promise)
             worse += 1
-            if all(runner.step() for _ in names) and runner.left < best.left:  # two where another change bends as well
+            if all(runner.step() for _ in names) and runner.left < best.left:  # two steps for a pair
                 best, worse = runner, 0
             if worse > 1:
                 break
@@ -498,7 +498,7 @@ class Candidates(Ranking):
         return Runner(names, fit, z, starts, promise.left, promise.freedom)
 
     def raced(self, runners: list[Runner], base: Tried) -> tuple[list[Tried], list[Runner]]:
-        """(those that are fitted, all, best first)."""
+        """Eliminate candidates step by step; return (fitted changes, all candidates, best first)."""
         alive, there = list(runners), list[Runner]()
         for most in RACE:
             most = 1 if most < RACE[0] and self.is_late else most
@@ -529,13 +529,13 @@ class Candidates(Ranking):
                 candidates.append(
                     self.solved(runner.names, runner.fit.unknowns, runner.fit.law, runner.starts, runner.z)
                 )
-            except (SimulationError, np.linalg.LinAlgError):  # its motion grows beyond what numbers hold
+            except (SimulationError, np.linalg.LinAlgError):  # the motion overflows
                 continue
             self.evidence[" and ".join(runner.names)] = base.score - candidates[-1].score
         return candidates, every
 
     def improve(self, there: Sequence[Runner]) -> None:
-        """Steps of those that came near the noise, for as long as these help."""
+        """Take further steps with the candidates near the noise level while the steps help."""
         best = np.inf
         for runner in sorted(there, key=lambda runner: runner.left):
             for _ in range(STEPS):
@@ -549,7 +549,7 @@ class Candidates(Ranking):
     def solved(
         self, names: tuple[str, ...], unknowns: Unknowns, law: Law, starts: Array, z: Array, most: int = STEPS
     ) -> Tried:
-        """The change where it fits best, with the noise estimated anew."""
+        """Fit a change fully, with repeated estimation of the noise."""
         problem, pieces = self.problem(unknowns, self.cut), self.cut
         fit = self.followed(problem, problem.fit(law, pieces, problem.first_noise), z, starts)
         law = fit.law
@@ -567,7 +567,7 @@ class Candidates(Ranking):
                 solved = replace(solved, converged=True)
                 break
             jumps = solved.stuck and unknowns.delay is not None and fit.law is law
-            if shorter is not None and jumps:  # stiff motions do, between two counts of steps that a delay cuts
+            if shorter is not None and jumps:  # a stiff motion jumps where a delay changes the number of steps
                 fit = problem.fit(shorter, pieces, fit.noise)
                 continue
             noise = np.where(np.isfinite(self.stated), self.stated, np.fmax(size, 1e-3 * self.scatter))
@@ -578,7 +578,7 @@ class Candidates(Ranking):
 
     @staticmethod
     def followed(problem: Problem, fit: Fit, z: Array, starts: Array) -> Fit:
-        """By steps short enough for the motion there: a search by longer ones takes long, and leads nowhere."""
+        """Return a fit with steps short enough for the motion; a search with longer steps is slow and fails."""
         for _ in range(ROUNDS):
             shorter = fit.shorter
             if shorter is None or problem.follows(fit, z, starts):
@@ -588,5 +588,5 @@ class Candidates(Ranking):
 
 
 def _squares(point: FittedMotion) -> Array:
-    """(K,) what is left of each segment."""
+    """Return the squared residuals (K,) of each segment."""
     return np.array([float(np.nansum(r**2)) for r in point.residuals])

@@ -1,8 +1,8 @@
-"""Whether a recording's columns are mistaken: two exchanged, one with the other sign, or degrees where radians belong.
+"""Detection of mistaken columns of a recording: two exchanged, one with the wrong sign, or degrees instead of radians.
 
-Each mistake is one permutation of the columns with factors, and has no number that is fitted. Short segments of the
-motion say which of them come nearer to the model than the columns as they are. Those few are fitted whole, with
-nothing but their first states, and one is named where it leaves noise and the columns as they are do not.
+Each mistake is a permutation of the columns with factors, and has no parameter to fit. Short segments of the motion
+show which mistakes agree better with the model than the given columns. Those few are fitted to whole recordings, with
+only their first states unknown. A mistake is named if only noise remains without it, but not with the given columns.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,35 +26,35 @@ from drake_diff.identification.unknowns import Unknowns
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
 
-SEGMENTS = 12  # of the recording, by which mistakes are compared
-FITTED = 3  # mistakes that are fitted whole, of those that come nearest
-NEARER = 0.5  # of what the columns as they are leave: a mistake that leaves more is not fitted
-FAR = 3.0  # more than a mistake that explains leaves: columns as they are that leave 20 times its squares
-EVIDENCE = 20.0  # by which -2 log of the likelihood must fall: of 100 mistakes, by chance in 0.5 % of recordings
-SAME = 6.0  # of the same: evidence of 20 to 1, below which two mistakes are not told apart
-STEPS, FEW = 20, 8  # of Gauss and Newton
+SEGMENTS = 12  # of the recording, on which mistakes are compared
+FITTED = 3  # number of best mistakes that are fitted to whole recordings
+NEARER = 0.5  # fraction of the loss of the given columns: a mistake with a larger loss is not fitted
+FAR = 3.0  # difference of losses (20 times the squared residuals) above which the given columns are not fitted
+EVIDENCE = 20.0  # required decrease of -2 log likelihood: by chance in 0.5 % of recordings, for 100 mistakes
+SAME = 6.0  # difference of -2 log likelihood (odds of 20 to 1) below which two mistakes are not distinguished
+STEPS, FEW = 20, 8  # maximum numbers of Gauss-Newton steps: of a full fit, and of a first one
 
 
 @dataclass(frozen=True, eq=False)
 class Mistake:
-    """Columns of states and inputs that are right where they are taken in this order, times these factors."""
+    """A mistake in the columns of states and inputs, which this order and these factors correct."""
 
     words: str
     order: Indices  # (nx + nu,)
     factors: Array  # (nx + nu,)
 
     def mended(self, piece: Excerpt) -> Excerpt:
-        """The piece as it would be without the mistake."""
+        """Return the piece without the mistake."""
         nx = piece.ys.shape[1]
         us = piece.us[:, self.order[nx:] - nx] * self.factors[nx:]
         return replace(piece, ys=piece.ys[:, self.order[:nx]] * self.factors[:nx], us=us)
 
 
-Fitted = Callable[[Sequence[Excerpt]], tuple[float, bool]]  # (-2 log of the likelihood, whether noise is left)
+Fitted = Callable[[Sequence[Excerpt]], tuple[float, bool]]  # (-2 log likelihood, whether the residuals are noise)
 
 
 def mistakes(model: Model, chart: Chart, pieces: Sequence[Excerpt]) -> list[Mistake]:
-    """Everything that is tried; of what was not measured, and of quaternions, nothing."""
+    """Return all mistakes to try; unmeasured columns and quaternions have none."""
     nq, nx = model.nq, model.nx
     seen = np.any([np.isfinite(piece.ys).any(axis=0) for piece in pieces], axis=0)
     sliding = {model.places(joint)[0].start for joint in joints(model.plant) if joint.type_name() == "prismatic"}
@@ -88,12 +88,12 @@ def mistakes(model: Model, chart: Chart, pieces: Sequence[Excerpt]) -> list[Mist
 
 
 def _sets(*groups: Sequence[Sequence[int]]) -> list[tuple[int, ...]]:
-    """Each set of columns of each group once, without those that have none."""
+    """Return each set of columns of each group once, without empty sets."""
     return [columns for group in groups for columns in dict.fromkeys(map(tuple, group)) if columns]
 
 
 def _listed(names: Sequence[str]) -> str:
-    """What has something, and has it or have it: "column a has", "columns a and b have"."""
+    """Return the columns with their verb: "column a has", "columns a and b have"."""
     if len(names) == 1:
         return f"column {names[0]} has"
     if len(names) > 4:
@@ -104,9 +104,9 @@ def _listed(names: Sequence[str]) -> str:
 def mistaken_columns(
     model: Model, chart: Chart, pieces: Sequence[Excerpt], law: Law, fits: Sequence[Fitted]
 ) -> Explanation | None:
-    """The mistake of columns that alone explains recordings; None where they are explained as they are, or by none.
+    """Find the mistake that explains the recordings, or return None if none does or the given columns are explained.
 
-    `law` moves short segments. Each of `fits` says how well the model, as it is, goes through whole recordings.
+    `law` simulates short segments. Each of `fits` measures how well the unchanged model follows whole recordings.
     """
     every = mistakes(model, chart, pieces)
     none = Mistake("", np.arange(model.nx + model.nu), np.ones(model.nx + model.nu))
@@ -136,9 +136,9 @@ def mistaken_columns(
 def mistaken_in_the_air(
     model: Model, tree: Tree, chart: Chart, pieces: Sequence[Excerpt], stated: Array
 ) -> Explanation | None:
-    """The same of motions in which nothing touches, in continuous time or by the model's own Euler steps.
+    """Find such a mistake in motions without contact, in continuous time or with the model's own Euler steps.
 
-    `stated` (2 nv,) is the noise, NaN where it is not known.
+    `stated` (2 nv,) is the given noise, NaN if unknown.
     """
     arguments = model, tree, Unknowns((), as_in_files=True)
     periods = np.concatenate([np.diff(piece.times) for piece in pieces]) / model.time_step
@@ -155,7 +155,7 @@ def mistaken_in_the_air(
 def _left(
     model: Model, law: Law, chart: Chart, pieces: Sequence[Excerpt], candidates: Sequence[Mistake]
 ) -> list[float]:
-    """What some short segments leave without each mistake, from states that are guessed: mean log of 1 + squares."""
+    """Return the loss of short segments without each mistake, from guessed states: the mean of log(1 + r^2)."""
     s, nx, losses = cut_segments(law, pieces, model.nu), model.nx, list[float]()
     some = np.unique(np.linspace(0, len(s.first) - 1, SEGMENTS).round().astype(int))
     for candidate in candidates:
@@ -176,9 +176,9 @@ def _left(
 
 
 def _fitted(model: Model, law: Law, chart: Chart, stated: Array, pieces: Sequence[Excerpt]) -> tuple[float, bool]:
-    """(-2 log of the likelihood with the noise that is left, whether what is left is noise).
+    """Return (-2 log likelihood with the noise of the residuals, whether the residuals are noise).
 
-    Where a few steps leave far more than noise, no more are taken.
+    The fit ends early if the first few steps leave residuals far above noise.
     """
     nothing = Unknowns((), as_in_files=True)
     problem = Problem(model, chart, nothing, list(pieces), stated, noise_by_differences(chart, pieces))
@@ -189,7 +189,7 @@ def _fitted(model: Model, law: Law, chart: Chart, stated: Array, pieces: Sequenc
             if np.any(size[np.isfinite(size)] > HOPELESS * problem.first_noise[np.isfinite(size)]):
                 return np.inf, False
             fit, solved = problem.solve(law, STEPS)
-    except (DrakeDiffError, np.linalg.LinAlgError):  # its motion grows beyond what numbers hold
+    except (DrakeDiffError, np.linalg.LinAlgError):  # the motion overflows
         return np.inf, False
     score = likelihood_of(fit, solved, stated, problem.scatter)
     return score, not problem.doubt(fit, solved, "")

@@ -1,7 +1,7 @@
-"""What is tried where bodies touch: one parameter alone, by the model's own steps over the recordings.
+"""The search for one changed parameter in recordings with contact, by the model's own steps.
 
-Through an impact a small error of the first state grows, so the end of a recording is reached in stages. The model as
-it is goes first, up to the stage at which it leaves more than noise. Each change begins there, from several values.
+A small error of the first state grows through an impact, so the fitted part of a recording is extended in stages. The
+unchanged model is fitted up to the stage with residuals above noise. Each change starts there, from several values.
 """
 
 from collections.abc import Iterator, Sequence
@@ -28,24 +28,24 @@ from drake_diff.model.parameters import applied, list_parameters, select
 from drake_diff.model.plant import bodies, labelled
 from drake_diff.model.step import set_state
 
-FIRST, LONGER = 3, 1.5  # samples of the first stage; how many times as long each is as the one before
-BEGIN = (0.1, -0.1, 0.3, -0.3, 0.8, -0.8)  # where a change of one number begins, of its logarithm or of HEIGHT
-HEIGHT = 0.02  # [m] of a ground
-BEST = 2  # of where a change may begin
-STEPS, FEW = 8, 3  # of Gauss and Newton, at the end and in the stages before
-TOLD_APART = 20.0  # of the squares: what leaves so much more than a change that explains is given up
-MORE = 1.3  # times the squares of the stage before: other first states are tried
-DRAWS, LEAST_SEEN = 24, 1e-3  # of these; of what is seen of one entry, a combination seen less stays
-NOISY = 1.5  # times the scatter: what the model leaves in a stage at which changes begin
+FIRST, LONGER = 3, 1.5  # samples of the first stage; ratio of the lengths of successive stages
+BEGIN = (0.1, -0.1, 0.3, -0.3, 0.8, -0.8)  # initial changes of one number, in its logarithm or in units of HEIGHT
+HEIGHT = 0.02  # [m] unit of initial changes of the ground's height
+BEST = 2  # number of initial values of a change from which a fit is started
+STEPS, FEW = 8, 3  # maximum numbers of Gauss-Newton steps, in the last stage and in those before
+TOLD_APART = 20.0  # excess of the sum of squares over that of a change that explains, above which a change is given up
+MORE = 1.3  # times the mean square of the previous stage, above which other first states are tried
+DRAWS, LEAST_SEEN = 24, 1e-3  # number of such states; relative singular value below which a combination is not varied
+NOISY = 1.5  # times the scatter: residuals of the model in a stage at which changes begin
 OF_CONTACT = ("friction", "stiffness", "dissipation", "radius")
 OF_MOTION = (MASS, CENTER, "damping", "gravity")
-SEGMENT = 0.1  # [s] by which mistakes of columns are compared
-LARGER = 1.2  # radii with which bodies are looked at that nearly touch
+SEGMENT = 0.1  # [s] length of the segments on which mistaken columns are compared
+LARGER = 1.2  # factor of the radii with which bodies that nearly touch are found
 NOTHING = Unknowns(())
 
 
 def may_touch(model: Model, chart: Chart, pieces: Sequence[Excerpt]) -> bool:
-    """Whether bodies would touch with a higher ground and larger spheres, where samples are whole steps apart."""
+    """Return whether bodies would touch with a higher ground and larger spheres; needs whole steps between samples."""
     periods = np.concatenate([np.diff(piece.times) for piece in pieces]) / model.time_step
     stride = np.round(np.median(periods))
     if not model.contract.contact.collision_pairs or stride < 1 or np.any(np.abs(periods - stride) > CLOCK_TOLERANCE):
@@ -62,19 +62,19 @@ def may_touch(model: Model, chart: Chart, pieces: Sequence[Excerpt]) -> bool:
 
 
 class FitStage(NamedTuple):
-    """How a change fits the recordings up to a stage."""
+    """The fit of a change to the recordings up to a stage."""
 
     stage: int
     fit: Fit
     solved: Solved
-    left: float  # of the squares, in units of the scatter, of each number
+    left: float  # mean squared residual, in units of the scatter
 
 
 @dataclass(eq=False)
 class ContactExplanation(Ranking):
-    """The search for one change that explains recordings in which bodies touch."""
+    """The search for one change that explains recordings with contact."""
 
-    least_left: dict[int, float] = field(default_factory=dict)  # by stage, of the changes that explain
+    least_left: dict[int, float] = field(default_factory=dict)  # least `left` by stage, of the changes that explain
     jumps = True
 
     def __post_init__(self) -> None:
@@ -96,7 +96,7 @@ class ContactExplanation(Ranking):
             candidate = None if self.is_late else self.tried(unknown, begin, points)
             tried += [] if candidate is None else [candidate]
         explaining = [candidate for candidate in tried if candidate.explains]
-        end = None  # of the model as it is from first states of the best change, which may lead it to less
+        end = None  # unchanged model from the first states of the best change, which may give smaller residuals
         if explaining:
             starts = min(explaining, key=self.bic).starts
             end = self.to_end(NOTHING, len(self.stages) - 1, np.zeros(0), starts)
@@ -116,7 +116,7 @@ class ContactExplanation(Ranking):
         return self.unexplained(f"{NO_CHANGE}; {what}.")
 
     def is_nothing(self, candidate: Tried) -> bool:
-        """Whether the model's own value is within the interval: the search led the model to a better motion."""
+        """Return whether the interval contains the model's value: only the first states improved the fit."""
         (name,) = candidate.names
         start, _ = self.of_model(name)
         low, high = np.atleast_2d(candidate.intervals[name]).T
@@ -124,7 +124,7 @@ class ContactExplanation(Ranking):
 
     @cached_property
     def stages(self) -> list[float]:
-        """Shares of the recordings, the last 1."""
+        """The fractions of the recordings that are fitted, the last being 1."""
         longest = max(len(piece.times) for piece in self.pieces)
         count = max(0, int(np.ceil(np.log(longest / FIRST) / np.log(LONGER))))
         return [min(1.0, FIRST * LONGER**k / longest) for k in range(count)] + [1.0]
@@ -141,7 +141,7 @@ class ContactExplanation(Ranking):
     def stages_of(
         self, unknowns: Unknowns, first: int, z: Array, starts: Array | None, before: FitStage | None = None
     ) -> Iterator[FitStage]:
-        """How a change fits stage after stage, for as long as it leaves no more than HOPELESS."""
+        """Yield the fits of a change stage by stage, while the residuals are at most HOPELESS."""
         law = self.law(unknowns)
         for stage in range(first, len(self.stages)):
             fit = self.fit(law, unknowns, stage)
@@ -161,13 +161,13 @@ class ContactExplanation(Ranking):
                 return
 
     def is_behind(self, now: FitStage) -> bool:
-        """Whether a change leaves clearly more in a stage than one that explains."""
+        """Return whether the residuals of a stage are clearly larger than those of a change that explains."""
         best = self.least_left.get(now.stage, np.inf)
         return (now.left - best) * now.fit.count > TOLD_APART * max(best, 1.0)
 
     @staticmethod
     def solved(fit: Fit, stage: int, z: Array, starts: Array, most: int) -> FitStage | None:
-        """Where the least squares of a stage lead; None where there is no motion."""
+        """Solve the least squares of a stage; return None if no motion exists."""
         try:
             solved = fit.solve(z, starts, most)
         except SimulationError:
@@ -176,7 +176,7 @@ class ContactExplanation(Ranking):
         return FitStage(stage, fit, solved, float(np.mean(residuals**2)))
 
     def other_starts(self, fit: Fit, z: Array, before: FitStage) -> list[Array]:
-        """The best of first states that the stage before allows too: through impacts steps by slopes may stop early."""
+        """Return the best other first states that the stage before allows, as steps may stop early through impacts."""
         random, size = np.random.default_rng(0), np.sqrt(max(before.left, 1.0))
         spreads = [np.linalg.pinv(R, rcond=LEAST_SEEN) for R, _, _ in before.solved.reduced.own]
         moves = (
@@ -187,12 +187,12 @@ class ContactExplanation(Ranking):
         return [point.starts for point in best[:BEST]]
 
     def to_end(self, unknowns: Unknowns, first: int, z: Array, starts: Array | None) -> FitStage | None:
-        """The last stage, if the change reaches the end of the recordings."""
+        """Return the fit of the last stage, or None if the change does not reach the end of the recordings."""
         stages = list(self.stages_of(unknowns, first, z, starts))
         return stages[-1] if stages and stages[-1].stage == len(self.stages) - 1 else None
 
     def first_points(self, begin: FitStage) -> Iterator[tuple[Unknown, list[FittedMotion]]]:
-        """Where changes may begin, best first."""
+        """Yield each change with the motions at its initial values, best first."""
         for unknown in self.changes:
             unknowns = Unknowns((unknown,))
             fit = self.fit(self.law(unknowns), unknowns, min(begin.stage + 1, len(self.stages) - 1))
@@ -202,7 +202,7 @@ class ContactExplanation(Ranking):
                 yield unknown, there
 
     def tried(self, unknown: Unknown, begin: FitStage, points: Sequence[FittedMotion]) -> Tried | None:
-        """A change where it fits, from where it leaves least that comes to the end; None where none does."""
+        """Fit a change from the best initial value that reaches the end; return None if none does."""
         unknowns, stage = Unknowns((unknown,)), min(begin.stage + 1, len(self.stages) - 1)
         for point in points[:BEST]:
             stages = list(self.stages_of(unknowns, stage, point.z, point.starts, begin))
@@ -215,7 +215,7 @@ class ContactExplanation(Ranking):
 
     @staticmethod
     def beginnings(unknown: Unknown) -> list[Array]:
-        """(k,) changes of z with which the search begins."""
+        """Return the changes (k,) of z with which the search begins."""
         none, scales = np.zeros(len(unknown.start)), np.array(BEGIN)[:, None]
         if unknown.quantity == BIAS:
             return [none, *(HEIGHT * scales)]
@@ -224,15 +224,15 @@ class ContactExplanation(Ranking):
         return [none, *(scales if unknown.quantity == MASS else unknown.start * np.expm1(scales))]
 
     def judged(self, names: tuple[str, ...], unknowns: Unknowns, stage: FitStage) -> Tried:
-        """With the noise that is left; of a change that did not come to the end, one that does not explain."""
-        solved = replace(stage.solved, converged=True)  # on ragged ground the last step is judged by what it leaves
+        """Judge a fit by the noise of its residuals; a fit that does not reach the end does not explain."""
+        solved = replace(stage.solved, converged=True)  # the loss is rough: only the last residuals count
         candidate = self.judge(names, self.problem(unknowns, stage.fit.segments.pieces), stage.fit, solved)
         if stage.stage == len(self.stages) - 1:
             return candidate
         return candidate._replace(score=np.inf, doubt="its motion departs from the recordings")
 
     def unchanged(self, pieces: Sequence[Excerpt]) -> tuple[float, bool]:
-        """How well the model as it is goes through other pieces."""
+        """Return (score, whether it explains) of the unchanged model on other pieces."""
         other = ContactExplanation(self.model, self.chart, list(pieces), self.stated)
         end = other.to_end(NOTHING, 0, np.zeros(0), None)
         base = None if end is None else other.judged((), NOTHING, end)
@@ -240,7 +240,7 @@ class ContactExplanation(Ranking):
 
     @cached_property
     def changes(self) -> list[Unknown]:
-        """Everything that is tried: what touches first, then what moves."""
+        """All quantities that are tried: first those of contact, then those of motion."""
         known, plant = {p.name: p.value for p in list_parameters(self.model)}, self.model.plant
         names = [n for q in OF_CONTACT for n in known if n.endswith(f".{q}") and "/" not in n and np.all(known[n] > 0)]
         names += [f"{height}.{BIAS}" for height in _heights(self.model, self.chart)]
@@ -264,7 +264,7 @@ class ContactExplanation(Ranking):
 
 
 def _heights(model: Model, chart: Chart) -> list[str]:
-    """Positions along which nearly all weight acts: where the ground is moves their zero."""
+    """Return the positions along which nearly all weight acts; the ground's height is a bias of these."""
     set_state(model.double, model.default_state)
     pulls = np.abs(model.plant.CalcGravityGeneralizedForces(model.double.context))
     pairs = [*chart.coordinates.single, *((i + 6, j + 5) for i, j in chart.coordinates.free)]

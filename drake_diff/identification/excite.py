@@ -1,9 +1,9 @@
-"""A motion from which parameters can be told: inputs that make the information of recordings about them large.
+"""Design of a motion for identification: inputs that make a recording informative about the parameters.
 
-What is maximized is the determinant of the information that `identify` would have, first states taken out, with the
-weak pull to the file's values: D-optimality, which does not depend on the units of the parameters. Where every joint
-has an input of its own, the motion of each joint is a Fourier series, as by Swevers, and the inputs follow by inverse
-dynamics; else the inputs themselves are the series. A window lets them begin and end at rest, or at 0.
+The objective is the determinant of the information matrix of `identify`, with the first states eliminated and with the
+weak regularization towards the file's values. This is D-optimality, which does not depend on the units of the
+parameters. If every joint is actuated, each joint follows a Fourier series (Swevers), and inverse dynamics gives the
+inputs. Otherwise the inputs themselves are the series. A window makes the series begin and end at rest, or at 0.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,41 +31,41 @@ from drake_diff.model.plant import joints
 from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
 
-NOISE = 1e-3  # [rad] or [m], of positions, where nothing is said
-WINDOW = 0.125  # of the duration: how long the motion takes to begin, and to end
-COARSE = 0.04  # [s] between samples while it is searched; the result is told of the samples that were asked for
-MARGIN = 0.02  # of each range, which the search leaves for what inputs that are held change
-RANDOM = 15  # motions by random coefficients: what is compared with, and where the search begins
-DIFFERENCE = 1e-4  # of a coefficient
-SMALLER = (1.0, 0.95, 0.9)  # of coefficients, where inputs that are held go beyond a limit
-BOX, LEAST_BOX = 0.2, 1e-3  # of coefficients, in one step
-PARTS = np.array([1.0, 0.5, 0.25, 0.1])  # of a step, that are tried
-GAIN = 1e-2  # of the log of the determinant: a smaller one ends the search
+NOISE = 1e-3  # [rad] or [m] default standard deviation of positions
+WINDOW = 0.125  # fraction of the duration in which the motion begins, and in which it ends
+COARSE = 0.04  # [s] sample period during the search; the result is computed with the requested period
+MARGIN = 0.02  # fraction of each range that the search leaves for the effect of piecewise-constant inputs
+RANDOM = 15  # number of motions with random coefficients, which are the baseline and the initial guesses
+DIFFERENCE = 1e-4  # finite-difference step of a coefficient
+SMALLER = (1.0, 0.95, 0.9)  # factors of the coefficients if piecewise-constant inputs exceed a limit
+BOX, LEAST_BOX = 0.2, 1e-3  # first and least trust region of the coefficients
+PARTS = np.array([1.0, 0.5, 0.25, 0.1])  # fractions of a step that are tried
+GAIN = 1e-2  # gain in the log determinant below which the search ends
 SHRINKINGS = 30
-FASTEST = 20.0  # [1/s] by which what inputs that are held do to the motion is taken back
+FASTEST = 20.0  # [1/s] largest feedback rate against the error of piecewise-constant inputs
 
 
 @dataclass(frozen=True, eq=False)
 class Excitation(ShowsItsRepr):
-    """Inputs that tell much of a model's parameters, and what they will tell; `excite` makes one."""
+    """Inputs that are informative about a model's parameters, and the expected deviations, from `excite`."""
 
     times: Array  # (n,) [s]
-    xs: Array  # (n, nx) how the model moves, from rest
-    us: Array  # (n - 1, nu) each held until the next time
-    deviations: Mapping[str, Any]  # by parameter, the standard deviation that it will be known with; inf: not at all
-    random: Mapping[str, Any]  # the same of the middle one of some random motions, which keep the same limits
-    rest: Mapping[str, Any]  # the same of a recording of the first state, held as far as the inputs can
+    xs: Array  # (n, nx) states of the model, from rest
+    us: Array  # (n - 1, nu) each constant until the next time
+    deviations: Mapping[str, Any]  # by parameter, its expected standard deviation; inf if not identifiable
+    random: Mapping[str, Any]  # the same for the median of random motions within the same limits
+    rest: Mapping[str, Any]  # the same for a recording at the first state, as far as the inputs can keep it there
     units: Mapping[str, str]
-    unidentifiable: tuple[str, ...]  # combinations that stay open, in words
-    gain: float  # by how much a deviation falls from random to this on (geometric) average
-    noise: Mapping[str, float]  # what was taken as measured, with which standard deviation
+    unidentifiable: tuple[str, ...]  # combinations that remain unidentifiable, in words
+    gain: float  # ratio of the deviations of `random` to those of this motion, as a geometric mean
+    noise: Mapping[str, float]  # standard deviation of each measured state
     sentence: str
 
     def __repr__(self) -> str:
         return self.sentence
 
     def recording(self, name: str = "planned") -> Recording:
-        """The motion as a recording without noise."""
+        """Return the motion as a recording without noise."""
         return Recording(name, "1", self.times, self.xs, self.us)
 
 
@@ -82,32 +82,32 @@ def excite(
     max_iterations: int = 20,
     seed: int = 0,
 ) -> Excitation:
-    """Find a motion whose recording tells as much of some parameters as the limits allow.
+    """Find a motion within the limits whose recording is most informative about some parameters.
 
-    The determinant of their information is maximized (D-optimality), at the model's own values. Inputs and joints keep
-    their limits, and bodies do not touch. The motion is the best that a local search finds from random ones.
+    The determinant of their information is maximized (D-optimality), at the model's own values. Inputs and joints stay
+    within their limits, and bodies do not touch. The motion is the best that a local search finds from random motions.
 
     Args:
-        model: The model, which moves as in continuous time.
+        model: The model, simulated in continuous time.
         parameters: Names as for `dd.identify`.
-        duration: Of the motion [s].
-        period: Between samples [s], at which inputs change too.
-        x0: (nx,) the first state, at rest; the model's default, and the middle of limits that it is at or beyond.
-        noise: What is measured: the standard deviation of states by name. None: 1e-3 rad or m of each position.
-        limits: By the name of a state or input: the lower and upper limit, or how far from 0 it may be, within the
-            model's own. Needed of inputs without a limit where not every joint has an input, and of slides without one.
-            A hinge without limits turns half a turn to either side of x0.
-        harmonics: Frequencies of the Fourier series, multiples of 1 / duration.
-        max_iterations: Of the search. 0: the best of the random motions.
-        seed: Of the random motions.
+        duration: Duration of the motion [s].
+        period: Sample period [s], at which the inputs also change.
+        x0: (nx,) the first state, at rest. Default: the model's; a position at or beyond a limit is set to the middle.
+        noise: The standard deviation of the measured states, by name. None: 1e-3 rad or m of each position.
+        limits: By the name of a state or input, a lower and an upper limit, or a largest magnitude. The model's limits
+            also apply. Inputs without a limit need one if not every joint has an input; so do slides without limits.
+            A hinge without limits moves at most half a turn to either side of x0.
+        harmonics: Number of frequencies of the Fourier series, multiples of 1 / duration.
+        max_iterations: Maximum number of iterations of the search. 0: the best of the random motions.
+        seed: Seed of the random motions.
 
     Returns:
-        `.us` and `.xs` at `.times`; `.deviations` of each parameter, beside those of a `.random` motion and at `.rest`;
-        `.unidentifiable` combinations.
+        `.us` and `.xs` at `.times`, `.deviations` of each parameter together with those of a `.random` motion and at
+        `.rest`, and `.unidentifiable` combinations.
 
     Raises:
-        InputError, UnknownNameError, ShapeError, NonFiniteError: A name, number or state is none of this model.
-        ModelError: The model has no motion in continuous time, or no motion was found that keeps the limits.
+        InputError, UnknownNameError, ShapeError, NonFiniteError: A name, number or state does not fit the model.
+        ModelError: The model has no motion in continuous time, or no motion within the limits was found.
 
     Source:
         Swevers et al., "Optimal robot excitation and identification" (1997).
@@ -156,7 +156,7 @@ def _first(model: Model, x0: Any) -> Array:
 
 @dataclass(eq=False)
 class _Design:
-    """What is sought, and within which limits."""
+    """The optimization problem: the parameters, the limits and the motion's series."""
 
     model: Model
     tree: Tree
@@ -171,13 +171,13 @@ class _Design:
 
     @cached_property
     def times(self) -> Array:
-        """(n,) [s] of the samples."""
+        """The times (n,) [s] of the samples."""
         n = round(self.duration / self.period)
         return np.asarray(self.duration / n * np.arange(n + 1))
 
     @cached_property
     def few(self) -> Array:
-        """[s] of the samples by which motions are compared during the search."""
+        """The times [s] of the samples that the search uses."""
         most = len(self.times) - 1
         return np.linspace(0, self.duration, max(2 * LEAST, min(most, round(self.duration / COARSE))) + 1)
 
@@ -195,13 +195,13 @@ class _Design:
 
     @cached_property
     def follows(self) -> bool:
-        """Whether any motion of the joints has inputs."""
+        """Whether inputs exist for every motion of the joints."""
         reach = np.linalg.matrix_rank(self.dynamics.efforts)
         return not self.chart.coordinates.free and self.model.nu > 0 and int(reach) == self.model.nv
 
     @cached_property
     def limits(self) -> tuple[Array, Array]:
-        """(nx + nu,) lower and upper, of states and inputs."""
+        """The lower and upper limits (nx + nu,) of states and inputs."""
         model = self.model
         low, high = (
             np.concatenate([q, v, sign * self.tree.numbers.limit])
@@ -228,7 +228,7 @@ class _Design:
 
     @cached_property
     def reach(self) -> tuple[Array, Array]:
-        """The middle and the half range of what the series are of: positions, or inputs."""
+        """The middle and the half range of the quantities that follow the series: positions, or inputs."""
         low, high = self.limits
         if not self.follows:
             low, high = low[self.model.nx :], high[self.model.nx :]
@@ -243,7 +243,7 @@ class _Design:
         return q0, (high[:nq] - low[:nq]) / 2
 
     def basis(self, times: Array) -> tuple[Array, Array, Array]:
-        """(n, 2 H) windowed waves, and their first and second derivatives by time."""
+        """Return the windowed waves (n, 2 H), and their first and second derivatives with respect to time."""
         T, ramp = self.duration, WINDOW * self.duration
         window, slope, bend = np.ones_like(times), np.zeros_like(times), np.zeros_like(times)
         for s, sign in ((times / ramp, 1.0), ((T - times) / ramp, -1.0)):
@@ -259,7 +259,7 @@ class _Design:
         return W * waves, S * waves + W * first, B * waves + 2 * S * first + W * second
 
     def planned(self, law: TreeMotion, c: Array, times: Array) -> tuple[Array, Array, Array | None]:
-        """xs (K, n, nx) and us (K, n - 1, nu) by coefficients c (K, m), and accelerations (K, n, nv) where planned."""
+        """Return xs (K, n, nx), us (K, n - 1, nu) for c (K, m), and accelerations (K, n, nv) or None if simulated."""
         middle, half = self.reach
         K, n = len(c), len(times)
         phi, slope, bend = self.basis(times)
@@ -280,7 +280,7 @@ class _Design:
         return xs, us.reshape(K, n - 1, -1), a
 
     def simulated(self, c: Array) -> tuple[Array, Array]:
-        """xs (n, nx) as the model moves under us (n - 1, nu) that are held; they take back what that changes."""
+        """Simulate piecewise-constant inputs us (n - 1, nu), corrected by feedback towards the plan; return xs, us."""
         planned, us, a = self.planned(self.law, c[None], self.times)
         if a is None:
             return planned[0], us[0]
@@ -298,7 +298,7 @@ class _Design:
         return xs, us
 
     def beyond(self, xs: Array, us: Array) -> Array:
-        """(..., n - 1, 2 (nx + nu)) how far each sample is below and above limits, in ranges; -1 without one."""
+        """Return violations (..., n - 1, 2 (nx + nu)) of lower and upper limits, in half ranges; -1 without limit."""
         low, high = self.limits
         size = np.where(np.isfinite(high - low), (high - low) / 2, 1.0)
         values = np.concatenate([xs[..., 1:, :], us], axis=-1)
@@ -306,7 +306,7 @@ class _Design:
         return np.where(np.isfinite(both), both, np.where(np.isnan(both) | (both > 0), 1e3, -1.0))
 
     def over(self, c: Array) -> Array:
-        """(K, stretches, 2 (nx + nu)) how far motions by c (K, m) go beyond their limits, less the margin."""
+        """Return the violations (K, stretches, 2 (nx + nu)) for coefficients c (K, m), with the margin added."""
         xs, us, a = self.planned(self.rough, c, self.few)
         if a is None:
             return self.beyond(xs, us) + MARGIN
@@ -315,7 +315,7 @@ class _Design:
         return np.maximum.reduceat(every, first, axis=1) + MARGIN
 
     def fit(self, law: TreeMotion, xs: Array, us: Array, times: Array) -> tuple[Fit, Array]:
-        """Of K motions (K, n, nx), each a piece of its own; and where its segments start."""
+        """Return a fit to K motions (K, n, nx), each as a piece, and the starts of its segments."""
         pieces = [
             Excerpt("planned", times, x, u, held_out=False, recording=k)
             for k, (x, u) in enumerate(zip(xs, us, strict=True))
@@ -328,7 +328,7 @@ class _Design:
         return np.array([s.pieces[p].ys[k] for p, k in zip(s.of_piece, s.first, strict=True)])
 
     def informed(self, xs: Array, us: Array, times: Array) -> list[Array]:
-        """Of each motion R (np, np), of which R' R is the information about z; of zeros where there is no motion."""
+        """Return R (np, np) of each motion, where R' R is the information about z; zeros if no motion exists."""
         fit, starts = self.fit(self.rough, xs, us, times)
         z = self.unknowns.z_start
         point = fit.at(z, starts)
@@ -339,7 +339,7 @@ class _Design:
         return [R if np.all(np.isfinite(R)) else np.zeros_like(R) for R in Rs]
 
     def identifiability(self, xs: Array, us: Array) -> tuple[Array, tuple[str, ...]]:
-        """(R of one motion as `identify` would cut it, what stays open)."""
+        """Return (R of one motion with the pieces of `identify`, the unidentifiable combinations)."""
         z = self.unknowns.z_start
         fit, starts = self.fit(self.law, xs[None], us[None], self.times)
         cut = Fit(self.model, self.law, self.chart, self.unknowns, growth_cuts(fit, z, starts), self.noise)
@@ -350,7 +350,7 @@ class _Design:
         return R, unidentifiable(self.unknowns, z, known_of(self.unknowns, z, R).open)
 
     def worth(self, R: Array, scale: Array) -> float:
-        """log of the determinant of the information with the pull to the file's values."""
+        """Return the log determinant of the information, including the regularization towards the file's values."""
         pull = np.where(np.isfinite(self.unknowns.widths), scale / self.unknowns.widths, 1e-6)
         s = np.linalg.svd(np.vstack([R * scale, np.diag(pull)]), compute_uv=False)
         return 2 * float(np.sum(np.log(s)))
@@ -391,7 +391,7 @@ class _Design:
         return self.unknowns.named(deviations_of(self.unknowns, z, known_of(self.unknowns, z, R).covariance))
 
     def within(self, c: Array) -> Array | None:
-        """c, made smaller until limits are kept and bodies do not touch; None where no part of it does."""
+        """Scale c down until the motion is within limits and without contact; return None if no scale suffices."""
         parts = 0.85 ** np.arange(SHRINKINGS)
         inside = np.max(self.over(parts[:, None] * c), axis=(1, 2)) <= 0
         for fraction in parts[inside]:
@@ -409,7 +409,7 @@ class _Design:
         return False
 
     def feasible(self, c: Array) -> tuple[Array, Array] | None:
-        """The motion, where it, or one that is a little smaller, keeps all limits at every sample."""
+        """Return the motion, scaled down a little if needed, if it is within all limits at every sample."""
         for fraction in SMALLER:
             xs, us = self.simulated(fraction * c)
             if np.all(np.isfinite(xs)) and np.max(self.beyond(xs, us)) <= 0 and not self.touches(xs):
@@ -417,7 +417,7 @@ class _Design:
         return None
 
     def searched(self, c: Array, scale: Array, most: int) -> list[Array]:
-        """Where the search has been, best first: linear programs by differences, within a box that follows success."""
+        """Return the iterates, best first, of linear programs by finite differences within an adaptive trust region."""
 
         def evaluate(many: Array) -> tuple[Array, Array]:
             xs, us, _ = self.planned(self.rough, many, self.few)
@@ -454,9 +454,9 @@ class _Design:
         return been[:0:-1]
 
 
-STATES = 60  # random ones, of at least as many rows as there are numbers
-SAME = 1e-7  # of an effect: what is less follows from the others
-ONE = 1e-6  # of a factor: what differs from 1 by less is written as 1
+STATES = 60  # minimum number of random states
+SAME = 1e-7  # relative norm of an effect below which it is a combination of the others
+ONE = 1e-6  # tolerance within which a factor is written as 1
 INERTIA = ("inertia_xx", "inertia_yy", "inertia_zz", "inertia_xy", "inertia_xz", "inertia_yz")
 NAMES = ("mass", "moment_x", "moment_y", "moment_z", *INERTIA)
 ORDER = (*range(4, 10), 1, 2, 3, 0)  # inertia, moments, mass
@@ -465,10 +465,10 @@ UNITS = ("kg", *["kg m"] * 3, *["kg m^2"] * 6)
 
 @dataclass(frozen=True, eq=False)
 class BaseParameter(ShowsItsRepr):
-    """A sum that motion shows, where its parts by themselves are not shown."""
+    """A sum of inertial parameters that is identifiable, although its parts are not."""
 
-    parts: Mapping[str, float]  # BODY.mass, BODY.moment_x or BODY.inertia_xx about its origin, and the factor of each
-    value: float  # of the model
+    parts: Mapping[str, float]  # factors by name: BODY.mass, BODY.moment_x or BODY.inertia_xx (about its origin)
+    value: float  # value of the model
     unit: str
 
     def __repr__(self) -> str:
@@ -483,26 +483,26 @@ class BaseParameter(ShowsItsRepr):
 
 
 def base_parameters(model: Model, bodies: Sequence[str] | None = None) -> tuple[BaseParameter, ...]:
-    """The sums of masses, moments and inertias that motion of the joints, with known inputs, can show.
+    """Return the sums of masses, moments and inertias that are identifiable from joint motion with known inputs.
 
-    A moment is mass times centre of mass, and an inertia is about the origin of the body's frame. What is in no sum
-    does nothing. Within a sum no recording of the joints can tell one part from another.
+    A moment is mass times centre of mass, and an inertia is about the origin of the body's frame. A quantity in no sum
+    has no effect on the motion. The parts of a sum cannot be distinguished by any recording of the joints.
 
     Args:
         model: The model.
-        bodies: Those whose numbers are unknown; None: all that move. Those of the others are taken as known.
+        bodies: The bodies with unknown parameters; None: all that move. The parameters of other bodies are known.
 
     Returns:
-        Each sum, in the order from the base to the tips, with its value in the model.
+        The sums, ordered from the base to the tips, with their values in the model.
 
     Raises:
         ModelError: The model has no motion in continuous time.
-        UnknownNameError: There is no such body that moves.
+        UnknownNameError: The model has no moving body with mass of this name.
 
     Source:
-        Gautier and Khalil, "Direct calculation of minimum set of inertial parameters of serial robots" (1990), here by
-        elimination in the regressor at random states, as by Gautier, "Numerical calculation of the base inertial
-        parameters of robots" (1991).
+        Gautier and Khalil, "Direct calculation of minimum set of inertial parameters of serial robots" (1990). The
+        sums are computed by elimination in the regressor at random states, as in Gautier, "Numerical calculation of
+        the base inertial parameters of robots" (1991).
 
     Example:
         >>> from drake_diff.identification import base_parameters
@@ -540,7 +540,7 @@ def base_parameters(model: Model, bodies: Sequence[str] | None = None) -> tuple[
 
 
 def _effects(model: Model, tree: Tree, count: int) -> list[Array]:
-    """Of each link (rows, 10): inverse dynamics by its ten numbers at random states."""
+    """Return the derivatives (rows, 10) of inverse dynamics with respect to the ten numbers of each link."""
     random, numbers = np.random.default_rng(0), tree.numbers
     N = max(STATES, 20 * count // max(model.nv, 1) + 1)
     q = random.uniform(-np.pi, np.pi, (N, model.nq))
@@ -558,7 +558,7 @@ def _sums(effects: Array, names: Sequence[str], units: Sequence[str], values: Ar
     basis = np.zeros((len(effects), 0))
     for j, effect in enumerate(effects.T):
         left = effect - basis @ (basis.T @ effect)
-        left -= basis @ (basis.T @ left)  # once more: what is left of a difference is rounded
+        left -= basis @ (basis.T @ left)  # repeated, as the first projection leaves rounding errors
         if np.linalg.norm(left) > SAME * size:
             basis = np.column_stack([basis, left / np.linalg.norm(left)])
             columns.append(j)

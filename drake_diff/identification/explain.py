@@ -1,8 +1,8 @@
-"""The smallest change of a model that explains what was recorded: one parameter, or two, or what no file has.
+"""The search for the smallest change of a model that explains recordings: of one or two parameters, or of the setup.
 
-Each change is tried alone. Where none explains the recordings, Euler steps of several lengths are tried, and then
-pairs: those that promise most at the model, and second changes beside the single ones that left least, in a pass of
-derivatives with the first one made, as a large change bends what others promise. `ranking` says when one is named.
+Each change is tried alone. If none explains the recordings, Euler steps of several lengths are tried, and then pairs.
+Pairs are the best by the linearization at the model, and the best single changes with a second change. The second
+change is predicted with derivatives at the first one, as a large change alters the prediction of others.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -40,10 +40,10 @@ from drake_diff.identification.unknowns import DELAY, LIMIT
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 
-BESIDE, LOOKED_AT_BESIDE = 3, 4  # changes beside which a second one is sought, and how many of these go on
-DELAYS_SEEN, NEAR = 4, 0.02  # passes of derivatives beside a delay, and of it how near two of them are at the end
-BEHIND = 4.0  # times the least that is promised: of what is beyond, LOOKED_AT_BESIDE enter the race
-SHORTEST_DELAY = 1e-4  # [s] beside which another change is looked for
+BESIDE, LOOKED_AT_BESIDE = 3, 4  # number of first changes of pairs, and number of second changes for each
+DELAYS_SEEN, NEAR = 4, 0.02  # maximum number of linearizations at delays; relative change of the delay that ends them
+BEHIND = 4.0  # times the best prediction: worse candidates are tried only among the first LOOKED_AT_BESIDE
+SHORTEST_DELAY = 1e-4  # [s] least delay of a pair
 TIME_STEP = "model.time_step"
 MOTIONS = ("auto", "continuous")
 Search = Callable[[], list[Tried]]
@@ -56,29 +56,29 @@ def explain(
     noise: Mapping[str, float] | None = None,
     motion: str = "auto",
 ) -> Explanation:
-    """Name the smallest change of a model that explains recordings of its motion.
+    """Find the smallest change of a model that explains recordings of its motion.
 
-    Each parameter is tried alone: masses, centres of mass, inertias, dampings, springs, rotor inertias, offsets of
-    joints and gravity; and what is no parameter of a file: dry friction, the strength and the limit of each input, a
-    delay of all inputs, and biases of sensors. Before these, mistaken columns are tried: two that are exchanged, one
-    with the other sign, degrees where radians belong. Where none of them explains the recordings alone, semi-implicit
-    Euler steps of several lengths are tried, with one change or none, and then pairs.
+    Mistaken columns are tried first: two exchanged columns, wrong signs, and degrees instead of radians. Then each
+    parameter is tried alone: masses, centres of mass, inertias, dampings, springs, rotor inertias, offsets of joints
+    and gravity. Quantities that model files lack are also tried: Coulomb friction, the strength and the limit of each
+    input, a delay of all inputs, and biases of sensors. If none explains the recordings alone, semi-implicit Euler
+    steps of several lengths are tried, with one change or none, and then pairs of changes.
 
     Args:
         model: The model.
         recordings: As for `dd.identify`.
-        noise: The standard deviation of the noise of states, by name. What is not given is estimated.
-        motion: "continuous" looks at motions in which bodies touch or a joint is beyond its limit as if these did
-            nothing. "auto" looks at motions in which bodies touch by the model's own steps, and refuses limits.
+        noise: The standard deviation of the noise of states, by name. Missing values are estimated.
+        motion: "continuous" ignores contact and joint limits in the recordings. "auto" simulates recordings with
+            contact by the model's own steps, and refuses recordings in which a joint is beyond its limit.
 
     Returns:
-        `.names`, `.values` with `.intervals` (95 %), `.alternatives` that the recordings cannot tell from it, and a
-        `.sentence`. No names with `.explained`: the model is right as far as the recordings can tell. No names without
-        it: no change of one or two numbers explains them.
+        `.names`, `.values` with `.intervals` (95 %), `.alternatives` that the recordings cannot distinguish from it,
+        and a `.sentence`. If `.names` is empty and `.explained` is true, the model agrees with the recordings. If
+        `.explained` is false, no change of one or two quantities explains them.
 
     Raises:
-        InputError, UnknownNameError, ShapeError, NonFiniteError: A recording is not one of this model.
-        ModelError: The model has no motion in continuous time there: a joint is beyond its limit, or controllers or
+        InputError, UnknownNameError, ShapeError, NonFiniteError: A recording does not fit the model.
+        ModelError: The recorded motion is not one in continuous time: a joint is beyond its limit, or controllers or
             constraints act.
 
     Source:
@@ -118,7 +118,7 @@ def explain(
 
 @dataclass(eq=False, kw_only=True)
 class _Search(Candidates):
-    """What is tried, one after the other."""
+    """The sequence of searches."""
 
     nearest: Tried | None = None
 
@@ -132,7 +132,7 @@ class _Search(Candidates):
         return explanation or (self.nothing() if base.explains else self.without(base))
 
     def by_one(self, how: str = "") -> tuple[Explanation | None, Tried, View, list[Runner]]:
-        """(what one change explains, the model as it is, what all promise there, the changes that were fitted)."""
+        """Return (explanation by one change, fit of the unchanged model, its linearization, all candidates)."""
         nothing = self.of(())
         runner = self.running((), nothing, self.starts, nothing.z_start, NO_PROMISE)
         before = np.inf
@@ -146,7 +146,7 @@ class _Search(Candidates):
             raise SimulationError(f"{self.model.name} has no motion near the states that were measured")
         count = len(alone.freedoms)
         chosen = self.chosen(alone, [(i,) for i in range(count)])
-        if self.delay is not None:  # none at all promises little of one of several samples
+        if self.delay is not None:  # at zero delay, the prediction is poor for a delay of several samples
             chosen.setdefault((f"model.{DELAY}",), Promise((self.delay,), alone.most, 1.0, np.zeros(1)))
         singles, runners = self.tried(alone, chosen, base)
         named = self.enough(base, singles, count)
@@ -155,11 +155,11 @@ class _Search(Candidates):
 
     @property
     def delay(self) -> int | None:
-        """Which change is that of a delay."""
+        """The index of the delay among the changes."""
         return next((i for i in self.of_inputs if self.unknowns.each[i].quantity == DELAY), None)
 
     def by_steps(self, base: Tried, runners: Sequence[Runner]) -> Explanation | None:
-        """By Euler steps of a length, with one other change or none, where they leave clearly less, or little."""
+        """Try Euler steps that reduce the residuals clearly or to the noise level, with one other change or none."""
         fitted = [runner for runner in runners if runner.fit.unknowns.delay is None and np.isfinite(runner.left)]
         nothing = self.of(())
         none = self.running((), nothing, self.starts, nothing.z_start, NO_PROMISE)
@@ -197,7 +197,7 @@ class _Search(Candidates):
         )
 
     def left_by(self, step: float | None, case: Runner) -> float:
-        """What a step of Gauss and Newton leaves of the squares by Euler steps of this length."""
+        """Return the loss after a Gauss-Newton step with Euler steps of this length (None: continuous time)."""
         self.step = step
         runner = self.running(case.names, case.fit.unknowns, case.starts, case.z, NO_PROMISE)
         left = runner.left if runner.step() else np.inf
@@ -216,7 +216,7 @@ class _Search(Candidates):
         return self.named(named) if named else None
 
     def halves(self, pairs: Sequence[Tried]) -> list[Tried]:
-        """Each change of some pairs alone, from where the pair was: the other one may do nothing."""
+        """Fit each change of some pairs alone, from the values of the pair, as the other one may be unnecessary."""
         halves: dict[str, Tried] = {}
         for pair in pairs:
             for unknown, s in self.of(pair.names).items():
@@ -230,7 +230,7 @@ class _Search(Candidates):
         return list(halves.values())
 
     def paired(self, alone: View, runners: Sequence[Runner], base: Tried) -> list[Tried]:
-        """Pairs beside the change that left least, where that is little; those that promise most; and beside others."""
+        """Try pairs with the best single change if it fits well, then the best predicted pairs, then all others."""
         beside: list[Search] = [partial(self.beside, runner, base) for runner in runners[:BESIDE]]
         first = 1 if runners and not self.is_hopeless(runners[0].left) else 0
         promising: list[Search] = [partial(self.at_the_model, alone, base), partial(self.beside_a_delay, base)]
@@ -246,7 +246,7 @@ class _Search(Candidates):
         return self.tried(alone, self.chosen(alone, combinations(moving, 2)), base)[0]
 
     def beside(self, runner: Runner, base: Tried) -> list[Tried]:
-        """Beside one change that is no delay."""
+        """Try pairs of a given change, if it is not a delay, with every other."""
         if runner.fit.unknowns.delay is not None:
             return []
         i = [unknown.name for unknown in self.unknowns.each].index(runner.names[0])
@@ -260,7 +260,7 @@ class _Search(Candidates):
         return self.tried(seen, self.chosen(seen, others, LOOKED_AT_BESIDE), base)[0]
 
     def beside_a_delay(self, base: Tried) -> list[Tried]:
-        """A change beside a delay: what each promises together with some more delay, from several delays."""
+        """Try pairs with a delay: predict each change together with a step of the delay, at several delays."""
         unknowns, last = self.unknowns.each, self.delay
         if last is None:
             return []
@@ -305,7 +305,7 @@ class _Search(Candidates):
         return unknown.start, unknown.unit
 
     def without(self, base: Tried) -> Explanation:
-        """Of recordings that no change explains."""
+        """Return the explanation for recordings that no change explains."""
         nearest = self.nearest or base
         near = f"with {' and '.join(nearest.names)}" if nearest.names else "as the model is"
         tried = "no change that was tried" if self.ended_early else "no change of one or two quantities"

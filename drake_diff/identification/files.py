@@ -1,6 +1,6 @@
-"""The directory of an identification: its record, the recordings themselves, trace.mcap and a report.
+"""The directory of an identification: its record, copies of the recordings, trace.mcap and a report.
 
-The recordings are in it as they were read, so that `verify` fits them again.
+The recordings are stored as they were read, so that `verify` can repeat the fit.
 """
 
 import json
@@ -42,26 +42,26 @@ from drake_diff.runs.rebuild import TRACE, rebuilt
 from drake_diff.runs.reproduce import contract_as, model_as
 
 REPORT = "report.html"
-MADE = (TRACE, REPORT)  # what is made again, beside the record
+MADE = (TRACE, REPORT)  # the files that are regenerated, together with the record
 OF_RECORDINGS = (
     "inputs, model and recordings: they define the task, and only who made a recording knows if a robot moved so; "
     "recordings[...].sha256 is the hash of the file that was read"
 )
-MOST_PLOTS = 12  # of coordinates
-MOST_COLUMNS = 16  # of the table of correlations
+MOST_PLOTS = 12  # plots of coordinates
+MOST_COLUMNS = 16  # columns of the table of correlations
 
 
 def save(identification: Identification, directory: str | Path, *, meshes: bool = True) -> FitRecord:
     """Write the directory of an identification: record, recordings, model file, trace and report; see `runs.save`.
 
-    Raises InputError where it did not come from `identify`, ArtifactError where a recording's file has changed since.
+    Raises InputError if it is not a result of `identify`, ArtifactError if a recording's file has changed since.
     """
     with written_whole(directory) as folder:
         return write_identification(identification, folder, meshes=meshes)
 
 
 def write_identification(identification: Identification, folder: Path, *, meshes: bool = True) -> FitRecord:
-    """Write what `save` does into `folder`, which `written_whole` gave."""
+    """Write the files of `save` into `folder`, which is from `written_whole`."""
     asked, name = _asked(identification), name_of(folder)
     stored = (folder.with_name(name) / RECORDINGS).resolve()
     for recording, given in zip(asked.recordings, asked.files, strict=True):
@@ -100,7 +100,7 @@ def _check_file(name: str, path: Path, sha256: str, stored: Path) -> None:
 
 
 def _files(path: Path) -> list[Path]:
-    """The file, or those of a folder."""
+    """Return the file itself, or all files of a folder."""
     return [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
 
 
@@ -137,7 +137,7 @@ def _begun(name: str, asked: Request) -> FitRecord:
 
 
 def record_of(e: Identification, name: str) -> FitRecord:
-    """The record of an identification, but for the files."""
+    """Return the record of an identification, without the list of files."""
     asked = _asked(e)
     recordings = [_recording(i, e, asked) for i in range(len(asked.recordings))]
     begun = _begun(name, asked)
@@ -158,10 +158,10 @@ def record_of(e: Identification, name: str) -> FitRecord:
 
 
 def _data(recordings: Sequence[records.RecordingEvidence]) -> DataBoundary:
-    """Which spans of which recordings were fitted, and which were predicted only."""
+    """Return the spans of the recordings that were fitted, and those that were only predicted."""
 
     def use(r: records.RecordingEvidence, span: list[float], is_all: bool) -> DataUse:
-        sha256 = r.sha256 if is_all else None  # that of a file is of no span in it
+        sha256 = r.sha256 if is_all else None  # the hash of a file does not identify a span in it
         return DataUse(name=f"{r.path}, {span[0]:g} to {span[1]:g} s", what=f"recording {r.name}", sha256=sha256)
 
     seen = [use(r, span, not r.held_out_s) for r in recordings for span in r.fitted_s]
@@ -201,7 +201,7 @@ def _recording(i: int, e: Identification, asked: Request) -> records.RecordingEv
 
 
 def estimates_of(e: Identification) -> list[records.Estimate]:
-    """Each entry of each value with its interval."""
+    """Return each entry of each value with its interval."""
     estimates = []
     for name, value in e.values.items():
         now, was, limits = np.atleast_1d(value), np.atleast_1d(e.start[name]), np.reshape(e.intervals[name], (-1, 2))
@@ -220,8 +220,8 @@ def _correlation(covariance: Array) -> list[list[float | None]]:
 
 
 def write_made(folder: Path, e: Identification, record: FitRecord) -> None:
-    """Write `MADE`."""
-    fields = json.loads(canonical(record.model_dump(mode="json")))  # in the order in which the record is written
+    """Write the files of `MADE`."""
+    fields = json.loads(canonical(record.model_dump(mode="json")))  # in the order of the written record
     _write_trace(folder / TRACE, e, {record.FILE: ("application/json", reproducible(fields).encode())})
     plots = [*_motion_plots(e), *_residual_plots(e)]
     data = page_data(max(float(m.piece.times[-1]) for m in e.motions), plots)
@@ -229,10 +229,10 @@ def write_made(folder: Path, e: Identification, record: FitRecord) -> None:
 
 
 def _write_trace(path: Path, e: Identification, attachments: Mapping[str, tuple[str, bytes]]) -> None:
-    """Write what was measured and how the model moves with the values found, and with its own, on one axis of time.
+    """Write the measured motion, and the model's motion with the estimated and the initial values, on one time axis.
 
-    Of recording k: /k/measured/state (NaN is what was not measured), /k/input, /k/fitted/state and, where it was looked
-    at, /k/before/state. The frames are those of the first recording.
+    The channels of recording k are /k/measured/state (NaN if not measured), /k/input, /k/fitted/state and, if it was
+    computed, /k/before/state. The frames are those of the first recording.
     """
     asked = _asked(e)
     model, contract = asked.model, asked.model.contract
@@ -259,10 +259,10 @@ def _channels_of(e: Identification, asked: Request, i: int) -> Iterator[Channel]
 
 
 def reproduce(folder: Path, record: FitRecord, models: Path | None) -> Reproduced:
-    """The fit once more from the recordings in the directory, and all that was written of it.
+    """Repeat the fit from the recordings in the directory, and regenerate its files.
 
-    ArtifactError where the directory does not have what the record says; ModelError where the model cannot be rebuilt,
-    `models` as in `rebuilt`.
+    Raises ArtifactError if the directory does not match the record, ModelError if the model cannot be rebuilt.
+    `models` is as in `rebuilt`.
     """
     if record.inputs.parameters == [] or not record.recordings:
         raise ArtifactError(f"{record.FILE}: it lists no parameters or no recordings")
@@ -289,7 +289,7 @@ def reproduce(folder: Path, record: FitRecord, models: Path | None) -> Reproduce
 
 
 def _options(inputs: records.Asked) -> dict[str, Any]:
-    """What `identify` was called with beside model, recordings and parameters."""
+    """Return the arguments of `identify` other than model, recordings and parameters."""
     ends = (-np.inf, np.inf)
     return {
         "noise": inputs.noise or None,
@@ -307,7 +307,7 @@ def _options(inputs: records.Asked) -> dict[str, Any]:
 
 
 def _stored(folder: Path, record: FitRecord, i: int, model: Any) -> tuple[Recording, tuple[Path, str] | None]:
-    """A recording in the directory, and its file with the hash, if it is not arrays."""
+    """Read a recording of the directory; return it, and its file with the hash, or None if it is stored as arrays."""
     stored = record.recordings[i]
     name, path = ARRAYS if stored.file is None else stored.file, folder / stored.path
     if stored.path != f"{RECORDINGS}/{i}/{name}" or Path(name).name != name or name in ("", "..", "."):
@@ -321,9 +321,9 @@ def _stored(folder: Path, record: FitRecord, i: int, model: Any) -> tuple[Record
 
 
 def _joined(e: Identification, i: int) -> tuple[Array, ...]:
-    """times (n,), measured, fitted and earlier states (n, nx) of a recording's stretches, NaN where there is none.
+    """Return times (n,), and measured, fitted and initial states (n, nx) of a recording's pieces; NaN if missing.
 
-    A sample where one stretch ends and the next begins is as the next one has it.
+    A sample that ends one piece and starts the next has the value of the next.
     """
     motions = sorted((m for m in e.motions if m.piece.recording == i), key=lambda motion: float(motion.piece.times[0]))
 
@@ -336,7 +336,7 @@ def _joined(e: Identification, i: int) -> tuple[Array, ...]:
 
 
 def _motion_plots(e: Identification) -> Iterator[Plot]:
-    """What was measured beside the model's motion."""
+    """Yield plots of the measured motion and of the model's motion."""
     model = _asked(e).model
     units = [c.unit for c in (*model.contract.positions, *model.contract.velocities)]
     for i, recording in enumerate(_asked(e).recordings):
@@ -349,7 +349,7 @@ def _motion_plots(e: Identification) -> Iterator[Plot]:
 
 
 def _residual_plots(e: Identification) -> Iterator[Plot]:
-    """What is left of each entry that was fitted, in standard deviations of the noise."""
+    """Yield plots of the residuals of each fitted entry, in standard deviations of the noise."""
     times = np.concatenate([m.piece.times for m in e.motions if not m.piece.held_out])
     order = np.argsort(times, kind="stable")
     looks: dict[str, Any] = {

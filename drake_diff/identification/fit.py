@@ -1,14 +1,14 @@
-"""Weighted least squares over pieces of motion, each from a first state of its own, by multiple shooting.
+"""Weighted least squares over pieces of motion, each with its own first state, by multiple shooting.
 
-A piece is cut into segments. The state at the start of each is an unknown as well, and the gaps between segments are
-closed together with the least squares (Bock's generalized Gauss-Newton method): a step is linearized along the measured
-motion, however unstable it is, and where the gaps are closed it is one motion over the whole piece. With the linearized
-gaps a segment's state follows from the piece's first state and from z, which leaves
+A piece is cut into segments. The state at the start of each segment is also an unknown, and the gaps between segments
+are closed as the least squares are solved (Bock's generalized Gauss-Newton method). A step is linearized along the
+measured motion, even if the motion is unstable. With closed gaps, the segments form one motion over the whole piece.
+The linearized gaps give a segment's state from the piece's first state and z, which leaves
 
     min | r - J (d_first, dz) |^2 + | (z + dz - z_file) / width |^2
 
-whose d_first of each piece are taken out by a QR factorization of their own. The second term only decides where the
-data say nothing: it is one standard deviation where a quantity is three times its own size away from the file's.
+A QR factorization of each piece eliminates its d_first. The second term matters only where the data are uninformative:
+it is one standard deviation if a quantity differs from the file's by three times its own size.
 """
 
 from collections.abc import Sequence
@@ -28,40 +28,40 @@ from drake_diff.identification.unknowns import BIAS, Unknowns
 from drake_diff.model.model import Model
 from drake_diff.model.tangent import tangent_space
 
-SEGMENT_SAMPLES = 5  # of a segment at least
-GROWTH = 1e6  # of a small motion within a piece, beyond which its end says nothing of its start: it is cut in two
+SEGMENT_SAMPLES = 5  # minimum number of samples of a segment
+GROWTH = 1e6  # growth of a perturbation beyond which a piece's end does not determine its start, and it is cut
 LARGEST = 1.0  # the largest change of an unknown in one step, in widths / FAR
-SETTLED = 1e-5  # of |r|^2, in units of the noise: what a last step may still gain
-PROMISED = 1e-2  # the same where slopes promise more than there is, as by kinks: a tenth of a standard deviation
-CLOSED = 1e-3  # of the noise: how far gaps may stand open at the end
+SETTLED = 1e-5  # predicted decrease of |r|^2, in units of the noise, below which the fit has converged
+PROMISED = 1e-2  # the same where derivatives predict too much, as at kinks: a tenth of a standard deviation
+CLOSED = 1e-3  # largest gaps of a converged fit, in units of the noise
 HALVINGS = 8
-FARTHER = 3.0  # by which a step may lead farther each time that a whole one did well, where motion kinks
-NEAR = 10.0  # times how well a velocity is known from the samples around: about how far a step leads where motion kinks
-TOO_LARGE = 1e100  # of a derivative, in units of the noise: its square is beyond what numbers hold
+FARTHER = 3.0  # growth of the trust region after an accepted full step, for motions with kinks
+NEAR = 10.0  # radius of the trust region of velocities, in units of their measured accuracy, for motions with kinks
+TOO_LARGE = 1e100  # derivative, in units of the noise, above which its square may overflow
 STUCK = "the line search found no motion that is closer to the measurements"
-NO_PRIOR = 1e-7  # [1/rad, 1/m] what keeps a first state that nothing measures from going anywhere
+NO_PRIOR = 1e-7  # [1/rad, 1/m] regularization that bounds first states without measurements
 
 
 @dataclass(eq=False)
 class Segments:
-    """All segments of all pieces side by side, in the order of time."""
+    """All segments of all pieces as one batch, in the order of time."""
 
     pieces: list[Excerpt]
     of_piece: NDArray[np.intp]  # (K,)
-    first: NDArray[np.intp]  # (K,) the sample that each starts at
+    first: NDArray[np.intp]  # (K,) the sample at which each segment starts
     hs: Array  # (K, M), padded with steps of length 0
     us: Array  # (K, M, nu)
-    counts: NDArray[np.intp]  # (K,) steps of each
-    samples: list[NDArray[np.intp]]  # of each segment, the samples of its piece that belong to it
-    at: list[NDArray[np.intp]]  # and after how many steps they are
-    by_delay: Array  # (K, M) the lengths of the steps by a delay of inputs
+    counts: NDArray[np.intp]  # (K,) number of steps of each segment
+    samples: list[NDArray[np.intp]]  # for each segment, the samples of its piece that belong to it
+    at: list[NDArray[np.intp]]  # for each segment, the number of steps before these samples
+    by_delay: Array  # (K, M) derivatives of the step lengths with respect to a delay of inputs
 
 
 def steps_between(law: Law, piece: Excerpt, k: int, delay: float | None) -> tuple[Array, Array, Array]:
-    """From sample k to the next: lengths of the steps (m,) [s], inputs (m, nu), and the lengths by the delay (m,).
+    """Return step lengths (m,) [s] and inputs (m, nu) from sample k to the next, and d length / d delay (m,).
 
-    With a delay, steps end where an input changes too; before the first input it is as if that had always acted. An
-    input that changes at a sample makes steps of no length, by which the delay has a derivative there.
+    With a delay, steps also end where an input changes. The first input also acts before its time. An input that
+    changes at a sample makes steps of zero length, which carry the derivative with respect to the delay.
     """
     a, b = float(piece.times[k]), float(piece.times[k + 1])
     if delay is None:
@@ -86,7 +86,7 @@ def steps_between(law: Law, piece: Excerpt, k: int, delay: float | None) -> tupl
 
 
 def cut_segments(law: Law, pieces: Sequence[Excerpt], nu: int, delay: float | None = None) -> Segments:
-    """The last sample of a piece belongs to its last segment, any other to the segment that it starts or is within."""
+    """Cut pieces into segments; a boundary sample belongs to the later segment, the last sample to the last one."""
     of_piece, first, hs, us, samples, offsets, by_delay = [], [], [], [], [], [], []
     for p, piece in enumerate(pieces):
         n = len(piece.times)
@@ -120,26 +120,26 @@ def cut_segments(law: Law, pieces: Sequence[Excerpt], nu: int, delay: float | No
 
 @dataclass(frozen=True, eq=False)
 class Reduced:
-    """The least squares at a point, in z alone: min | b - R dz |^2 + rest, and what first states follow from dz."""
+    """The least squares at a point in z alone, min | b - R dz |^2 + rest, and the first states as functions of dz."""
 
-    now: float  # |r|^2 with no step, gaps linearized
+    now: float  # |r|^2 without a step, gaps linearized
 
     R: Array  # (np, np)
     b: Array  # (np,)
     rest: float
-    own: list[tuple[Array, Array, Array]]  # of each piece: R_ss (2 nv, 2 nv), R_sz (2 nv, np), b_s (2 nv,)
-    nodes: list[tuple[Array, Array]]  # of each segment: D (2 nv, 2 nv + np) and e (2 nv,): its start moves by D d + e
-    residuals: list[Array]  # of each piece (n, 2 nv + m), gaps linearized, in units of the noise; NaN where unmeasured
-    each: list[Array]  # of each piece by itself, R (np, np)
+    own: list[tuple[Array, Array, Array]]  # per piece: R_ss (2 nv, 2 nv), R_sz (2 nv, np), b_s (2 nv,)
+    nodes: list[tuple[Array, Array]]  # per segment: D (2 nv, 2 nv + np) and e (2 nv,); its start moves by D d + e
+    residuals: list[Array]  # per piece (n, 2 nv + m), gaps linearized, in units of the noise; NaN if unmeasured
+    each: list[Array]  # R (np, np) of each piece alone
 
     @property
     def finite(self) -> bool:
-        """Whether its numbers are small enough to go on with."""
+        """Whether all entries are finite and below TOO_LARGE."""
         return bool(np.all(np.abs(np.column_stack([self.R, self.b])) < TOO_LARGE))
 
 
 class Fit:
-    """Unknowns and states of one set of pieces."""
+    """The least-squares problem in the unknowns and states of a set of pieces."""
 
     def __init__(
         self,
@@ -154,7 +154,7 @@ class Fit:
         fixed: bool = False,
     ):
         self.sensors = Sensors(None, (), ()) if sensors is None else sensors
-        self.fixed = fixed  # whether the unknowns stay, and only first states are sought
+        self.fixed = fixed  # whether the unknowns are fixed, and only first states are estimated
         self.model, self.law, self.chart, self.unknowns, self.noise = model, law, chart, unknowns, noise
         self.segments = cut_segments(law, pieces, model.nu, None if unknowns.delay is None else 0.0)
         self.gap_scale = np.empty(chart.size)
@@ -165,16 +165,16 @@ class Fit:
 
     @property
     def count(self) -> int:
-        """How many numbers were measured."""
+        """The number of measurements."""
         return int(sum(np.isfinite(self._measured(p)).sum() for p in range(len(self.segments.pieces))))
 
     @property
     def shorter(self) -> Law | None:
-        """The law by steps of half the length of those that there are; None where they are the model's own."""
+        """The law with steps of half the present length; None if they are the model's own."""
         return self.law.shorter(float(np.max(self.segments.hs)))
 
     def cut(self, values: Array) -> Segments:
-        """The segments with the steps that these values make: those of a delay of inputs are its own."""
+        """Return the segments for these values; a delay of inputs changes their steps."""
         if self.unknowns.delay is None:
             return self.segments
         return cut_segments(self.law, self.segments.pieces, self.model.nu, float(values[self.unknowns.delay]))
@@ -185,7 +185,7 @@ class Fit:
         return np.where(np.isfinite(self.noise), every, np.nan)
 
     def at(self, z: Array, starts: Array) -> "FittedMotion | None":
-        """The motion there; None where there is none."""
+        """Simulate the segments at z from these starts; return None if the motion does not exist."""
         values = self.unknowns.values(z)
         if not isinstance(self.law, DiscreteMotion) and not self.law.is_possible(values):
             return None
@@ -211,7 +211,7 @@ class Fit:
         return FittedMotion(z, starts, xs, residuals, gaps, value, float(np.linalg.norm(gaps / self.gap_scale)), s)
 
     def states(self, solved: "Solved") -> list[Array]:
-        """(n, nx) of each piece: the motion at its samples."""
+        """Return the states (n, nx) of each piece at its samples."""
         values = self.unknowns.values(solved.z)
         s = self.cut(values)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -222,7 +222,7 @@ class Fit:
         return states
 
     def _samples(self, s: Segments, xs: Array) -> tuple[Array, Array]:
-        """x and u at the samples of all segments, one after the other; an input is that of the step that begins."""
+        """Return x and u at the samples of all segments, concatenated; u is the input of the step that begins."""
         pairs = [(k, i) for k, offsets in enumerate(s.at) for i in offsets]
         rows, steps = np.array(pairs, dtype=np.intp).T
         return xs[rows, steps], s.us[rows, np.minimum(steps, s.us.shape[1] - 1)]
@@ -231,7 +231,7 @@ class Fit:
         return np.split(every, np.cumsum([len(offsets) for offsets in s.at])[:-1])
 
     def _read(self, values: Array, s: Segments, xs: Array) -> list[Array]:
-        """Of each segment (samples, m), what sensors read."""
+        """Return the sensor readings (samples, m) of each segment."""
         if not self.sensors.count:
             return [np.zeros((len(offsets), 0)) for offsets in s.at]
         with np.errstate(over="ignore", invalid="ignore"):
@@ -239,13 +239,13 @@ class Fit:
 
     @property
     def _continuous(self) -> TreeMotion:
-        """The law, which has rates between its steps."""
+        """The law of motion in continuous time."""
         if isinstance(self.law, DiscreteMotion):
             raise ModelError("sensors and delays of inputs need motion in continuous time")
         return self.law
 
     def _read_slopes(self, z: Array, s: Segments, xs: Array) -> list[tuple[Array, Array]]:
-        """Of each segment (samples, m, 2 nv) by the state, and (samples, m, np) by z."""
+        """Return the readings' derivatives with respect to state (samples, m, 2 nv) and z (samples, m, np)."""
         dynamics = self._continuous.dynamics(self.unknowns.values(z))
         by_x, by_z = self.sensors.slopes(dynamics, *self._samples(s, xs), self._continuous.by(z))
         return list(zip(self._split(s, by_x), self._split(s, by_z), strict=True))
@@ -257,7 +257,7 @@ class Fit:
         return shift
 
     def _bias_columns(self) -> list[tuple[int, int]]:
-        """(column of z, entry of a small motion) of each bias."""
+        """Return (column of z, entry of a tangent vector) for each bias."""
         names = (*tangent_space(self.model).names, *self.sensors.columns)
         return [
             (s.start, names.index(unknown.label))
@@ -269,9 +269,9 @@ class Fit:
         weak = np.sum(((z - self.unknowns.z_start) / self.unknowns.pulls) ** 2)
         return float(weak + np.sum(self.unknowns.prior_rows(z)[0] ** 2))
 
-    @np.errstate(over="ignore", invalid="ignore")  # of motions that grow beyond all bounds
+    @np.errstate(over="ignore", invalid="ignore")  # the motion may overflow
     def reduce(self, point: "FittedMotion", reach: float = 1.0) -> Reduced:
-        """Linearize, close the gaps to first order, and take the first states out; `reach` lets these move farther."""
+        """Linearize, close the gaps to first order, and eliminate the first states; `reach` enlarges their region."""
         z, starts, xs, residuals, gaps = point.z, point.starts, point.xs, point.residuals, point.gaps
         s, nt, nz = point.segments, self.chart.size, len(z)
         A, C = self.law.slopes(z, xs, s.hs, s.us)
@@ -328,7 +328,7 @@ class Fit:
         return Reduced(now, R[:nz, :nz], R[:nz, -1], rest, blocks, nodes, by_piece, Rs)
 
     def step_of(self, z: Array, reduced: Reduced) -> Array:
-        """dz (np,) of the linearized problem, within bounds and not far."""
+        """Return the step dz (np,) of the linearized problem, limited to the bounds and to LARGEST."""
         if self.fixed:
             return np.zeros_like(z)
         widths = self.unknowns.widths
@@ -349,7 +349,7 @@ class Fit:
         return np.asarray(step * scale)
 
     def moved(self, starts: Array, reduced: Reduced, dz: Array, fraction: float) -> Array:
-        """The starts of the segments a part of the way along the step dz."""
+        """Return the starts of the segments after a fraction of the step dz."""
         after, first = starts.copy(), {}
         for p, (R, R_z, b) in enumerate(reduced.own):
             first[p] = np.linalg.lstsq(R, b - R_z @ dz, rcond=1e-14)[0]
@@ -359,12 +359,12 @@ class Fit:
         return after
 
     def by(self, law: Law) -> "Fit":
-        """The same with another law, of segments as long."""
+        """Return the same fit with another law, whose segments have the same length."""
         arguments = self.model, law, self.chart, self.unknowns, self.segments.pieces, self.noise
         return Fit(*arguments, sensors=self.sensors, fixed=self.fixed)
 
     def solve(self, z: Array, starts: Array, most: int) -> "Solved":
-        """From z and the starts of the segments; at most so many steps. SimulationError where there is no motion."""
+        """Solve from z and the segment starts in at most `most` steps. Raises SimulationError if no motion exists."""
         merit, reach, here = 0.0, 1.0, self.at(z, starts)
         if here is None:
             raise SimulationError(
@@ -394,7 +394,7 @@ class Fit:
         return Solved(here.z, here.starts, reduced, False, most, f"it reached the limit of {most} steps")
 
     def _promised(self, here: "FittedMotion", reduced: Reduced) -> tuple[Array, float]:
-        """The step dz (np,), and how much less of |r|^2 it leaves by the linearized motion."""
+        """Return the step dz (np,), and its predicted decrease of |r|^2."""
         dz = self.step_of(here.z, reduced)
         then = reduced.rest + float(np.sum((reduced.b - reduced.R @ dz) ** 2)) + self._pull(here.z + dz)
         return dz, reduced.now + self._pull(here.z) - then
@@ -402,7 +402,7 @@ class Fit:
     def _ahead(
         self, here: "FittedMotion", reduced: Reduced, dz: Array, merit: float, gain: float
     ) -> tuple[float, "FittedMotion | None"]:
-        """The largest part of a step that does well, halved as often as needed, and where it leads."""
+        """Search along a step by halving; return the accepted fraction and the motion there, or None."""
         for fraction in (0.5**k for k in range(HALVINGS + 1)):
             ahead = self.at(
                 np.clip(here.z + fraction * dz, *self.unknowns.bounds), self.moved(here.starts, reduced, dz, fraction)
@@ -415,20 +415,20 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class FittedMotion:
-    """A motion of all segments from their starts."""
+    """The motion of all segments from their starts."""
 
     z: Array
     starts: Array
     xs: Array  # (K, M+1, nx)
-    residuals: list[Array]  # of each segment (samples, 2 nv + m) in units of the noise
-    gaps: Array  # (K, 2 nv), 0 where a piece ends
-    value: float  # |r|^2 with the pull to the file's values
-    gap: float  # the size of the gaps
+    residuals: list[Array]  # per segment (samples, 2 nv + m), in units of the noise
+    gaps: Array  # (K, 2 nv), 0 at the end of a piece
+    value: float  # |r|^2 with the regularization towards the file's values
+    gap: float  # norm of the scaled gaps
     segments: Segments
 
 
 def _triangle(matrix: Array) -> Array:
-    """(n, n) R with R' R = matrix' matrix, of a matrix (m, n)."""
+    """Return R (n, n) with R' R = matrix' matrix, for a matrix (m, n)."""
     n = matrix.shape[1]
     triangle: Array = np.asarray(np.linalg.qr(matrix, mode="r"))
     return np.vstack([triangle, np.zeros((max(0, n - len(triangle)), n))])
@@ -436,7 +436,7 @@ def _triangle(matrix: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """Where the least squares ended."""
+    """The result of the least squares."""
 
     z: Array
     starts: Array
@@ -447,12 +447,12 @@ class Solved:
 
     @property
     def stuck(self) -> bool:
-        """Whether no step led on, by the derivatives that there were."""
+        """Whether the line search failed."""
         return self.why == STUCK
 
 
 def growth_cuts(fit: Fit, z: Array, starts: Array) -> list[Excerpt]:
-    """The pieces, cut where a small motion of their start has grown by GROWTH."""
+    """Return the pieces, cut where a perturbation of their start has grown by GROWTH."""
     s, nt = fit.segments, fit.chart.size
     point = fit.at(z, starts)
     if point is None:

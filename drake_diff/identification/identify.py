@@ -1,4 +1,4 @@
-"""Which parameters of a model are wrong, and by how much, from recordings of its motion."""
+"""Estimation of a model's parameters, with intervals, from recordings of its motion."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -49,10 +49,10 @@ from drake_diff.model.tangent import tangent_space
 
 MOTIONS = ("auto", "continuous", "steps", "impacts")
 TOUCH = "bodies touch"
-SHORTEST = 1e-4  # [s] of the steps of Runge and Kutta
-STEP_ERROR = 1e-3  # of the noise: what a step of half the length may change over a segment
-ROUNDS = 5  # of estimating the noise
-DELAYS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0)  # of a time between samples: delays that are tried at first
+SHORTEST = 1e-4  # [s] least length of a Runge-Kutta step
+STEP_ERROR = 1e-3  # in units of the noise: largest change over a segment by steps of half the length
+ROUNDS = 5  # maximum number of rounds of noise estimation
+DELAYS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0)  # in sample periods: initial guesses of a delay
 SAME_NOISE = 0.01
 
 
@@ -72,36 +72,36 @@ def identify(
     """Estimate parameters of a model from recordings of its motion, with intervals.
 
     Args:
-        model: The model; its own values are where the search begins.
-        recordings: One or more of `dd.Recording`, or files as `comparison.read_recording` takes them. States that
-            were not measured are NaN, or columns that a file lacks; positions alone are enough. Inputs are held from
-            each sample to the next. Samples may be any time apart.
-        parameters: Names as by `dd.list_parameters`, and beside them JOINT.coulomb_friction, INPUT.strength and
-            STATE.bias, and model.input_delay [s], by which inputs act later than they are recorded; or "all": masses,
-            centres of mass, inertias, dampings, spring stiffnesses and rotor inertias.
-        noise: The standard deviation of the noise of states, by name. What is not given is estimated.
-        held_out: Which part of each recording, its end, is not fitted but predicted; or the name of a recording.
-        motion: Which motion is fitted:
+        model: The model; its own values are the initial guess.
+        recordings: One or more of `dd.Recording`, or files for `comparison.read_recording`. States that were not
+            measured are NaN, or columns that are missing in a file; positions alone are enough. Inputs are constant
+            from each sample to the next. The sample times need not be equidistant.
+        parameters: Names as in `dd.list_parameters`, and also JOINT.coulomb_friction, INPUT.strength, STATE.bias and
+            model.input_delay [s], by which inputs act later than they are recorded. Or "all": masses, centres of mass,
+            inertias, dampings, spring stiffnesses and rotor inertias.
+        noise: The standard deviation of the noise of states, by name. Missing values are estimated.
+        held_out: The fraction at the end of each recording that is predicted instead of fitted, or a recording's name.
+        motion: The motion law that is fitted:
 
             - "continuous": the model's equations of motion in continuous time, without contact, limits and controllers;
-            - "steps": the model's own discrete steps with all that acts in them, contact parameters included;
-            - "impacts": the model's own steps through impacts, by `identify_contact`'s search: contact parameters,
-              centres of mass and biases, of motions with every position and velocity measured;
-            - "auto": continuous, but steps where bodies touch, a joint is beyond its limit, or the model has no other.
-        max_iterations: How many steps of Gauss and Newton the fit may take; through impacts there are 32 at most.
-        priors: What is known of parameters beside the recordings: mean and standard deviation, by name. It counts as
-            one measurement more; without it the file's value only decides where the data say nothing.
+            - "steps": the model's own discrete steps with all their forces, contact parameters included;
+            - "impacts": the model's own steps through impacts, by the search of `identify_contact`: contact parameters,
+              centres of mass and biases, for motions with every position and velocity measured;
+            - "auto": "continuous", or "steps" if bodies touch, a joint is beyond its limit, or only steps are possible.
+        max_iterations: The maximum number of Gauss-Newton steps of the fit; through impacts, the limit is 32.
+        priors: Prior knowledge of parameters: mean and standard deviation, by name. A prior counts as one more
+            measurement. Without a prior, the file's value matters only where the data are uninformative.
         bounds: Lower and upper bound of parameters, by name.
-        sensors: Where sensors sit that recordings have columns of and that are not the frame of a body: by label, the
-            body and x, y, z [m], or x, y, z, roll, pitch, yaw [rad], in its frame.
+        sensors: The mounts of recorded sensors that are not at the frame of a body: by label, the body and x, y, z
+            [m], or x, y, z [m], roll, pitch, yaw [rad], in the body's frame.
 
     Returns:
         `.values`, `.intervals` (95 %), `.unidentifiable`, `.explained` with its `.reason`, and a `.sentence`.
 
     Raises:
-        InputError, UnknownNameError, ShapeError, NonFiniteError: A recording is not one of this model, or a name is
-            none of its parameters.
-        ModelError: The model has no motion that can be fitted here; says why.
+        InputError, UnknownNameError, ShapeError, NonFiniteError: A recording does not fit the model, or a name is not
+            one of its parameters.
+        ModelError: The model has no motion that can be fitted; the message gives the reason.
 
     Source:
         Multiple shooting: Bock, "Recent advances in parameter identification techniques for ODE" (1983).
@@ -161,7 +161,7 @@ def identify(
 
 
 def what_acts(model: Model, chart: Chart, pieces: Sequence[Excerpt]) -> str:
-    """What acts in the recordings that motion in continuous time leaves out; empty where nothing does."""
+    """Return what acts in the recordings but not in continuous-time motion (contact, limits), or "" if nothing."""
     lower, upper = model.position_limits
     for piece in pieces:
         q = piece.ys[:, : model.nq]
@@ -179,20 +179,20 @@ def what_acts(model: Model, chart: Chart, pieces: Sequence[Excerpt]) -> str:
 
 @dataclass(eq=False)
 class Problem:
-    """Recordings, what is sought in them, and the noise that weights them."""
+    """An estimation problem: recordings, unknowns, and the noise that weights the residuals."""
 
     model: Model
     chart: Chart
     unknowns: Unknowns
     pieces: list[Excerpt]
-    stated: Array  # (2 nv + m,) the noise as it was given, NaN where it was not
-    scatter: Array  # (2 nv + m,) that of neighbouring samples
+    stated: Array  # (2 nv + m,) the given noise; NaN if not given
+    scatter: Array  # (2 nv + m,) the noise estimated from neighbouring samples
     sensors: Sensors | None = None
-    jumps: bool = False  # whether the motion does, as through impacts
+    jumps: bool = False  # whether the motion has jumps, as at impacts
 
     @property
     def entries(self) -> tuple[str, ...]:
-        """A name for each number of a sample."""
+        """The name of each entry of a sample."""
         return (*tangent_space(self.model).names, *(() if self.sensors is None else self.sensors.columns))
 
     def fit(self, law: Law, pieces: Sequence[Excerpt], noise: Array, *, fixed: bool = False) -> Fit:
@@ -212,7 +212,7 @@ class Problem:
         return [piece for piece in self.pieces if not piece.held_out]
 
     def prepared(self, law: Law) -> tuple[Fit, Array]:
-        """By steps that follow the motion, over pieces that are short enough; and a guess of the starts of segments."""
+        """Return a fit with short enough integration steps and pieces, and a guess of the starts of its segments."""
         z, noise = self.unknowns.z_first, self.first_noise
         fit = self.fit(law, self.fitted, noise)
         starts = self.guess(fit)
@@ -222,7 +222,7 @@ class Problem:
         return fit, self.guess(fit)
 
     def solve(self, law: Law, most: int) -> tuple[Fit, Solved]:
-        """With steps so short that half of them give the same motion over the segments, at the start and at the end."""
+        """Fit with steps so short that halving them does not change the motion, at the first and the last values."""
         fit, starts = self.prepared(law)
         z, pieces = self.first(fit, starts), fit.segments.pieces
         while True:
@@ -233,9 +233,9 @@ class Problem:
             fit = self.shortened(fit, pieces, fit.noise)
 
     def first(self, fit: Fit, starts: Array) -> Array:
-        """Where the search begins: the model's values, and of some delays that by which the rest could fit best.
+        """Return the initial guess: the model's values, and the delay with the best prediction for the rest.
 
-        A step of Gauss and Newton sees a delay only as far as inputs stay what they are.
+        A Gauss-Newton step is valid in the delay only while the inputs stay constant.
         """
         z, column = self.unknowns.z_first, self.unknowns.delay
         if column is None:
@@ -254,7 +254,7 @@ class Problem:
         return np.array(min(tried)[1]) if tried else z
 
     def follows(self, fit: Fit, z: Array, starts: Array) -> bool:
-        """Whether steps of half the length lead to the same ends of all segments; the model's own steps need not."""
+        """Return whether steps of half the length give the same segment ends; True for the model's own steps."""
         shorter = fit.shorter
         if shorter is None:
             return True
@@ -275,9 +275,9 @@ class Problem:
         return self.fit(law, pieces, noise)
 
     def weighted(self, fit: Fit, z: Array, starts: Array, most: int) -> tuple[Fit, Solved]:
-        """Least squares, weighted anew until the residuals have the noise that they are weighted by.
+        """Solve the least squares, reweighted until the weights match the noise of the residuals.
 
-        Or until steps are too long for where it leads: what is left then is no noise.
+        The iteration also ends if the steps are too long for the solution, as the residuals are then not noise.
         """
         for _ in range(ROUNDS):
             solved = fit.solve(z, starts, most)
@@ -325,7 +325,7 @@ class Problem:
     def _predicted(
         self, fit: Fit, solved: Solved, known: Known, freedom: float
     ) -> tuple[float, float, str, list[Followed]]:
-        """(error with the model's own values, with those found, why that is too much: empty where not; the motions)."""
+        """Return (error with the model's values, with the estimates, why it is too large or "", the motions)."""
         held = [piece for piece in self.pieces if piece.held_out]
         pieces = held or list(fit.segments.pieces)
         states_fit = self.fit(fit.law, pieces, fit.noise, fixed=True)
@@ -350,7 +350,7 @@ class Problem:
         return errors[0], errors[1], why, motions
 
     def doubt(self, fit: Fit, solved: Solved, why_not: str) -> str:
-        """Why the model does not explain the recordings; empty where it does."""
+        """Return why the model does not explain the recordings, or "" if it does."""
         if not solved.converged:
             return f"the fit did not converge: {solved.why}"
         off, _ = self.unknowns.prior_rows(solved.z)

@@ -1,18 +1,18 @@
-"""Contact parameters from motions through impacts: segments that start in the air, and slopes over a cloud of values.
+"""Contact parameters from motions through impacts, with segments that start in free flight and averaged derivatives.
 
-Where bodies strike each other a motion has no slope that is worth following: a touch a little earlier leads elsewhere,
-and between steps of a time-stepping law the loss is ragged. Three things help here. A segment starts where nothing
-touches, at the state whose motion through the air goes through the measured positions: these are far better than the
-velocities, which are differences of them. Segments of one or two impacts come first and whole recordings last. And the
-slopes are those of a plane laid through the residuals of many values at once, a cloud that becomes smaller: what a
-residual differs from its plane by is how far it is to be believed.
+Derivatives of a motion through impacts are of no use for a search: a slightly earlier contact leads to a different
+motion, and the loss of a time-stepping law is rough. Three measures help. First, a segment starts in free flight, at
+the state that fits the measured positions best: these are far more accurate than the velocities, which are differences
+of positions. Second, segments with one or two impacts are fitted first, and whole recordings last. Third, derivatives
+are from a linear regression of the residuals on random parameter values (a cloud, which shrinks during the search).
+The scatter of a residual about its regression plane is its uncertainty.
 
-Intervals have two parts. Slopes over a wider cloud and the scatter between recordings say how far others would lead.
-And where an impact lasts for a few steps, these matter more than noise does: the search goes on from where it ended by
-steps of half the length, and the way that this leads counts six times.
+Intervals have two parts. Derivatives from a wider cloud and the scatter between recordings give the effect of noise.
+If an impact lasts only a few steps, the time step matters more than noise: the search continues from its result with
+steps of half the length, and six times the resulting change is added.
 
-What is left is measured in units of the noise and of how far apart motions are that begin at other states which the
-same measured positions allow: through impacts small errors of a first state grow.
+Residuals are in units of the noise and of the distance between motions from other first states that the measured
+positions also allow, as small errors of a first state grow through impacts.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -37,13 +37,13 @@ from drake_diff.model.parameters import ParameterVector, applied, select
 from drake_diff.model.step import advance, set_state
 from drake_diff.model.tangent import tangent_space
 
-LEAST = 6  # samples of a flight: fewer say little of a velocity
+LEAST = 6  # minimum number of samples of a flight, which must determine a velocity
 CLEAR = 1  # samples between a flight and a sample at which shapes overlap
-ITERATIONS = 3  # of Gauss and Newton: through the air a motion is nearly linear in its first state
+ITERATIONS = 3  # Gauss-Newton iterations: free flight is nearly linear in its first state
 
 
 def flights_of(model: Model, xs: Array) -> list[tuple[int, int]]:
-    """First and last sample of each stretch of xs (n, nx) that is clear of the model's contacts."""
+    """Return the first and last sample of each part of xs (n, nx) without contact."""
     if not model.contract.contact.collision_pairs:
         return [(0, len(xs) - 1)]
     touching = np.zeros(len(xs), dtype=bool)
@@ -60,21 +60,21 @@ def flights_of(model: Model, xs: Array) -> list[tuple[int, int]]:
 
 
 class Start(NamedTuple):
-    """A first state, and what measured positions leave open of it."""
+    """A first state, and its uncertainty given the measured positions."""
 
     x: Array  # (nx,)
-    spread: Array  # (2 nv, k): small motions from x, of one standard deviation each
+    spread: Array  # (2 nv, k): tangent vectors at x, of one standard deviation each
 
     def others(self, chart: Chart, count: int, random: np.random.Generator) -> list[Array]:
-        """First states (nx,) that the same positions could have had."""
+        """Draw first states (nx,) that agree with the same positions."""
         return [chart.plus(self.x, self.spread @ random.standard_normal(self.spread.shape[1])) for _ in range(count)]
 
 
 def start_of(model: Model, chart: Chart, piece: Excerpt, scale: Array) -> Start:
-    """The state whose motion goes through the positions of a piece in which nothing touches.
+    """Fit the first state of a piece without contact to its measured positions.
 
-    By least squares, each position in units of its `scale` (nv,). Its spread is that of the scatter of what is left.
-    Parameters that are applied act.
+    The fit is by least squares, with each position in units of its `scale` (nv,). The spread is from the scatter of the
+    residuals. Applied parameters take effect.
     """
     stride, nv = steps_between(model, piece), model.nv
     us, x, none = np.repeat(piece.us, stride, axis=0), piece.ys[0], select(model, ())
@@ -92,12 +92,12 @@ def start_of(model: Model, chart: Chart, piece: Excerpt, scale: Array) -> Start:
         inverse = np.linalg.pinv(J.reshape(-1, 2 * nv))
         d = np.asarray(inverse @ e.ravel(), dtype=float)
         x = chart.plus(x, d)
-    left = np.sqrt(np.sum((e - J @ d) ** 2, axis=0) / (len(e) - 2))  # a place and a velocity of each are fitted
+    left = np.sqrt(np.sum((e - J @ d) ** 2, axis=0) / (len(e) - 2))  # minus two fitted numbers: position and velocity
     return Start(np.asarray(x), inverse * np.tile(left, len(e)))
 
 
 def steps_between(model: Model, piece: Excerpt) -> int:
-    """How many of the model's steps lie between two samples. InputError where it is no whole number."""
+    """Return the number of the model's steps between two samples. Raises InputError if it is not an integer."""
     periods = np.diff(piece.times)
     count = max(1, round(float(np.median(periods)) / model.time_step))
     if np.any(np.abs(periods - count * model.time_step) > CLOCK_TOLERANCE * model.time_step * count):
@@ -108,30 +108,30 @@ def steps_between(model: Model, piece: Excerpt) -> int:
 
 
 def millisecond(chart: Chart, pieces: list[Excerpt]) -> Array:
-    """(nv,) how far each position moves in a millisecond: what an impact that much earlier or later changes."""
+    """Return the distance (nv,) that each position moves in 1 ms: the effect of a change of an impact's time."""
     speeds = np.sqrt(np.mean(np.concatenate([p.ys[:, chart.coordinates.nq :] ** 2 for p in pieces]), axis=0))
-    for _, j in chart.coordinates.free:  # along one axis it may not have moved
+    for _, j in chart.coordinates.free:  # its motion may have no component along an axis
         for three in (slice(j, j + 3), slice(j + 3, j + 6)):
             speeds[three] = np.sqrt(np.mean(speeds[three] ** 2))
     return np.asarray(1e-3 * np.maximum(speeds, max(1e-3 * np.max(speeds), 1e-9)))
 
 
 def first_state(model: Model, recording: Recording, *, parameters: Mapping[str, Any] | None = None) -> Array:
-    """The state at the start of a recording, by its motion before anything touches.
+    """Estimate the state at the start of a recording from its motion before the first contact.
 
-    What is measured of a motion before the first contact is all that goes into it: the state whose motion, by the
-    model's own steps, goes through the measured positions.
+    Only the measurements before the first contact are used. The result is the state whose motion, by the model's own
+    steps, fits the measured positions best.
 
     Args:
-        model: Its steps are taken, so that the state fits a rollout of this model and time step.
-        recording: Every position measured; its velocities are where the search begins.
+        model: The model whose steps are used; the state suits a rollout of this model with this time step.
+        recording: A recording with every position measured; its velocities are the initial guess.
         parameters: Other values of the model's parameters, by name.
 
     Returns:
-        (nx,); the first measured state itself where fewer than 6 samples come before the first contact.
+        (nx,), or the first measured state itself if there are fewer than 6 samples before the first contact.
 
     Raises:
-        InputError: The times between samples are no whole number of steps.
+        InputError: The times between samples are not a whole number of steps.
 
     Example:
         >>> model = dd.load_model("models/sphere_on_ground.sdf", time_step=0.005)
@@ -152,46 +152,46 @@ def first_state(model: Model, recording: Recording, *, parameters: Mapping[str, 
         return start_of(applied_model, chart, piece.part(*flights[0]), millisecond(chart, [piece])).x
 
 
-ROUNDS = 5  # of reweighting
-PULL = 1e-3  # towards where a cloud stands: what no residual knows stays there
-AGAIN = 4  # steps of one width at most: it shrinks where a step is no longer than it
-FAR = 2.0  # widths of the cloud that a step may go along each direction
-# [s] how long segments go on after a flight, and the widths of the clouds of each stage.
+ROUNDS = 5  # of iterative reweighting
+PULL = 1e-3  # regularization towards the centre of a cloud, for directions that no residual determines
+AGAIN = 4  # maximum number of steps with a cloud of one width; it shrinks after a step that is not longer than it
+FAR = 2.0  # longest step along each direction, in widths of the cloud
+# Of each stage: how long segments continue after a flight [s], and the widths of the clouds.
 STAGES = (
     (0.15, tuple(0.6**k for k in range(6))),
     (np.inf, (0.1, 0.05)),
 )
-SLOPES = 0.15  # width of the cloud that intervals are from: a narrower one sees its own ragged ground
-HALF = (0.4, SLOPES)  # widths of the clouds of steps of half the length: wide enough to leave that ground
-# The grid convergence index of the coarser of two grids: an error that grows as the step does is twice what half the
-# step changes, with a safety of 3 beside. It is needed: a ball's friction was off by 0.021 and 0.014 by steps of 5 and
-# 2.5 ms, where half of 0.021 was to be expected.
+SLOPES = 0.15  # width of the cloud for intervals: a narrower one is dominated by the roughness of the loss
+HALF = (0.4, SLOPES)  # widths of the clouds for steps of half the length: wide enough to average the roughness
+# The grid convergence index of the coarser of two grids: a first-order error is twice the change by half the step,
+# times a safety factor of 3. It is needed: the error of a ball's friction was 0.021 and 0.014 by steps of 5 and
+# 2.5 ms, where half of 0.021 was expected.
 BY_HALF = 6.0
-REST = 0.15  # [s] the end of a recording: where things lie says how large they are
-# Of a positive number; [m, rad] of a bias or a length; of a radius of gyration.
+REST = 0.15  # [s] the end of a recording, where the resting positions of bodies show their sizes
+# Units of w: of a positive number's logarithm; [m, rad] of a bias or a length; fraction of a radius of gyration.
 LOG_SCALE, LENGTH_SCALE, CENTER_SCALE = 0.3, 1e-3, 0.02
-SAMPLES = 3  # every so many samples are compared: neighbours say the same
-LOST = 1000.0  # times the unit: the residual of a motion that Drake cannot step
-SEED = 0  # of clouds and other first states: the same recordings give the same values
-OTHERS = 8  # first states of each recording
+SAMPLES = 3  # every third sample is compared, as neighbours are redundant
+LOST = 1000.0  # residual, in units of `unit`, of a motion that Drake cannot simulate
+SEED = 0  # of clouds and other first states, so that results are reproducible
+OTHERS = 8  # other first states drawn for each recording
 Build = Callable[..., Model]
 Residual = Callable[[Array], Array]
 
 
 class Plane(NamedTuple):
-    """Residuals near w: r + J d, and how far to believe each."""
+    """The linear model r + J d of the residuals near w, and their uncertainty."""
 
     r: Array  # (M,)
     J: Array  # (M, n)
-    variance: Array  # (M,) of the scatter about the plane, and 1 of the residual's own
+    variance: Array  # (M,) of the scatter about the plane, plus 1 for the residual itself
 
     def weights(self, d: Array) -> Array:
-        """(M,) of the soft-L1 loss at d (n,)."""
+        """Return the weights (M,) of the soft-L1 loss at d (n,)."""
         e = self.r + self.J @ d
         return np.asarray(1 / self.variance / np.sqrt(1 + e**2 / self.variance))
 
     def step(self) -> Array:
-        """(n,) to where the loss is least."""
+        """Return the step (n,) to the minimum of the loss."""
         d: Array = np.zeros(self.J.shape[1])
         for _ in range(ROUNDS):
             weighted = self.J.T * self.weights(d)
@@ -200,7 +200,7 @@ class Plane(NamedTuple):
 
 
 def plane_at(residual: Residual, w: Array, width: float, random: np.random.Generator) -> Plane:
-    """Laid through the residuals (M,) of 4 n or more values about w (n,), in pairs."""
+    """Fit a plane to the residuals (M,) at 4 n or more values around w (n,), in antithetic pairs."""
     n = len(w)
     half = max(2 * n, 4)
     z = random.standard_normal((half, n))
@@ -213,17 +213,17 @@ def plane_at(residual: Residual, w: Array, width: float, random: np.random.Gener
 
 
 class Shrunk(NamedTuple):
-    """Where steps led."""
+    """The result of a sequence of steps."""
 
     w: Array  # (n,)
-    rounds: int  # planes that were laid
+    rounds: int  # number of planes that were fitted
     converged: bool  # whether the last step was within the narrowest cloud
 
 
 def shrink_to(residual: Residual, w: Array, widths: Sequence[float], random: np.random.Generator) -> Shrunk:
-    """Where steps lead, some for each width of the cloud, from w (n,).
+    """Take steps from w (n,), several for each width of the cloud.
 
-    Residuals are in units of what they are uncertain by at best.
+    Residuals are in units of their least uncertainty.
     """
     rounds, within = 0, False
     for width in widths:
@@ -239,7 +239,7 @@ def shrink_to(residual: Residual, w: Array, widths: Sequence[float], random: np.
 
 
 class Segment(NamedTuple):
-    """A stretch of a recording, and where its motion begins."""
+    """A part of a recording, and the first state of its motion."""
 
     piece: int
     first: int
@@ -248,18 +248,18 @@ class Segment(NamedTuple):
 
 
 class ImpactSolution(NamedTuple):
-    """Where a search ended."""
+    """The result of a search."""
 
     w: Array  # (n,)
     spread: Array  # (n,) half widths of 95 % intervals
-    half: Array | None  # (n,) where steps of half the length lead; None where the model cannot be had with them
-    correlation: Array  # (n, n); NaN where nothing is known
+    half: Array | None  # (n,) the result with steps of half the length; None if the model cannot be rebuilt with them
+    correlation: Array  # (n, n); NaN if nothing is known
     converged: bool
-    rounds: int  # planes that were laid
+    rounds: int  # number of planes that were fitted
 
 
 class ImpactSearch:
-    """Segments of all recordings, and the coordinates w in which the unknowns are sought: 0 at the model's values."""
+    """The search over all recordings, in coordinates w of the unknowns that are 0 at the model's values."""
 
     def __init__(
         self,
@@ -283,7 +283,7 @@ class ImpactSearch:
         self.unit = millisecond(self.chart, [piece for piece in self.pieces if not piece.held_out])
 
     def _scale(self, unknown: Unknown) -> tuple[float, bool]:
-        """What w = 1 changes, and whether it is of the logarithm."""
+        """Return the change of the unknown for w = 1, and whether it is a change of the logarithm."""
         if unknown.quantity in (INERTIA, STRENGTH):
             expected = "a quantity of contact; see dd.identify"
             raise InputError(unknown.name, got="a quantity of smooth motion", expected=expected)
@@ -296,21 +296,21 @@ class ImpactSearch:
         return LENGTH_SCALE / unknown.size if unknown.quantity == "radius" else LOG_SCALE, True
 
     def values(self, w: Array) -> Array:
-        """(n,) of the parameters, then of the lengths."""
+        """Return the values (n,) of the parameters, followed by those of the lengths."""
         moved, start = self.scale * w, self.unknowns.start
         return np.asarray(np.where(self.by_log, start * np.exp(np.where(self.by_log, moved, 0)), start + moved))
 
     def intervals(self, solution: ImpactSolution) -> Array:
-        """(n, 2) of the values."""
+        """Return the intervals (n, 2) of the values."""
         return np.stack([self.values(solution.w + sign * solution.spread) for sign in (-1, 1)], axis=1)
 
     def open(self, solution: ImpactSolution) -> tuple[str, ...]:
-        """What the recordings leave open: entries whose interval is wider than a factor of 3, 10 mm or 10 mrad."""
+        """Return the undetermined entries: those with half widths above a factor of 3, 10 mm or 10 mrad."""
         wide = self.scale * solution.spread > np.where(self.by_log, np.log(3.0), 0.01)
         return tuple(column for column, is_open in zip(self.unknowns.columns, wide, strict=True) if is_open)
 
     def vector(self, w: Array) -> ParameterVector:
-        """The model's parameters at w, of a model of its own where there are lengths."""
+        """Return the model's parameters at w; with lengths, those of a model that is built for them."""
         values = self.values(w)
         parameters = values[self.law.own]
         if self.build is None:
@@ -321,9 +321,9 @@ class ImpactSearch:
         return select(model, self.law.vector.to_dict()).at(parameters)
 
     def segments(self, w: Array, length: float) -> list[Segment]:
-        """From the first sample of each fitted recording and the start of each flight.
+        """Return segments from the first sample of each fitted recording and from the start of each flight.
 
-        Each goes on for `length` [s] after its flight. The end of each recording is one more.
+        A segment continues for `length` [s] after its flight. The end of each recording is a further segment.
         """
         segments = []
         with applied(self.vector(w)) as model:
@@ -344,7 +344,7 @@ class ImpactSearch:
         return segments
 
     def starts(self, w: Array, noise: Array) -> list[Start]:
-        """Of each recording, those held out too, by its first flight; else as measured, with `noise` (2 nv,)."""
+        """Return the start of each recording (held-out ones too) by its first flight, else measured with `noise`."""
         starts = []
         with applied(self.vector(w)) as model:
             for piece in self.pieces:
@@ -358,12 +358,12 @@ class ImpactSearch:
         return starts
 
     def recordings(self, w: Array, starts: Sequence[Array]) -> list[Array]:
-        """(n, nx) the motion of each recording, from starts (nx,)."""
+        """Return the simulated states (n, nx) of each recording, from starts (nx,)."""
         segments = [Segment(p, 0, len(self.pieces[p].times) - 1, x0) for p, x0 in enumerate(starts)]
         return [np.concatenate([x0[None], xs]) for x0, xs in zip(starts, self.motions(w, segments), strict=True)]
 
     def motions(self, w: Array, segments: Sequence[Segment]) -> list[Array]:
-        """Of each segment (samples - 1, nx) after its first, as they would be measured; NaN where Drake cannot step."""
+        """Return simulated measurements (samples - 1, nx) after each segment's first; NaN if Drake cannot step."""
         shift, values, motions = np.zeros(self.model.nx), self.values(w), []
         for unknown, s in self.unknowns.items():
             if unknown.quantity == BIAS:
@@ -383,7 +383,7 @@ class ImpactSearch:
         return motions
 
     def residual(self, w: Array, segments: Sequence[Segment]) -> Array:
-        """Measured minus simulated positions of every third sample of all segments, one after the other."""
+        """Return measured minus simulated positions at every third sample of all segments, concatenated."""
         residuals = []
         for segment, xs in zip(segments, self.motions(w, segments), strict=True):
             e = self.chart.minus(self.pieces[segment.piece].ys[segment.first + 1 : segment.last + 1], xs)
@@ -392,7 +392,7 @@ class ImpactSearch:
         return np.asarray(np.clip(np.where(np.isfinite(r), r, LOST), -LOST, LOST))
 
     def run(self, seed: int) -> ImpactSolution:
-        """Through all `STAGES`, with clouds drawn by `seed`."""
+        """Run all `STAGES`, with clouds drawn from `seed`."""
         w, random, rounds, converged = np.zeros(len(self.scale)), np.random.default_rng(seed), 0, True
         for length, widths in STAGES:
             segments = self.segments(w, length)
@@ -407,10 +407,10 @@ class ImpactSearch:
         return ImpactSolution(w, spread, half, correlation, converged, rounds + 1)
 
     def by_half(self, w: Array, random: np.random.Generator) -> Array | None:
-        """(n,) where the search leads from w (n,) over full recordings by steps of half the length."""
+        """Continue the search from w (n,) with full recordings and half the time step; None if not possible."""
         source = self.law.model.source
         if not self.law.model.can_rebuild or source is None or not source.exists():
-            return None  # a diagram, or a file that is gone, as a function that makes models may have it
+            return None  # a diagram, or a temporary file of a function that builds models
         model = self.law.model.at_time_step(self.law.model.time_step / 2)
         finer = ImpactSearch(model, self.pieces, self.names, self.lengths, self.build)
         return shrink_to(partial(finer.residual, segments=finer.segments(w, np.inf)), w, HALF, random).w
@@ -427,25 +427,25 @@ def identify_contact(
     """Estimate friction, stiffness, dissipation, radii and centres of mass from motions through impacts.
 
     Args:
-        model: The model; its values are where the search begins, and its discrete steps are what is fitted: several of
-            them must fit into the time for which an impact lasts. With `lengths` a function that makes a model of them.
-        recordings: Several motions with every position and velocity measured, at equal times.
-        parameters: Names as by `dd.list_parameters`, and STATE.bias: of a height, that of the ground below what was
-            measured. A number of contact moves by its logarithm.
-        lengths: [m] where the search for the function's arguments begins, such as where shapes are: a plant has no
-            parameter for that.
-        seed: Of the clouds of values from which slopes are taken.
+        model: The model; its values are the initial guess, and its discrete steps are fitted. An impact must last for
+            several of these steps. With `lengths`, a function that makes a model of them.
+        recordings: Several motions with every position and velocity measured, at equidistant times.
+        parameters: Names as in `dd.list_parameters`, and STATE.bias; the bias of a height is that of the ground below
+            the measured positions. Parameters of contact are searched in their logarithms.
+        lengths: [m] initial guesses of the function's arguments, such as positions of shapes, for which a plant has no
+            parameter.
+        seed: Seed of the clouds of values from which derivatives are computed.
 
     Returns:
-        As `dd.identify` with motion="impacts" does. `.intervals` (95 %) are by the scatter between recordings, and by
-        six times what half the time step changes, as in the grid convergence index. Where that is most of it, a shorter
+        The same as `dd.identify` with motion="impacts". `.intervals` (95 %) combine the scatter between recordings with
+        six times the change by half the time step, as in the grid convergence index. If the latter dominates, a shorter
         time step helps.
 
     Raises:
-        InputError, UnknownNameError: A recording or a name that cannot be taken; says why.
+        InputError, UnknownNameError: A recording or a name is not usable; the message gives the reason.
 
     Source:
-        Between recordings: Liang and Zeger, "Longitudinal data analysis using generalized linear models" (1986). Steps:
+        Scatter: Liang and Zeger, "Longitudinal data analysis using generalized linear models" (1986). Time step:
         Roache, "Perspective: a method for uniform reporting of grid refinement studies" (1994).
 
     Example:
@@ -472,9 +472,9 @@ def identify_contact(
 
 
 def _spread_between(plane: Plane, segments: Sequence[Segment], count: int) -> tuple[Array, Array]:
-    """(n,) half widths of 95 % intervals of w, and their correlation (n, n).
+    """Return the half widths (n,) of the 95 % intervals of w, and their correlation (n, n).
 
-    Each recording counts as one observation, however it hangs together.
+    Each recording counts as one observation, whatever the correlation within it.
     """
     n, begin = plane.J.shape[1], 0
     if count <= n:
@@ -504,10 +504,10 @@ def fit_through_impacts(
     build: Build | None = None,
     seed: int = SEED,
 ) -> Identification:
-    """Fit the pieces through impacts; those held out are predicted from their first flight.
+    """Fit the pieces through impacts; held-out pieces are predicted from their first flight.
 
-    Positions alone are judged, by their `noise` (2 nv,). InputError or UnknownNameError for a recording or a name that
-    cannot be taken.
+    Only positions are judged, by their `noise` (2 nv,). Raises InputError or UnknownNameError for an unusable recording
+    or name.
     """
     search, nv, noise = ImpactSearch(model, pieces, names, lengths, build), model.nv, noise[: 2 * model.nv]
     solution = search.run(seed)
@@ -554,7 +554,7 @@ def fit_through_impacts(
 
 
 def _predicted(search: ImpactSearch, w: Array, noise: Array) -> tuple[list[Array], list[Array]]:
-    """The motion (n, nx) of each recording, and what is left (n, 2 nv) in units of what noise explains; NaN of v."""
+    """Return the motion (n, nx) of each recording, and residuals (n, 2 nv) in units of their noise; NaN for v."""
     starts, random, nv = search.starts(w, noise), np.random.default_rng(SEED), search.model.nv
     xs = search.recordings(w, [start.x for start in starts])
     others = [start.others(search.chart, OTHERS, random) for start in starts]
@@ -575,7 +575,7 @@ def _size(residuals: Sequence[Array]) -> float:
 
 
 def _doubt(names: Sequence[str], residuals: Sequence[Array], words: str) -> str:
-    """Where residuals are larger than noise makes them; empty where they are not."""
+    """Return a sentence about the residual with the largest excess over noise, or "" if there is none."""
     if not residuals:
         return ""
     rows = np.concatenate(residuals)

@@ -1,4 +1,4 @@
-"""What the data determine, and whether the model explains them."""
+"""Identifiability and intervals of the unknowns, and tests whether the model explains the data."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,33 +14,33 @@ from drake_diff.identification.fit import NO_PRIOR, Fit, Solved
 from drake_diff.identification.recordings import ORDERS
 from drake_diff.identification.unknowns import FAR, MASS, Unknowns
 
-HOPELESS = 3.0  # times the noise: residuals that no better weights make good
+HOPELESS = 3.0  # times the noise: residuals that other weights cannot explain
 CONFIDENCE = 0.95
-UNSEEN = 1.0  # a change by so many times its own size that the data leave open at one sigma is not determined
-NOTHING = 1e-8  # of a unit's effect: rounding
-FALSE_ALARM = 0.004  # of all tests of the scatter together, where the model is right; of whole motions of all tests
-COLOURED = 0.001  # of all tests for whiteness together; of 12 columns of 200 samples it is 0.002: tails are heavier
-OF_MEDIANS = 0.6  # of the degrees of freedom: drawn, for 40 to 120 samples
+UNSEEN = 1.0  # standard deviation, in units of a quantity's size, above which a combination is not determined
+NOTHING = 1e-8  # relative singular value that is rounding
+FALSE_ALARM = 0.004  # false-alarm probability of all scatter tests, and of all whiteness tests if the motion jumps
+COLOURED = 0.001  # the same of all whiteness tests; 0.002 in fact for 12 columns of 200 samples, as tails are heavier
+OF_MEDIANS = 0.6  # factor of the degrees of freedom, from simulations of 40 to 120 samples
 LAGS = 10
-MANY = 1000  # samples, from which on Q is nearly as chi-square says
-DRAWN = 2_000_000  # numbers of white noise for each length of a piece
-SCATTER = 1.6  # times the scatter of neighbouring samples: residuals beyond it are no noise, where samples are many
+MANY = 1000  # samples above which Q is nearly chi-square distributed
+DRAWN = 2_000_000  # random numbers drawn for each length of a piece
+SCATTER = 1.6  # times the scatter of neighbouring samples: residuals above it are not noise, for many samples
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What the data say of the unknowns: the covariance of z, data alone, and combinations that they leave open."""
+    """The information of the data alone about the unknowns: the covariance of z, and undetermined combinations."""
 
-    covariance: Array  # (np, np) of z; infinite entries on the diagonal where nothing is known
-    open: tuple[Array, ...]  # directions (np,) of z, each normed to 1 in the quantities' own sizes
+    covariance: Array  # (np, np) of z; the diagonal is infinite if nothing is known
+    open: tuple[Array, ...]  # undetermined directions (np,) of z, with norm 1 in the quantities' own sizes
 
 
 def known_of(unknowns: Unknowns, z: Array, R: Array) -> Known:
-    """By the singular values of the Jacobian R (np, np) in units of the noise, first states taken out."""
+    """Compute `Known` from the Jacobian R (np, np), in units of the noise and with the first states eliminated."""
     R = np.vstack([R, unknowns.prior_rows(z)[1]])
     norms = np.linalg.norm(R, axis=0)
     sizes = unknowns.widths / FAR
-    # Of what has no size, 10 times what the data could tell of it alone: only beside others can it stay open.
+    # A quantity without a size gets 10 times its deviation if estimated alone, so it is open only in combinations.
     scale = np.where(np.isfinite(sizes), sizes, 10 / np.where(norms > 0, norms, 1.0))
     _, s, V = np.linalg.svd(R * scale)
     least = NOTHING * max(float(np.max(s, initial=0.0)), 1.0)
@@ -56,7 +56,7 @@ def known_of(unknowns: Unknowns, z: Array, R: Array) -> Known:
 
 
 def _sparse(directions: Array) -> list[Array]:
-    """The same space by directions of few entries each: elimination with the largest entry as pivot."""
+    """Return a sparse basis of the same space, by elimination with the largest entry as pivot."""
     rows, basis = np.array(directions), []
     for k in range(len(rows)):
         _, column = np.unravel_index(np.argmax(np.abs(rows[k:])), rows[k:].shape)
@@ -72,7 +72,7 @@ def _sparse(directions: Array) -> list[Array]:
 
 
 def deviations_of(unknowns: Unknowns, z: Array, covariance: Array) -> Array:
-    """(np,) the standard deviation of each value, by the covariance of z; infinite where nothing is known."""
+    """Return the standard deviations (np,) of the values for a covariance of z; infinite if nothing is known."""
     by_z = unknowns.by_z(z)
     finite = np.where(np.isfinite(np.diag(covariance)), 1.0, 0.0)
     safe = np.where(np.isfinite(covariance), covariance, 0.0)
@@ -82,7 +82,7 @@ def deviations_of(unknowns: Unknowns, z: Array, covariance: Array) -> Array:
 
 
 def intervals_of(unknowns: Unknowns, z: Array, covariance: Array, freedom: float) -> Array:
-    """(np, 2) with 95 % in each; a mass's is about its logarithm, and none goes below what is possible."""
+    """Return the 95 % intervals (np, 2), cut at the bounds; those of masses are symmetric in the logarithm."""
     t = float(stats.t.ppf((1 + CONFIDENCE) / 2, max(freedom, 1.0)))
     values, spread = unknowns.values(z), deviations_of(unknowns, z, covariance)
     intervals = np.empty((len(z), 2))
@@ -98,7 +98,7 @@ def intervals_of(unknowns: Unknowns, z: Array, covariance: Array, freedom: float
 
 
 class Freedom(NamedTuple):
-    """How many numbers were measured, and how many of them first states and unknowns take up."""
+    """The number of measurements, and the degrees of freedom of first states and unknowns."""
 
     numbers: int
     of_starts: float
@@ -110,7 +110,7 @@ class Freedom(NamedTuple):
 
 
 def freedom_of(fit: Fit, solved: Solved) -> Freedom:
-    """Of a fit where it ended."""
+    """Return the degrees of freedom at the end of a fit."""
     of_starts = sum(float(np.sum(np.abs(np.diag(R)) > 10 * NO_PRIOR)) for R, _, _ in solved.reduced.own)
     of_unknowns = 0.0
     if not fit.fixed and len(solved.z):
@@ -122,7 +122,7 @@ def freedom_of(fit: Fit, solved: Solved) -> Freedom:
 
 
 def noise_of(fit: Fit, solved: Solved) -> Array:
-    """(2 nv,) the noise that the residuals show."""
+    """Return the noise (2 nv,) estimated from the residuals."""
     freedom = freedom_of(fit, solved)
     free = max(freedom.left, 1.0) / freedom.numbers
     every = np.concatenate(solved.reduced.residuals)
@@ -132,14 +132,14 @@ def noise_of(fit: Fit, solved: Solved) -> Array:
 
 
 def score_of(fit: Fit, solved: Solved) -> float:
-    """-2 log of the likelihood, up to a constant of the data."""
+    """Return -2 log likelihood, up to a constant of the data."""
     every = np.concatenate(solved.reduced.residuals)
     logs = np.isfinite(every).sum(axis=0) * np.log(np.where(np.isfinite(fit.noise), fit.noise, 1.0))
     return float(np.nansum(every**2)) + 2 * float(np.sum(logs))
 
 
 def likelihood_of(fit: Fit, solved: Solved, stated: Array, scatter: Array) -> float:
-    """-2 log of the likelihood with the noise that the residuals show, where none is `stated` (2 nv,)."""
+    """Return -2 log likelihood, with the noise of the residuals where `stated` (2 nv,) is NaN."""
     every = np.concatenate(solved.reduced.residuals)
     numbers = np.isfinite(every).sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -150,11 +150,11 @@ def likelihood_of(fit: Fit, solved: Solved, stated: Array, scatter: Array) -> fl
 
 
 def most_scatter(count: int, tests: int, *, jumps: bool = False) -> float:
-    """How many times the scatter of neighbouring samples the residuals of `count` samples may be, of `tests` entries.
+    """Return the largest ratio of residuals to scatter that noise explains, for `count` samples and `tests` entries.
 
-    The scatter is the least by differences of orders 1 to 8. Of order d it varies as if chi-square had n / C_d degrees
-    of freedom, C_d = binomial(4 d, 2 d) / binomial(2 d, d)^2; the mean of squares, by the same samples, leaves C_d - 1.
-    Where the motion `jumps` and medians tell the scatter, it varies as if there were fewer.
+    The scatter is the least of the estimates by differences of orders 1 to 8. That of order d varies like chi-square
+    with n / C_d degrees of freedom, C_d = binomial(4 d, 2 d) / binomial(2 d, d)^2. Its ratio to the mean square of the
+    same samples varies with C_d - 1 instead. If the motion `jumps`, medians give the scatter, with fewer degrees.
     """
     freedom = max(count - ORDERS, 1) / (comb(4 * ORDERS, 2 * ORDERS) / comb(2 * ORDERS, ORDERS) ** 2 - 1)
     freedom *= OF_MEDIANS if jumps else 1.0
@@ -162,11 +162,11 @@ def most_scatter(count: int, tests: int, *, jumps: bool = False) -> float:
 
 
 def colour_of(residuals: Sequence[Array], names: Sequence[str]) -> tuple[str, float]:
-    """(the entry whose residuals are least like white noise, the probability of that in white noise of all entries).
+    """Return (the entry whose residuals are least like white noise, the probability of such a one in white noise).
 
-    The test of Ljung and Box (1978), each piece by itself: Q = n (n + 2) sum over lags of rho_k^2 / (n - k). Of few
-    samples, Q is not as chi-square says, and the fit has taken a first position and velocity from each piece: Q's mean,
-    variance and skewness are those of white noise less its line, and its tail a gamma's with the same three.
+    The Ljung-Box test (1978) is applied to each piece: Q = n (n + 2) sum over lags of rho_k^2 / (n - k). For few
+    samples Q is not chi-square distributed, and the fit has removed a first position and velocity from each piece. So
+    the tail is that of a gamma distribution with the mean, variance and skewness of Q for detrended white noise.
     """
     worst, least, tests = "", 1.0, 0
     for j, name in enumerate(names):
@@ -189,7 +189,7 @@ def colour_of(residuals: Sequence[Array], names: Sequence[str]) -> tuple[str, fl
 
 
 def _ljung_box(rows: Array, lags: int) -> Array:
-    """Q of each row."""
+    """Return Q of each row."""
     n = rows.shape[1]
     r = rows - np.mean(rows, axis=1, keepdims=True)
     size = np.sum(r**2, axis=1)
@@ -200,9 +200,9 @@ def _ljung_box(rows: Array, lags: int) -> Array:
 
 @lru_cache
 def _white(n: int, lags: int) -> Array:
-    """(3,) mean, variance and third central moment of Q in white noise from which a line was fitted and taken."""
+    """Return mean, variance and third central moment (3,) of Q for white noise minus its fitted line."""
     if n > MANY:
-        return np.array([lags, 2 * lags, 8 * lags], dtype=float)  # chi-square's
+        return np.array([lags, 2 * lags, 8 * lags], dtype=float)  # moments of chi-square
     line = np.linalg.qr(np.column_stack([np.ones(n), np.arange(n)]))[0]
     noise = np.random.default_rng(n).standard_normal((DRAWN // n, n))
     Q = _ljung_box(noise - (noise @ line) @ line.T, lags)

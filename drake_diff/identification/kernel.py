@@ -1,8 +1,8 @@
-"""Steps of trees with inputs, springs, dampers and friction: compiled.
+"""Compiled steps of trees with inputs, springs, dampers and friction.
 
     M(q) a = B u - C(q, v) v + gravity - springs - damping v - friction
 
-Inverse dynamics is that of `mechanics.tree_kernel`; here are the other forces and the steps of Runge and Kutta.
+Inverse dynamics is from `mechanics.tree_kernel`. This module adds the other forces and the Runge-Kutta steps.
 """
 
 from typing import NamedTuple
@@ -18,27 +18,27 @@ Whole = NDArray[np.int64]
 
 
 class TreeSystem(NamedTuple):
-    """A tree of n joint coordinates, of which some may follow others, and what acts on it."""
+    """A tree of n joint coordinates, some of which may be mimic coordinates, and the forces on it."""
 
     tree: Tree
     of_q: Whole  # q of the joints is ratio * q[of_q] + shift
     ratio: Array
     shift: Array
-    spread: Array  # (n, nv) velocities of the joints by the independent ones
-    single: Whole  # (S, 2) of the independent coordinates: where joints of one degree of freedom are in q and in v
-    free: Whole  # (F, 2) where free bodies begin
-    position: Whole  # (n,) of a spring, in q of the joints
+    spread: Array  # (n, nv) derivatives of the joint velocities with respect to the independent ones
+    single: Whole  # (S, 2) indices in q and v of the independent joints with one degree of freedom
+    free: Whole  # (F, 2) first indices in q and v of free bodies
+    position: Whole  # (n,) index of a spring's position in q of the joints
     reflected: Array  # (n,)
     damping: Array
     stiffness: Array
     rest: Array
     coulomb: Array
-    slip: float  # over which friction turns; 0 where `turn` says which way joints slide
+    slip: float  # speed over which smooth friction changes its sign; 0 if `turn` gives the direction of sliding
 
 
 @inner
 def _load(s: TreeSystem, x: Array, q: Array, v: Array) -> None:
-    """q and v (n,) of all joints at x (nx,)."""
+    """Fill q and v (n,) of all joints at x (nx,)."""
     n, nv = s.spread.shape
     nq = len(x) - nv
     for i in range(len(q)):
@@ -51,7 +51,7 @@ def _load(s: TreeSystem, x: Array, q: Array, v: Array) -> None:
 
 @inner
 def _add_forces(s: TreeSystem, q: Array, v: Array, push: Array, turn: Array, mass: Array, tau: Array) -> None:
-    """tau (n,) becomes the force that accelerates, and mass (n, n) has the reflected inertia too."""
+    """Replace tau (n,) by the accelerating force, and add the reflected inertia to mass (n, n)."""
     for i in range(len(v)):
         slide = 0.0
         if s.slip > 0:
@@ -67,7 +67,7 @@ def _add_forces(s: TreeSystem, q: Array, v: Array, push: Array, turn: Array, mas
 
 @inner
 def _reduce(s: TreeSystem, mass: Array, tau: Array, M: Array, force: Array) -> None:
-    """M (nv, nv) = E' mass E and force (nv,) = E' tau of the joints that move independently."""
+    """Fill M (nv, nv) = E' mass E and force (nv,) = E' tau of the independent joints."""
     n, nv = s.spread.shape
     M[:], force[:] = 0.0, 0.0
     for i in range(n):
@@ -83,9 +83,9 @@ def _reduce(s: TreeSystem, mass: Array, tau: Array, M: Array, force: Array) -> N
 
 @compiled
 def accelerate(s: TreeSystem, x: Array, push: Array, turn: Array, held: Array, a: Array, holding: Array) -> None:
-    """At x (N, nx) fill a (N, nv) under generalized forces push (N, n), NaN where M is not positive definite.
+    """Fill a (N, nv) at x (N, nx) under generalized forces push (N, n), with NaN if M is not positive definite.
 
-    And holding (N, nv), the force on each joint that is held still; turn (N, nv) is 1 or -1 of those that slide.
+    Also fill holding (N, nv), the force on each sticking joint. turn (N, nv) is 1 or -1 for sliding joints.
     """
     N, nv = a.shape
     n = len(s.spread)
@@ -119,7 +119,7 @@ def accelerate(s: TreeSystem, x: Array, push: Array, turn: Array, held: Array, a
 
 @inner
 def _rate(s: TreeSystem, x: Array, a: Array, out: Array) -> None:
-    """out (nx,) = dx/dt."""
+    """Fill out (nx,) with dx/dt."""
     nq = len(x) - len(a)
     for k in range(len(s.single)):
         out[s.single[k, 0]] = x[nq + s.single[k, 1]]
@@ -140,7 +140,7 @@ def _rate(s: TreeSystem, x: Array, a: Array, out: Array) -> None:
 def step(
     s: TreeSystem, stages: Array, weights: Array, x: Array, h: Array, push: Array, turn: Array, held: Array, out: Array
 ) -> None:
-    """Fill out (N, nx) with where x (N, nx) is after steps of h (N,) by the method of these stages and weights."""
+    """Fill out (N, nx) with the states after steps of h (N,) from x (N, nx), for these stages and weights."""
     N, nx = x.shape
     y, a, holding = x.copy(), np.empty(turn.shape), np.empty(turn.shape)
     rates = np.empty((len(weights), N, nx))

@@ -1,4 +1,4 @@
-"""What identification says in words: of parameters, of what recordings leave open, of causes and of motions."""
+"""The messages of identification: about parameters, unidentifiable combinations, causes and motions."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,14 +8,14 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff.identification.unknowns import Unknowns
 
-PART = 0.03  # of the largest change in a combination: what is not told
-COMBINED = ("friction", "stiffness")  # of two bodies that touch, which Drake makes one of: 2 a b / (a + b), half of it
+PART = 0.03  # fraction of the largest change in a combination below which a change is omitted
+COMBINED = ("friction", "stiffness")  # Drake combines those of two bodies in contact: 2 a b / (a + b), or half of it
 NOISE_IS_LEFT = "the residuals are noise, and held-out samples are predicted"
 NO_CHANGE = "Not explained: no change that was tried explains the recording"
 
 
 def changed_to(name: str, values: Array, intervals: Array, start: Array, unit: str) -> str:
-    """What a quantity (k,) is, with its intervals (k, 2), and what it is in the model."""
+    """Return the values (k,) of a quantity with their intervals (k, 2) and the model's values, in words."""
     columns = [name] if len(start) == 1 else [f"{name}[{k}]" for k in range(len(start))]
     return ", ".join(
         _estimate(column, v, interval, was, unit) if np.all(np.isfinite(interval)) else f"{column} cannot be known"
@@ -29,7 +29,7 @@ def _estimate(column: str, value: float, interval: Array, was: float, unit: str)
 
 
 def unidentifiable(unknowns: Unknowns, z: Array, directions: Sequence[Array]) -> tuple[str, ...]:
-    """In words, the combinations that the data leave open, by their directions (np,) in z."""
+    """Return the combinations that the data leave undetermined, in words, for their directions (np,) in z."""
     by_z, values = unknowns.by_z(z), unknowns.values(z)
     return tuple(dict.fromkeys(_combination(unknowns, values, by_z @ direction) for direction in directions))
 
@@ -50,16 +50,16 @@ def _combination(unknowns: Unknowns, values: Array, change: Array) -> str:
         seen = _seen_of_two(values[columns], change[columns], kinds.pop() if len(kinds) == 1 else "")
         if seen:
             return f"{names[0]} and {names[1]}: only their {seen} is seen"
-    factor = np.sign(change[columns[0]]) * 0.1 / shares[columns[0]]  # what a tenth of the first one's size does
+    factor = np.sign(change[columns[0]]) * 0.1 / shares[columns[0]]  # a change by a tenth of the first one's size
     changes = [f"{unknowns.columns[j]} by {factor * change[j]:+.3g} {unknowns.units[j]}" for j in columns[:6]]
     more = f" and {len(columns) - 6} more" if len(columns) > 6 else ""
     return f"a change of {' with '.join(changes)}{more} leaves the motion as it is"
 
 
 def _seen_of_two(values: Array, change: Array, quantity: str) -> str:
-    """What of two values stays as it is in a small change of both; "" where no word says it.
+    """Return the combination ("sum", "product", ...) of two values that a small change of both preserves, or "".
 
-    `quantity` is what both are, if it is the same. Of equal values several words would be true: the likeliest is told.
+    `quantity` is the common quantity, if any. If several words apply, as for equal values, the likeliest is returned.
     """
     if np.any(values * change == 0):
         return ""
@@ -80,7 +80,7 @@ def identification_sentence(
     errors: tuple[float, float],
     reason: str,
 ) -> str:
-    """What recordings say of parameters (np,) with intervals (np, 2), and by how much the error falls."""
+    """Return the sentence about the estimates (np,), their intervals (np, 2) and the decrease of the error."""
     start, width = unknowns.start, np.maximum(intervals[:, 1] - intervals[:, 0], 1e-300)
     known = np.all(np.isfinite(intervals), axis=1)
     within = known & (intervals[:, 0] <= start) & (start <= intervals[:, 1])
@@ -116,7 +116,7 @@ def excitation_sentence(
     unidentifiable: Sequence[str],
     gain: float,
 ) -> str:
-    """How well a motion tells parameters; `deviations` are by it, by a random one and by a recording at rest."""
+    """Return the sentence about a motion; `deviations` are by it, by a random motion and by a recording at rest."""
     clauses = []
     for name in deviations[0]:
         now, random, rest = (", ".join(f"{d:.3g}" for d in np.atleast_1d(values[name])) for values in deviations)

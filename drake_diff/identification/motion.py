@@ -1,13 +1,13 @@
-"""How a model moves over many segments at once, and the derivatives of its steps.
+"""Simulation of many segments of a model's motion at once, and the derivatives of its steps.
 
-In continuous time: fixed steps of order 8 by the method of Dormand and Prince (Hairer, Norsett and Wanner, "Solving
-Ordinary Differential Equations I", 1993, II.5), over which inputs are held; the derivatives are those of the method's
-own steps. A step of length 0 changes nothing: with such steps segments of different length stand side by side. Or as
-simulators move it, by semi-implicit Euler steps with damping at the end of the step,
+There are three laws of motion. Continuous time uses fixed steps of the Dormand-Prince method of order 8 (Hairer,
+Norsett and Wanner, "Solving Ordinary Differential Equations I", 1993, II.5) with constant inputs; the derivatives are
+those of the discrete steps. A step of length 0 changes nothing, and pads segments to equal length. Semi-implicit Euler
+steps, as in simulators, take damping at the end of the step:
 
     v' = v + h (M + h D)^-1 (forces at q, v),    q' = q + h v'
 
-or by the model's own discrete steps, contact and limits included.
+The third law is the model's own discrete steps, with contact and limits.
 """
 
 from collections.abc import Sequence
@@ -35,25 +35,25 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameter, ParameterVector, applied, select
 from drake_diff.model.step import advance
 
-MOST_PHASES = 60  # of a step: one with more is given up, and its state is NaN
-SEARCHED, MET = 99, 1e-9  # steps of the search for an end; [rad/s, m/s] or of the friction: how near it is then
-SHORT = 1e-13  # [s] between which an end is known well enough, however steep it is there
+MOST_PHASES = 60  # maximum number of phases of a step: a step with more is given up, and its state is NaN
+SEARCHED, MET = 99, 1e-9  # iterations of the search for a phase's end; its tolerance [rad/s, m/s] or of friction
+SHORT = 1e-13  # [s] width of the bracket at which the search ends for any slope
 
 
 class SlidingPhase(NamedTuple):
-    """Of some steps, a time in which each joint slides one way or is held."""
+    """A phase of some steps in which each joint slides in one direction or sticks."""
 
-    rows: Indices  # of the steps
-    x: Array  # (n, nx) at its start
+    rows: Indices  # (n,) indices of the steps
+    x: Array  # (n, nx) states at its start
     h: Array  # (n,) [s]
     u: Array
     grip: Grip
-    stopped: Indices  # (n,) the joint that slid and has just come to 0; -1 where none has
-    before: Grip  # of the phase before
+    stopped: Indices  # (n,) the joint whose sliding velocity has just reached 0; -1 if none
+    before: Grip  # friction in the previous phase
 
 
 def step_with_friction(dynamics: TreeDynamics, x: Array, h: Array, u: Array) -> tuple[Array, list[SlidingPhase]]:
-    """Where steps from x (N, nx) of lengths h (N,) end, and their phases."""
+    """Return the states after steps of lengths h (N,) from x (N, nx), and the phases of the steps."""
     nv = dynamics.nv
     nq, nothing = x.shape[1] - nv, np.zeros((len(x), nv))
     x, left, phases, released = x.copy(), h.copy(), list[SlidingPhase](), nothing.copy()
@@ -92,7 +92,7 @@ def step_with_friction(dynamics: TreeDynamics, x: Array, h: Array, u: Array) -> 
 
 
 def friction_jacobians(dynamics: TreeDynamics, x: Array, h: Array, u: Array, by: Array) -> Array:
-    """(N, nx, nx + P) of these steps; `by` (count, P) is how the numbers change with parameters."""
+    """Return the Jacobians (N, nx, nx + P) of these steps; `by` (count, P) is d numbers / d parameters."""
     nx = x.shape[1]
     total = np.zeros((len(x), nx, nx + by.shape[1]))
     total[:, :, :nx] = np.eye(nx)
@@ -106,14 +106,14 @@ def friction_jacobians(dynamics: TreeDynamics, x: Array, h: Array, u: Array, by:
 
 
 def _begin(dynamics: TreeDynamics, x: Array, grip: Grip) -> Array:
-    """x with joints at rest that are held."""
+    """Return x with zero velocities of the sticking joints."""
     begin = x.copy()
     begin[:, -dynamics.nv :][grip.held > 0] = 0.0
     return begin
 
 
 def _room(dynamics: TreeDynamics, x: Array, u: Array, grip: Grip) -> Array:
-    """(N, nv) by how much each joint slides or is held as it should at x, negative beyond; infinite of others."""
+    """Return the margins (N, nv) of sliding or sticking at x, negative if violated, infinite without friction."""
     room = np.where(grip.turn != 0, grip.turn * x[:, -dynamics.nv :], np.inf)
     some = np.flatnonzero(np.any(grip.held > 0, axis=1))
     if len(some):
@@ -124,9 +124,9 @@ def _room(dynamics: TreeDynamics, x: Array, u: Array, grip: Grip) -> Array:
 
 
 def _end(dynamics: TreeDynamics, x: Array, u: Array, grip: Grip, h: Array, room: Array) -> tuple[Array, Array, Indices]:
-    """(when a phase ends that has this room (N, nv) at h (N,), where, by which joint): regula falsi of Illinois.
+    """Return (time, state, joint) at the end of a phase with margins `room` (N, nv) at h (N,), by the Illinois method.
 
-    Looked at are the joints that are beyond at h; every third step halves what is left.
+    Only the joints with a violated margin at h are considered. Every third iteration bisects the bracket.
     """
     sought, rows = room < 0, np.arange(len(x))
 
@@ -156,14 +156,14 @@ def _end(dynamics: TreeDynamics, x: Array, u: Array, grip: Grip, h: Array, room:
 
 
 def _jump(dynamics: TreeDynamics, phase: SlidingPhase) -> Array:
-    """(n, nx, nx) what becomes of a small change of the state where a phase begins.
+    """Return the saltation matrices (n, nx, nx) at the start of a phase.
 
-    Of a joint that has come to 0 it has changed when: what is accelerated otherwise from then on is moved by that.
+    A perturbation changes when a joint stops, and so the velocities of all coordinates whose acceleration jumps then.
     """
     nx, nv, x, u, grip = phase.x.shape[1], dynamics.nv, phase.x, phase.u, phase.grip
     jump = np.tile(np.eye(nx), (len(x), 1, 1))
     caught = np.flatnonzero(np.any(grip.held > 0, axis=1) & (phase.stopped < 0))
-    if len(caught):  # the momentum of what goes on is what it was
+    if len(caught):  # the momentum of the moving joints is conserved
         mass, free = dynamics.mass(x[caught]), 1 - grip.held[caught]
         held = mass * free[:, :, None] * free[:, None] + np.eye(nv) * grip.held[caught][:, None]
         jump[caught, nx - nv :, nx - nv :] = np.linalg.solve(held, mass * free[:, :, None])
@@ -177,30 +177,30 @@ def _jump(dynamics: TreeDynamics, phase: SlidingPhase) -> Array:
     return jump
 
 
-LONGEST = 0.02  # [s] of a step in continuous time
-CHUNK = 256  # steps that are differentiated in one call
-FINITE_DIFFERENCE, DIFFERENCE = "finite_difference", 1e-5  # of a parameter, relative
+LONGEST = 0.02  # [s] longest step in continuous time
+CHUNK = 256  # number of steps that are differentiated in one call
+FINITE_DIFFERENCE, DIFFERENCE = "finite_difference", 1e-5  # relative difference of a parameter
 
 
 @dataclass(frozen=True, eq=False)
 class TreeMotion:
-    """dq/dt = N(q) v, dv/dt = a of a tree whose numbers are set by unknowns.
+    """The motion dq/dt = N(q) v, dv/dt = a of a tree whose numbers are set by unknowns.
 
-    Coulomb friction holds the joints of which it is an unknown, unless it is `smooth`, which turns over a small speed.
+    Joints whose Coulomb friction is unknown can stick, unless friction is `smooth` (changes sign over a small speed).
     """
 
     model: Model
     tree: Tree
     unknowns: Unknowns
     longest: float = LONGEST  # [s] the longest step
-    segment: float = 0.15  # [s]
+    segment: float = 0.15  # [s] length of a segment
     method: Method = ORDER_8
-    frozen: bool = False  # whether steps are differentiated with their equations frozen halfway
+    frozen: bool = False  # whether derivatives use the equations linearized at the midpoint of a step
     smooth: bool = False
 
     @cached_property
     def dry(self) -> tuple[int, ...]:
-        """The velocities of joints that friction holds; one that others follow has the friction of all of them."""
+        """The velocity indices of joints that can stick; a joint with followers has the friction of all of them."""
         labels = {unknown.label for unknown in self.unknowns.each if unknown.quantity == COULOMB}
         joints = {link.joint.v_start for link in self.tree.links if link.joint.joint in labels and not self.smooth}
         coupling = self.tree.coupling
@@ -208,7 +208,7 @@ class TreeMotion:
 
     @property
     def kinks(self) -> bool:
-        """Whether friction holds a joint."""
+        """Whether any joint can stick."""
         return bool(self.dry)
 
     @property
@@ -217,25 +217,25 @@ class TreeMotion:
         return f"continuous time, by steps of order 8 of at most {1e3 * self.longest:.3g} ms{friction}"
 
     def cut(self, period: float) -> tuple[float, ...]:
-        """Lengths of the steps [s] over a time between samples [s]."""
+        """Return the lengths of the steps [s] over a time between samples [s]."""
         count = max(1, int(np.ceil(period / self.longest - 1e-9)))
         return (period / count,) * count
 
     def shorter(self, than: float) -> "TreeMotion | None":
-        """By steps of at most half of a length [s]."""
+        """Return the law with steps of at most half the length `than` [s]."""
         return replace(self, longest=than / 2)
 
     def is_possible(self, values: Array) -> bool:
-        """Whether there are bodies with these values."""
+        """Return whether bodies with these values are physically consistent."""
         return self.unknowns.consistent(values, self.tree)
 
     def dynamics(self, values: Array) -> TreeDynamics:
-        """The tree that unknowns of these values make."""
+        """Return the dynamics of the tree for these values of the unknowns."""
         numbers = set_numbers(self.model, self.tree, self.unknowns, values)
         return TreeDynamics(self.tree, numbers, self.dry, self.method, self.frozen)
 
     def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
-        """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
+        """Return the states (K, M+1, nx) from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
         dynamics = self.dynamics(values)
         xs = np.empty((len(starts), hs.shape[1] + 1, starts.shape[1]))
         xs[:, 0] = starts
@@ -246,7 +246,7 @@ class TreeMotion:
         return xs
 
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
-        """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
+        """Return the derivatives of each step with respect to the state (K, M, nx, nx) and to z (K, M, nx, np)."""
         dynamics, by, nx = self.dynamics(self.unknowns.values(z)), self.by(z), xs.shape[2]
         x, h, u = xs[:, :-1].reshape(-1, nx), hs.reshape(-1), us.reshape(hs.size, -1)
         total = np.zeros((hs.size, nx, nx + by.shape[1]))
@@ -259,11 +259,11 @@ class TreeMotion:
         return total[..., :nx], total[..., nx:]
 
     def by(self, z: Array) -> Array:
-        """(count, np) how the numbers of the tree change with z."""
+        """Return the derivatives (count, np) of the tree's numbers with respect to z."""
         return numbers_at(self.model, self.tree, self.unknowns, z)[1]
 
     def rates(self, values: Array, x: Array, u: Array) -> Array:
-        """(N, nx) by time, of states (N, nx) under u (N, nu)."""
+        """Return the time derivatives (N, nx) of states (N, nx) under u (N, nu)."""
         q, v = x[:, : self.model.nq], x[:, self.model.nq :]
         speed = (self.tree.coordinates.rate(q) @ v[..., None])[..., 0]
         return np.concatenate([speed, self.dynamics(values).accelerate(x, u)], axis=1)
@@ -271,7 +271,7 @@ class TreeMotion:
 
 @dataclass(frozen=True, eq=False)
 class EulerMotion(TreeMotion):
-    """Steps of the length `longest`, of which a whole number lies between samples; of hinges and slides."""
+    """Semi-implicit Euler steps of the length `longest`, a whole fraction of the sample period; no free bodies."""
 
     smooth: bool = True
 
@@ -280,21 +280,21 @@ class EulerMotion(TreeMotion):
         return f"semi-implicit Euler steps of {1e3 * self.longest:.4g} ms"
 
     def cut(self, period: float) -> tuple[float, ...]:
-        """Lengths of the steps [s] over a time between samples [s]."""
+        """Return the lengths of the steps [s] over a time between samples [s]."""
         return (self.longest,) * max(1, round(period / self.longest))
 
     def shorter(self, than: float) -> None:
-        """There is none: the step is what is looked for."""
+        """Return None, as the step length is itself estimated."""
         return
 
     def dynamics(self, values: Array) -> TreeDynamics:
-        """With damping at the end of the step."""
+        """Return the dynamics with damping at the end of the step."""
         dynamics = super().dynamics(values)
         numbers = dynamics.numbers
         return replace(dynamics, numbers=replace(numbers, reflected=numbers.reflected + self.longest * numbers.damping))
 
     def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
-        """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
+        """Return the states (K, M+1, nx) from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
         dynamics, nq = self.dynamics(values), self.model.nq
         xs = np.empty((len(starts), hs.shape[1] + 1, starts.shape[1]))
         xs[:, 0] = starts
@@ -305,7 +305,7 @@ class EulerMotion(TreeMotion):
         return xs
 
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
-        """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
+        """Return the derivatives of each step with respect to the state (K, M, nx, nx) and to z (K, M, nx, np)."""
         dynamics, by, nx, nq = self.dynamics(self.unknowns.values(z)), self.by(z), xs.shape[2], self.model.nq
         by[dynamics.numbers.places("reflected")] += self.longest * by[dynamics.numbers.places("damping")]
         x, u, h = xs[:, :-1].reshape(-1, nx), us.reshape(hs.size, -1), hs.reshape(-1, 1, 1)
@@ -320,14 +320,14 @@ class EulerMotion(TreeMotion):
 
 @dataclass(frozen=True, eq=False)
 class DiscreteMotion:
-    """Drake's steps of a length of which a whole number lies between samples."""
+    """Drake's discrete steps, of a length that is a whole fraction of the sample period."""
 
-    model: Model  # at that time step
+    model: Model  # with this time step
     unknowns: Unknowns
-    vector: ParameterVector  # of the unknowns that are the model's
-    own: Indices  # where the vector's entries stand among the unknowns
-    segment: float = np.inf  # [s] a whole piece: where bodies touch, a state from noisy samples is no start of a motion
-    differenced: list[str] = field(default_factory=list)  # says where Drake's own derivatives were refused
+    vector: ParameterVector  # the unknowns that are parameters of the model
+    own: Indices  # indices of the vector's entries among the unknowns
+    segment: float = np.inf  # [s] a whole piece: in contact, a motion cannot start at a noisy state
+    differenced: list[str] = field(default_factory=list)  # notes on derivatives that Drake refused
     kinks: bool = False
 
     @property
@@ -335,15 +335,15 @@ class DiscreteMotion:
         return ", ".join([f"the model's own steps of {1e3 * self.model.time_step:.4g} ms", *self.differenced[:1]])
 
     def cut(self, period: float) -> tuple[float, ...]:
-        """Lengths of the steps [s] over a time between samples [s]."""
+        """Return the lengths of the steps [s] over a time between samples [s]."""
         return (self.model.time_step,) * round(period / self.model.time_step)
 
     def shorter(self, than: float) -> None:
-        """There is none: it is the model's step that is fitted."""
+        """Return None, as the model's own step is fitted."""
         return
 
     def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
-        """(K, M+1, nx) states from starts (K, nx) by steps of hs (K, M) [s], 0 for none, under us (K, M, nu)."""
+        """Return the states (K, M+1, nx) from starts (K, nx) by steps of hs (K, M) [s], 0 for none, under us."""
         vector = self.vector.at(values[self.own])
         xs = np.repeat(starts[:, None], hs.shape[1] + 1, axis=1)
         with applied(vector) as model:
@@ -354,7 +354,7 @@ class DiscreteMotion:
         return xs
 
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
-        """Of each step: by the state (K, M, nx, nx), and by z (K, M, nx, np)."""
+        """Return the derivatives of each step with respect to the state (K, M, nx, nx) and to z (K, M, nx, np)."""
         vector, by_z = self.vector.at(self.unknowns.values(z)[self.own]), self.unknowns.by_z(z)[self.own]
         K, M, nx = *hs.shape, xs.shape[2]
         by_x, by = np.tile(np.eye(nx), (K, M, 1, 1)), np.zeros((K, M, nx, len(z)))
@@ -377,7 +377,7 @@ class DiscreteMotion:
         return by_x, by
 
     def _derivatives(self, model: Model, vector: ParameterVector, xs: Array, us: Array) -> Sequence[StepDerivatives]:
-        """Of steps from each of xs (N, nx) under us (N, nu), by the vector's parameters; those applied act."""
+        """Differentiate the steps from xs (N, nx) under us (N, nu), also with respect to the vector's parameters."""
         try:
             return derivatives_along(model, xs[0], us, vector=vector, xs=xs)
         except GradientError:
@@ -386,7 +386,7 @@ class DiscreteMotion:
 
 
 def _differences(vector: ParameterVector, parameter: Parameter, entries: slice, xs: Array, us: Array) -> Array:
-    """(N, nx, k) of steps from xs (N, nx) under us (N, nu) by a parameter that Drake takes as a float."""
+    """Return differences (N, nx, k) of steps from xs (N, nx) with respect to a parameter that Drake has as a float."""
     columns = []
     for i in range(entries.start, entries.stop):
         value = vector.values[i]
@@ -405,10 +405,9 @@ Law = TreeMotion | DiscreteMotion
 
 
 def discrete_motion(model: Model, unknowns: Unknowns, pieces: Sequence[Excerpt]) -> DiscreteMotion:
-    """Of steps as long as the model's, or shortened so that a whole number of them lies between samples.
+    """Return the law by the model's steps, shortened if needed so that a whole number fits between samples.
 
-    InputError where samples are not the same time apart; ModelError where the model came from a diagram, which has but
-    one time step.
+    Raises InputError if samples are not equidistant, ModelError if a model from a diagram would need another time step.
     """
     every = np.concatenate([np.diff(piece.times) for piece in pieces])
     period = float(np.median(every))

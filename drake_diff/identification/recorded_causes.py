@@ -1,8 +1,8 @@
-"""The recordings of a comparison compared with Drake's steps once more, and their causes looked for again.
+"""Reproduction of a saved comparison: its recordings are compared again, and their causes are searched again.
 
-A cause is found by a search that ends where its last step would gain no more than 1e-5 of the squares, in units of the
-noise. So a search that takes other steps, as on a machine that rounds otherwise, ends within sqrt(1e-5) of a standard
-deviation, 0.0016 of half a 95 % interval.
+The search for a cause ends when a step would reduce the sum of squares by at most 1e-5, in units of the noise. So a
+search with other steps, as on a machine with other rounding, ends within sqrt(1e-5) of a standard deviation, which is
+0.0016 of half a 95 % interval.
 """
 
 import math
@@ -29,22 +29,22 @@ from drake_diff.runs.provenance import contract_of, model_input
 from drake_diff.runs.rebuild import rebuilt
 from drake_diff.runs.reproduce import contract_as, model_as
 
-SAME_VALUE = 2e-3  # of half the interval: see above
-SAME_DIGIT = 1.01  # of the last digit in a text: a number that lies between two is rounded to either
-ENDED = "The search was ended after"  # in the sentence of a cause: by the limit of processor time, which no run repeats
+SAME_VALUE = 2e-3  # tolerance in units of half the interval (see above)
+SAME_DIGIT = 1.01  # tolerance in units of the last digit in a text: a number between two may be rounded to either
+ENDED = "The search was ended after"  # in a cause's sentence: its search reached the processor time limit
 LOST = "its cause was not looked for again: its recording is not in the directory"
 WRITTEN = (TRACE, REPLAY, PAGE)
-NEVER = (  # what is not checked
+NEVER = (  # the parts that are not checked
     "model and recordings: they define the task, and only who made a recording knows if a robot moved so",
     "all but the recordings, plots, scenes and frames: the engines were not run again",
 )
 
 
 def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Reproduced:
-    """The rows and causes of a record's recordings made again from the directory alone; engines are not run.
+    """Recompute the rows and causes of a record's recordings from the directory alone; engines are not run.
 
-    ArtifactError where the directory does not have what the record says; ModelError where the model cannot be rebuilt,
-    `models` as in `rebuilt`.
+    Raises ArtifactError if the directory does not match the record, ModelError if the model cannot be rebuilt. `models`
+    is as in `rebuilt`.
     """
     pages = made_of_record(folder, record)
     functions = [(e.engine, e.function.name) for e in record.engines if e.function is not None]
@@ -94,7 +94,7 @@ def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Re
 
 
 def _odd_recordings(record: ComparisonRecord) -> Iterator[str]:
-    """What cannot be so in what drake_diff writes."""
+    """Yield the problems with recordings that cannot occur in a record from drake_diff."""
     names = [r.name for r in record.recordings]
     for i, r in enumerate(record.recordings):
         if r.path != place_of(i) or r.path not in record.files:
@@ -105,7 +105,7 @@ def _odd_recordings(record: ComparisonRecord) -> Iterator[str]:
 
 
 def _of_the_model(record: ComparisonRecord, model: Model) -> dict[str, Any]:
-    """What the record says of the model, of the model in the directory."""
+    """Return the record's fields about the model, recomputed for the model in the directory."""
     changed: dict[str, Any] = {
         "model": model_as(model_input(model), record),
         "contract": contract_as(contract_of(model), record),
@@ -118,7 +118,7 @@ def _of_the_model(record: ComparisonRecord, model: Model) -> dict[str, Any]:
 
 
 def _odd_files(folder: Path, record: ComparisonRecord, given: Sequence[Recording]) -> Iterator[str]:
-    """What in the other files, or of the hashes of data, is not of the recordings in the directory."""
+    """Yield the contradictions of other files and of data hashes with the recordings in the directory."""
     used = {(use.name, use.sha256) for use in record.data.judged_on} if record.data is not None else set()
     log = read_mcap(folder / TRACE, links=False)
     places = [i for i, e in enumerate(record.engines) if not e.jacobians]
@@ -135,9 +135,9 @@ def _odd_files(folder: Path, record: ComparisonRecord, given: Sequence[Recording
 
 
 def as_recorded(name: str, recorded: CauseEvidence, repeated: CauseEvidence) -> tuple[CauseEvidence, list[str]]:
-    """The cause that was found again, as it is recorded where it is the same within SAME_VALUE; and what is in doubt.
+    """Return the recorded cause if the repeated one agrees within SAME_VALUE, else the repeated one; and doubts.
 
-    In doubt is what a search that its limit of processor time ended says: no run repeats that.
+    A result is in doubt if a search reached its processor time limit, as no run reproduces that.
     """
     if recorded == repeated or _is_same(recorded, repeated):
         return recorded, []
@@ -148,7 +148,7 @@ def as_recorded(name: str, recorded: CauseEvidence, repeated: CauseEvidence) -> 
 
 
 def _is_same(recorded: CauseEvidence, repeated: CauseEvidence) -> bool:
-    """Whether the words are the same, values and intervals as near as SAME_VALUE, and texts but for their rounding."""
+    """Return whether words agree exactly, values and intervals within SAME_VALUE, and numbers in texts to rounding."""
     for name in ("names", "alternatives", "explained"):
         if getattr(recorded, name) != getattr(repeated, name):
             return False
@@ -179,14 +179,14 @@ def _fourth_digit(value: float) -> float:
 
 
 def cause_of(model: Model, recording: Recording) -> CauseEvidence:
-    """The smallest change of the model that explains a recording; or why none was looked for.
+    """Find the smallest change of the model that explains a recording, or say why none was searched for.
 
     Args:
         model: The model.
-        recording: A motion of it.
+        recording: A motion of the model.
 
     Returns:
-        Names, values and 95 % intervals of what is changed, and a sentence.
+        Names, values and 95 % intervals of the changed quantities, and a sentence.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)

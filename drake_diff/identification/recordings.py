@@ -1,6 +1,6 @@
-"""What was measured, in pieces that each have a first state of their own: samples, noise, and a guess of states.
+"""Measurements as pieces with independent first states: samples, noise, and a guess of states.
 
-Differences of states are small motions [position; velocity], where a free body turns by a vector in world.
+Differences of states are tangent vectors [position; velocity], with a rotation vector in world for a free body.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ from drake_diff.model.tangent import tangent_space
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """States (..., nx) and their small motions (..., 2 nv)."""
+    """The chart between states (..., nx) and tangent vectors (..., 2 nv)."""
 
     coordinates: Coordinates
 
@@ -32,7 +32,7 @@ class Chart:
         return 2 * self.coordinates.nv
 
     def plus(self, x: Array, d: Array) -> Array:
-        """The states that the small motions lead to; quaternions get the norm 1."""
+        """Return the states x moved by the tangent vectors d; quaternions are normalized."""
         nq, nv = self.coordinates.nq, self.coordinates.nv
         moved = np.concatenate([x[..., :nq], x[..., nq:] + d[..., nv:]], axis=-1)
         for i, j in self.coordinates.single:
@@ -45,7 +45,7 @@ class Chart:
         return moved
 
     def minus(self, y: Array, x: Array) -> Array:
-        """The small motion from x to y; NaN where y has NaN."""
+        """Return the tangent vector from x to y; NaN where y is NaN."""
         nq, nv = self.coordinates.nq, self.coordinates.nv
         motion = np.empty((*np.broadcast_shapes(y.shape, x.shape)[:-1], 2 * nv))
         motion[..., nv:] = y[..., nq:] - x[..., nq:]
@@ -59,7 +59,7 @@ class Chart:
         return motion
 
     def to_motion(self, x: Array) -> Array:
-        """(..., 2 nv, nx): the small motion that a change of the state is."""
+        """Return the matrices (..., 2 nv, nx) from changes of the state to tangent vectors."""
         nq, nv = self.coordinates.nq, self.coordinates.nv
         matrix = np.zeros((*x.shape[:-1], 2 * nv, nq + nv))
         matrix[..., :nv, :nq] = self.coordinates.motion(x[..., :nq])
@@ -67,7 +67,7 @@ class Chart:
         return matrix
 
     def from_motion(self, x: Array) -> Array:
-        """(..., nx, 2 nv): how the state changes with a small motion."""
+        """Return the matrices (..., nx, 2 nv) from tangent vectors to changes of the state."""
         nq, nv = self.coordinates.nq, self.coordinates.nv
         matrix = np.zeros((*x.shape[:-1], nq + nv, 2 * nv))
         matrix[..., :nq, :nv] = self.coordinates.rate(x[..., :nq])
@@ -76,7 +76,7 @@ class Chart:
 
 
 def _product(a: Array, b: Array) -> Array:
-    """a * b of quaternions (w, x, y, z)."""
+    """Return the product a * b of quaternions (w, x, y, z)."""
     aw, ax, ay, az = np.moveaxis(a, -1, 0)
     bw, bx, by, bz = np.moveaxis(b, -1, 0)
     return np.stack(
@@ -90,39 +90,39 @@ def _product(a: Array, b: Array) -> Array:
     )
 
 
-LEAST = 8  # samples of a piece
-WINDOW = 9  # samples that a cubic is laid through, at least
-WINDOW_TIME = 0.05  # [s] and over this time at least
-ORDERS = 8  # of differences of neighbouring samples that tell the noise
-NO_NOISE = 1e-9  # of a column's range: what is recorded without noise is still rounded
-FEWEST = 6  # differences that tell the noise
-FEWEST_WITH_JUMPS = 20  # differences whose median tells it
-MAD = 1.4826  # of the median of normal deviations: their standard deviation
+LEAST = 8  # minimum number of samples of a piece
+WINDOW = 9  # minimum number of samples for a cubic fit
+WINDOW_TIME = 0.05  # [s] all samples within this time of the centre are also used
+ORDERS = 8  # highest order of the differences of samples from which the noise is estimated
+NO_NOISE = 1e-9  # minimum noise as a fraction of a column's range: recordings without noise are rounded
+FEWEST = 6  # minimum number of differences for an estimate of the noise
+FEWEST_WITH_JUMPS = 20  # minimum number of differences for an estimate by their median
+MAD = 1.4826  # ratio of a normal distribution's standard deviation to the median of absolute deviations
 
 
 @dataclass(frozen=True, eq=False)
 class Excerpt:
-    """A stretch of a recording."""
+    """A piece of a recording."""
 
     name: str
     times: Array  # (n,) [s]
-    ys: Array  # (n, nx) measured states; NaN where nothing was
-    us: Array  # (n-1, nu) held from each sample to the next
+    ys: Array  # (n, nx) measured states; NaN if unmeasured
+    us: Array  # (n-1, nu) inputs, constant from each sample to the next
     held_out: bool
-    recording: int = 0  # which one it is of
+    recording: int = 0  # index of its recording
     earlier: tuple[Array, Array] | None = None  # times (m,) and inputs (m, nu) of the recording before this piece
-    outs: Array | None = None  # (n, m) what sensors read; NaN where nothing was
+    outs: Array | None = None  # (n, m) sensor readings; NaN if unmeasured
 
     @property
     def switches(self) -> tuple[Array, Array]:
-        """When inputs begin (m,) [s], from the recording's first, and what they are then (m, nu)."""
+        """The times (m,) [s] at which inputs begin, from the recording's first one on, and the inputs (m, nu)."""
         if self.earlier is None:
             return self.times[:-1], self.us
         times, us = self.earlier
         return np.concatenate([times, self.times[:-1]]), np.concatenate([us, self.us])
 
     def part(self, first: int, last: int) -> "Excerpt":
-        """From one sample to another, both included."""
+        """Return the piece from one sample to another, both included."""
         span = slice(first, last + 1)
         earlier = Excerpt(self.name, self.times[: first + 1], self.ys, self.us[:first], False, 0, self.earlier).switches
         outs = None if self.outs is None else self.outs[span]
@@ -137,11 +137,11 @@ def read_pieces(
     held_out: float | str,
     columns: Sequence[str] = (),
 ) -> list[Excerpt]:
-    """Each recording's first part to fit, and its last to be held out: a part of the samples, or a recording by name.
+    """Split recordings into fitted and held-out pieces; `held_out` is a fraction at the end, or a recording's name.
 
-    `columns` are those of sensors that are read.
+    `columns` are the columns of sensors that are read.
 
-    Raises InputError, ShapeError or NonFiniteError, naming recording and entry.
+    Raises InputError, ShapeError or NonFiniteError that names recording and entry.
     """
     given = [recordings] if isinstance(recordings, (Recording, str, Path)) else list(recordings)
     if not given:
@@ -174,7 +174,7 @@ def read_pieces(
 def read_given(
     model: Model, recordings: Recording | str | Path | Sequence[Recording | str | Path]
 ) -> tuple[tuple[Recording, ...], tuple[tuple[Path, str] | None, ...]]:
-    """Every recording, and the file that it was read from with its hash, where there is one."""
+    """Read all recordings; return them, and for each its file with the hash, or None."""
     given = [recordings] if isinstance(recordings, (Recording, str, Path)) else list(recordings)
     logs, files = [], []
     for source in given:
@@ -188,7 +188,7 @@ def read_given(
 
 
 def hash_of(path: Path) -> str:
-    """The hash of a file; of a directory, that of the names and hashes of its files."""
+    """Return the hash of a file; that of a directory is over the names and hashes of its files."""
     if path.is_file():
         with path.open("rb") as file:
             return file_digest(file, "sha256").hexdigest()
@@ -197,7 +197,7 @@ def hash_of(path: Path) -> str:
 
 
 def columns_of(recordings: Sequence[Recording]) -> tuple[str, ...]:
-    """The columns of sensors of all recordings."""
+    """Return the sensor columns of all recordings."""
     return tuple(dict.fromkeys(name for recording in recordings for name in recording.outputs))
 
 
@@ -242,9 +242,9 @@ def _checked(recording: Recording, model: Model, columns: Sequence[str]) -> Exce
 
 
 def given_noise(model: Model, chart: Chart, noise: Mapping[str, float] | None, columns: Sequence[str] = ()) -> Array:
-    """(2 nv + m,) what the user says of the noise of each entry; NaN where nothing.
+    """Return the user's noise (2 nv + m,) of each entry; NaN if not given.
 
-    Names are those of states; a free body's turn is called base_rx, base_ry, base_rz.
+    Names are those of states; a free body's rotation is named base_rx, base_ry, base_rz.
     """
     names = (*tangent_space(model).names, *columns)
     deviations = np.full(len(names), np.nan)
@@ -258,10 +258,10 @@ def given_noise(model: Model, chart: Chart, noise: Mapping[str, float] | None, c
 
 
 def noise_by_differences(chart: Chart, pieces: Sequence[Excerpt], *, jumps: bool = False) -> Array:
-    """(2 nv + m,) an upper estimate of the noise of each entry: of differences of orders 1 to ORDERS, the least one.
+    """Return an upper estimate (2 nv + m,) of the noise of each entry: the least by differences of orders 1 to ORDERS.
 
-    White noise s makes the difference of order d vary by s sqrt(binomial(2 d, d)); what moves adds to that. Where the
-    motion `jumps`, as in impacts, which are few, the median of many differences says how large they are.
+    White noise s gives the difference of order d the deviation s sqrt(binomial(2 d, d)); motion increases it. If the
+    motion `jumps`, as at impacts, the median of the differences is used, as jumps are few.
     """
     increments = [chart.minus(piece.ys[1:], piece.ys[:-1]) for piece in pieces]
     increments = [
@@ -283,14 +283,14 @@ def noise_by_differences(chart: Chart, pieces: Sequence[Excerpt], *, jumps: bool
         travelled = np.concatenate([rows[:, j] for rows in increments])
         reach[j] = np.nansum(np.abs(travelled)) if np.any(np.isfinite(travelled)) else 0.0
     seen = np.any([np.isfinite(rows).any(axis=0) for rows in increments], axis=0)
-    least = np.where(np.isfinite(least), least, 1.0)  # where samples are too few to say
+    least = np.where(np.isfinite(least), least, 1.0)  # too few samples for an estimate
     return np.where(seen, np.maximum(least, NO_NOISE * np.maximum(reach, 1e-3)), np.nan)
 
 
 def guess_states(model: Model, chart: Chart, piece: Excerpt, samples: NDArray[np.intp]) -> Array:
-    """(len(samples), nx) states at some samples: cubics through the samples around each.
+    """Guess states (len(samples), nx) at some samples by cubic fits to the samples around each.
 
-    A velocity that was not measured is the slope of its position; a position that was not measured is the model's own.
+    An unmeasured velocity is the derivative of its position. An unmeasured position is the model's default.
     """
     nq, default = model.nq, model.default_state
     states = np.empty((len(samples), model.nx))
@@ -313,7 +313,7 @@ def guess_states(model: Model, chart: Chart, piece: Excerpt, samples: NDArray[np
 
 
 def _cubic(times: Array, y: Array, time: float) -> Any:
-    """(value, slope) at `time` of a cubic through the measured `y` (n,) around it; None where there are none."""
+    """Return (value, slope) at `time` of a cubic fit to the measured `y` (n,) around it; None if too few exist."""
     if len(times) < 2:
         return None
     begin, here, end = np.searchsorted(times, time + np.array([-WINDOW_TIME, 0.0, WINDOW_TIME]))

@@ -1,4 +1,4 @@
-"""What identification finds: values with their intervals, and the change that explains a recording."""
+"""Results of identification: values with their intervals, and the change that explains a recording."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,11 +16,11 @@ from drake_diff.model.model import Model
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """What `identify` was called with."""
+    """The arguments of a call of `identify`."""
 
     model: Model
     recordings: tuple[Recording, ...]
-    files: tuple[tuple[Path, str] | None, ...]  # of each, the file that it was read from and its hash
+    files: tuple[tuple[Path, str] | None, ...]  # per recording, its file and the file's hash, or None
     parameters: tuple[str, ...] | str
     noise: Mapping[str, float]
     held_out: float | str
@@ -33,42 +33,40 @@ class Request:
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """A stretch of a recording beside the model's motion."""
+    """A piece of a recording together with the model's motion."""
 
     piece: Excerpt
-    xs: Array  # (n, nx) with the values that were found
-    xs_before: (
-        Array | None
-    )  # with the model's own, from a first state that fits best; None where that was not looked at
+    xs: Array  # (n, nx) with the estimated values
+    xs_before: Array | None  # (n, nx) with the model's own values, from the best first state; None if not computed
 
 
 @dataclass(frozen=True, eq=False)
 class Identification(ShowsItsRepr):
-    """What recordings say of a model's parameters; `dd.identify` makes one."""
+    """Estimates of a model's parameters from recordings, as returned by `dd.identify`."""
 
-    values: Mapping[str, Any]  # by name, as the model's parameters take them; a number or an array
-    start: Mapping[str, Any]  # the model's own
-    intervals: Mapping[str, Array]  # (2,) or (k, 2): lower and upper, with 95 % of the probability
+    values: Mapping[str, Any]  # by name, in the form of the model's parameters: a number or an array
+    start: Mapping[str, Any]  # the model's own values
+    intervals: Mapping[str, Array]  # (2,) or (k, 2): lower and upper ends of 95 % intervals
     units: Mapping[str, str]
-    unidentifiable: tuple[str, ...]  # combinations that the recordings leave open, in words
-    explained: bool  # whether what is left looks like noise, and held-out samples are predicted
-    reason: str  # why
+    unidentifiable: tuple[str, ...]  # combinations that the recordings do not determine, in words
+    explained: bool  # whether the residuals look like noise, and held-out samples are predicted
+    reason: str  # the reason of `explained`
     sentence: str
-    noise: Mapping[str, float]  # the standard deviation of each measured entry, given or from the residuals
-    error_before: float  # of the held-out samples (of all, where none are), in standard deviations of the noise
+    noise: Mapping[str, float]  # the standard deviation of each measured entry, given or estimated from the residuals
+    error_before: float  # of the held-out samples (of all if none are held out), in standard deviations of the noise
     error_after: float
-    residuals: tuple[Array, ...]  # of each fitted piece (n, 2 nv + m), in standard deviations; NaN where unmeasured
-    columns: tuple[str, ...]  # (np,) a name for each entry of the values
-    entries: tuple[str, ...]  # (2 nv + m,) a name for each column of the residuals
-    covariance: Array  # (np, np) of the values; infinite where nothing is known
-    score: float  # -2 log of the likelihood, up to a constant of the data
-    count: int  # how many numbers were measured
+    residuals: tuple[Array, ...]  # per fitted piece (n, 2 nv + m), in standard deviations; NaN if unmeasured
+    columns: tuple[str, ...]  # (np,) the name of each entry of the values
+    entries: tuple[str, ...]  # (2 nv + m,) the name of each column of the residuals
+    covariance: Array  # (np, np) of the values; infinite if nothing is known
+    score: float  # -2 log likelihood, up to a constant of the data
+    count: int  # number of measurements
     converged: bool
     steps: int
-    motion: str  # which motion was fitted
-    motions: tuple[Followed, ...]  # of what was fitted, then of what was held out
-    at_half_step: Mapping[str, Any] | None = None  # through impacts, the values by steps of half the length, if it has
-    asked: Request | None = None  # what was asked: `dd.save` writes it, and `dd.verify` asks it again
+    motion: str  # the law of motion that was fitted
+    motions: tuple[Followed, ...]  # of the fitted pieces, then of the held-out ones
+    at_half_step: Mapping[str, Any] | None = None  # through impacts, the values with half the time step, if available
+    asked: Request | None = None  # the request, which `dd.save` writes and `dd.verify` repeats
 
     def __repr__(self) -> str:
         return self.sentence
@@ -76,15 +74,15 @@ class Identification(ShowsItsRepr):
 
 @dataclass(frozen=True, eq=False)
 class Explanation(ShowsItsRepr):
-    """The smallest change of a model that explains recordings; `dd.explain` makes one."""
+    """The smallest change of a model that explains recordings, as returned by `dd.explain`."""
 
-    names: tuple[str, ...]  # what is changed: one name, or two; empty where nothing is, or nothing explains
-    values: Mapping[str, Any]  # by name, of the alternatives too
-    intervals: Mapping[str, Array]  # (2,) or (k, 2): lower and upper, with 95 % of the probability
-    alternatives: tuple[tuple[str, ...], ...]  # other changes that the recordings cannot tell from this one
-    explained: bool  # whether the model explains the recordings: as it is, or with the change
+    names: tuple[str, ...]  # one or two changed quantities; empty if the model is unchanged, or no change explains
+    values: Mapping[str, Any]  # by name, including those of the alternatives
+    intervals: Mapping[str, Array]  # (2,) or (k, 2): lower and upper ends of 95 % intervals
+    alternatives: tuple[tuple[str, ...], ...]  # other changes that the recordings cannot distinguish from this one
+    explained: bool  # whether the model explains the recordings, unchanged or with the change
     sentence: str
-    evidence: Mapping[str, float]  # by what was fitted: by how much it lowers -2 log of the likelihood
+    evidence: Mapping[str, float]  # by fitted change, the decrease of -2 log likelihood
 
     def __repr__(self) -> str:
         return self.sentence
@@ -100,7 +98,7 @@ def identification(
     reason: str,
     **rest: Any,
 ) -> Identification:
-    """Of values (np,) with intervals (np, 2), explained where there is no `reason` against it."""
+    """Return an identification of values (np,) with intervals (np, 2); it is explained if `reason` is empty."""
     return Identification(
         values=unknowns.named(values),
         start=unknowns.named(unknowns.start),

@@ -1,6 +1,6 @@
-"""What sensors read that are no coordinates: where a point is, how a body turns and accelerates, a joint's force.
+"""Readings of sensors: the position of a point, the angular velocity and acceleration of a body, the force of a joint.
 
-Accelerations and forces have the derivatives of the equations of motion; kinematics is differentiated by differences.
+Accelerations and forces use the derivatives of the equations of motion. Kinematics is differentiated by differences.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ from drake_diff.model.plant import bodies, joints, labelled
 
 AXES = ("x", "y", "z")
 OF_BODY = ("position", "gyro", "accel")  # [m] in world; [rad/s] and [m/s^2] in the sensor's frame
-FORCE = "force"  # [N m] or [N] of a joint
+FORCE = "force"  # [N m] or [N], at a joint
 STEP = 1e-5  # [rad, m] of a central difference
 
 
@@ -27,22 +27,22 @@ STEP = 1e-5  # [rad, m] of a central difference
 class MountedSensor:
     """Three readings of a body, or one of a joint."""
 
-    label: str  # as its columns call it
+    label: str  # the label in its columns
     quantity: str
-    link: int  # which carries it; of a force, its joint's
-    turn: Array  # (3, 3) of its frame on the link
-    point: Array  # (3,) [m] of its origin there
+    link: int  # index of the link that carries it; for a force, the link of its joint
+    turn: Array  # (3, 3) rotation of its frame on the link
+    point: Array  # (3,) [m] its origin on the link
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """A name for each reading."""
+        """The name of each reading."""
         if self.quantity == FORCE:
             return (f"{self.label}.{FORCE}",)
         return tuple(f"{self.label}.{self.quantity}_{axis}" for axis in AXES)
 
 
 def sensor_of(column: str) -> tuple[str, str]:
-    """(label, quantity) of a column. InputError where it is none of a sensor."""
+    """Return (label, quantity) of a column. Raises InputError if it is not the column of a sensor."""
     label, dot, last = column.rpartition(".")
     quantity, _, axis = last.partition("_")
     if dot and label and (last == FORCE or (quantity in OF_BODY and axis in AXES)):
@@ -54,9 +54,9 @@ def sensor_of(column: str) -> tuple[str, str]:
 def choose_sensors(
     model: Model, tree: Tree | None, columns: Sequence[str], mounted: Mapping[str, tuple[str, Sequence[float]]] | None
 ) -> "Sensors":
-    """Those whose readings the columns are. A label is a joint, a body, whose frame it then is, or one of `mounted`.
+    """Return the sensors of the columns; a label is a joint, a body (the sensor has its frame), or one of `mounted`.
 
-    Raises UnknownNameError or InputError where there is no such body or joint, ModelError where it cannot be told.
+    Raises UnknownNameError or InputError for an unusable body or joint, ModelError for a motion without sensor support.
     """
     mounted = dict(mounted or {})
     wanted = dict.fromkeys(sensor_of(column) for column in columns)
@@ -96,7 +96,7 @@ def _sensor(model: Model, tree: Tree, label: str, quantity: str, mounted: Any) -
 
 
 def _mounted(label: str, given: Any) -> tuple[str, Array, Array]:
-    """Its body, and the pose on it: a point, or a point with roll, pitch and yaw."""
+    """Return the body, rotation and point of a sensor that is given as a point, or as a point with roll, pitch, yaw."""
     expected = "a body, and x, y, z [m], or x, y, z, roll, pitch, yaw [rad] in its frame"
     try:
         body, pose = given
@@ -112,7 +112,7 @@ def _mounted(label: str, given: Any) -> tuple[str, Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Sensors:
-    """All sensors of a fit; `columns` are those that were recorded, in their order."""
+    """All sensors of a fit; `columns` are the recorded columns, in their order."""
 
     tree: Tree | None
     each: tuple[MountedSensor, ...]
@@ -123,7 +123,7 @@ class Sensors:
         return len(self.columns)
 
     def read(self, dynamics: TreeDynamics, x: Array, u: Array) -> Array:
-        """(N, m) at x (N, nx) under u (N, nu)."""
+        """Return the readings (N, m) at x (N, nx) under u (N, nu)."""
         q, v, a = x[:, : x.shape[1] - dynamics.nv], x[:, -dynamics.nv :], dynamics.accelerate(x, u)
         read = self._of_links(dynamics, q, v, a)
         for i, k in self._forces(dynamics):
@@ -131,12 +131,12 @@ class Sensors:
         return read
 
     def slopes(self, dynamics: TreeDynamics, x: Array, u: Array, by: Array) -> tuple[Array, Array]:
-        """(N, m, 2 nv) by small motions of the state, and (N, m, np) by parameters, of which `by` moves the numbers."""
+        """Return derivatives with respect to tangent vectors (N, m, 2 nv) and parameters (N, m, np) for `by`."""
         nv, plus = dynamics.nv, Chart(dynamics.tree.coordinates).plus
         a, by_state = dynamics.acceleration_jacobians(x, u, by)
         q, v, numbers = x[:, : x.shape[1] - nv], x[:, -nv:], dynamics.numbers
         moved, by_a = np.zeros((len(x), self.count, 2 * nv)), np.zeros((len(x), self.count, nv))
-        for j, e in enumerate(np.eye(nv)):  # quadratic in v and linear in a: of these central differences are exact
+        for j, e in enumerate(np.eye(nv)):  # quadratic in v, linear in a: central differences are exact
             turned = [plus(x, np.tile(np.append(sign * STEP * e, 0 * e), (len(x), 1)))[:, :-nv] for sign in (1, -1)]
             ahead, back = (self._of_links(dynamics, q_end, v, a) for q_end in turned)
             moved[..., j] = (ahead - back) / (2 * STEP)
@@ -146,7 +146,7 @@ class Sensors:
             by_a[..., j] = (ahead - back) / 2
         by_parameters = np.zeros((len(x), self.count, by.shape[1]))
         frames = np.concatenate([numbers.places("offset").ravel(), numbers.places("gravity")])
-        for p in np.flatnonzero(np.any(by[frames] != 0, axis=0)):  # in which readings are linear
+        for p in np.flatnonzero(np.any(by[frames] != 0, axis=0)):  # readings are linear in them
             moved_trees = (replace(dynamics, numbers=numbers.moved(sign * by[:, p])) for sign in (1, -1))
             ahead, back = (self._of_links(there, q, v, a) for there in moved_trees)
             by_parameters[..., p] = (ahead - back) / 2
@@ -156,12 +156,12 @@ class Sensors:
         return moved + by_a @ by_state[..., : 2 * nv], by_parameters + by_a @ by_state[..., 2 * nv :]
 
     def _forces(self, dynamics: TreeDynamics) -> list[tuple[int, int]]:
-        """(column, degree of freedom) of each force."""
+        """Return (column, degree of freedom) of each force."""
         forces = (sensor for sensor in self.each if sensor.quantity == FORCE)
         return [(self.columns.index(f"{s.label}.{FORCE}"), int(dynamics.tree.first[s.link])) for s in forces]
 
     def _of_links(self, dynamics: TreeDynamics, q: Array, v: Array, a: Array) -> Array:
-        """(N, m) but for forces, which are 0."""
+        """Return the readings (N, m), with 0 for forces."""
         frames, columns = dynamics.frames(q, v, a), dict[str, Array]()
         for sensor in self.each:
             pose, motion, change = (values[:, sensor.link] for values in frames)
@@ -170,7 +170,7 @@ class Sensors:
 
 
 def _reading(sensor: MountedSensor, pose: Array, motion: Array, change: Array) -> Array:
-    """(N, 3) of a sensor on a link at `pose` (N, 3, 4) that moves so (N, 6) in its frame; (N, 1) of 0 for a force."""
+    """Return readings (N, 3) on a link at `pose` (N, 3, 4) with this motion (N, 6); zeros (N, 1) for a force."""
     w, point = motion[:, :3], np.broadcast_to(sensor.point, motion[:, :3].shape)
     if sensor.quantity == FORCE:
         return np.zeros((len(pose), 1))

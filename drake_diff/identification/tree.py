@@ -1,8 +1,8 @@
-"""The equations of motion of a tree at many states, as functions of the numbers that parameters set.
+"""The equations of motion of a tree at many states, as functions of its numbers, which depend on the parameters.
 
 The force of inverse dynamics is linear in each link's ten numbers: mass, mass times centre of mass, inertia about the
-frame's origin. So is it in damping, stiffness, friction and gravity; a shift of a joint on its parent enters as a
-polynomial of the second degree, whose derivative a central difference has. With these
+frame's origin. It is also linear in damping, stiffness, friction and gravity. It is quadratic in the offset of a joint
+on its parent, so a central difference gives the exact derivative. With these
 
     da / dnumber = M^-1 (d force / dnumber - d inverse dynamics / dnumber)   at fixed q, v and a.
 """
@@ -30,21 +30,21 @@ from drake_diff.model.repairs import JointCoupling
 
 KERNEL = "drake_diff.identification.kernel"
 INERTIA = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # xx yy zz xy xz yz
-SLIP_SPEED = 0.02  # [rad/s or m/s] over which friction turns where it is smooth
+SLIP_SPEED = 0.02  # [rad/s or m/s] over which smooth friction changes its sign
 REST = 1e-9  # [rad/s, m/s] below which a joint is at rest
-SHIFT = 0.437  # of a change of numbers: of a polynomial of the second degree a central difference is exact
+SHIFT = 0.437  # size of a central difference of numbers, which is exact for quadratic polynomials
 OF_JOINTS = ("reflected", "damping", "stiffness", "rest", "coulomb")
 Mask = NDArray[np.bool_]
-Method = tuple[Array, Array]  # of Runge and Kutta: (m, m) its stages, (m,) its weights
+Method = tuple[Array, Array]  # of Runge-Kutta type: stages (m, m) and weights (m,)
 ORDER_8: Method = (np.array(DOP853.A[: len(DOP853.B), : len(DOP853.B)]), np.array(DOP853.B))
 ORDER_4: Method = (np.pad(np.diag([0.5, 0.5, 1.0]), ((1, 0), (0, 1))), np.array([1, 2, 2, 1]) / 6)
 
 
 class Grip(NamedTuple):
-    """What Coulomb friction does at N states."""
+    """The sliding or sticking of joints by Coulomb friction at N states."""
 
-    turn: Array  # (N, nv) 1 or -1 of joints that slide
-    held: Array  # (N, nv) 1 of joints that are held
+    turn: Array  # (N, nv) 1 or -1 for joints that slide, else 0
+    held: Array  # (N, nv) 1 for joints that stick, else 0
 
     def some(self, rows: Any) -> "Grip":
         return Grip(self.turn[rows], self.held[rows])
@@ -52,26 +52,26 @@ class Grip(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """What parameters set, of L moving links and n degrees of freedom; complex where a derivative is taken by it."""
+    """The numbers of L moving links and n degrees of freedom that depend on parameters; complex for derivatives."""
 
     inertial: Any  # (L, 10) mass, mass times centre, xx yy zz xy xz yz about the origin, in the joint's frame
-    offset: Any  # (L, 3) [m] of the joint's frame on the link before it
+    offset: Any  # (L, 3) [m] origin of the joint's frame on the parent link
     gravity: Any  # (3,)
     damping: Any  # (n,)
     reflected: Any  # (n,) rotor inertia times gear ratio squared
     stiffness: Any  # (n,)
     rest: Any  # (n,)
-    coulomb: Any  # (n,) dry friction [N or N m]
-    strength: Any  # (nu,) what an input is multiplied by
-    limit: Any  # (nu,) what an input is cut at
+    coulomb: Any  # (n,) Coulomb friction [N or N m]
+    strength: Any  # (nu,) factor of an input
+    limit: Any  # (nu,) magnitude to which an input is clipped
 
     @property
     def flat(self) -> Any:
-        """All of them (count,), one after the other."""
+        """All numbers (count,), concatenated."""
         return np.concatenate([np.ravel(getattr(self, name)) for name in self.__dataclass_fields__])
 
     def places(self, name: str) -> Indices:
-        """Where those called `name` stand in `flat`, in their own shape."""
+        """Return the indices of the numbers `name` in `flat`, in their own shape."""
         start = 0
         for other in self.__dataclass_fields__:
             values = getattr(self, other)
@@ -81,38 +81,38 @@ class Numbers:
         raise KeyError(name)
 
     def moved(self, change: Any) -> "Numbers":
-        """With a change (count,) of all."""
+        """Return the numbers plus a change (count,) of all."""
         return Numbers(**{n: getattr(self, n) + change[self.places(n)] for n in self.__dataclass_fields__})
 
 
 @dataclass(frozen=True, eq=False)
 class Tree:
-    """The tree of a model: what stays where parameters change."""
+    """The tree of a model, with its structure, which does not depend on parameters."""
 
     links: tuple[RigidLink, ...]  # parents first
     compiled: CompiledTree  # of the moving links
     coordinates: Coordinates  # of the independent joints
-    coupling: JointCoupling | None  # of joints that follow others
+    coupling: JointCoupling | None  # of mimic joints
     n: int  # degrees of freedom of all joints
     actuation: Array  # (n, nu)
-    placed: Mapping[str, tuple[int, Any]]  # by body: the link it belongs to, and the pose of the body in its frame
-    moved_by: Mapping[str, Array]  # (10, 10) by body: its ten numbers in the frame of its link
+    placed: Mapping[str, tuple[int, Any]]  # by body: the index of its link, and its pose in the link's frame
+    moved_by: Mapping[str, Array]  # (10, 10) by body: the map of its ten numbers to the frame of its link
     bodies: Mapping[str, Link]
     numbers: Numbers  # the model's own
 
     @property
     def first(self) -> Indices:
-        """(L,) of each link, its first degree of freedom."""
+        """The first degree of freedom (L,) of each link."""
         return np.array([link.joint.v_start for link in self.links], dtype=np.intp)
 
     @cached_property
     def spread(self) -> Array:
-        """(n, nv) velocities of all joints by the independent ones."""
+        """The matrix (n, nv) from independent velocities to those of all joints."""
         return np.eye(self.n) if self.coupling is None else np.asarray(self.coupling.spread, dtype=float)
 
     @cached_property
     def springs(self) -> Indices:
-        """(n,) where the position of each degree of freedom is in q."""
+        """The index (n,) in q of each degree of freedom's position."""
         positions = np.zeros(self.n, dtype=np.int64)
         for link in self.links:
             if not link.free:
@@ -120,11 +120,11 @@ class Tree:
         return positions
 
     def joint_positions(self, q: Array) -> Array:
-        """Of all joints, at q (N, nq) of the independent ones."""
+        """Return the positions of all joints for q (N, nq) of the independent ones."""
         return q if self.coupling is None else np.asarray(self.coupling.positions(q))
 
     def with_numbers(self, numbers: Numbers) -> CompiledTree:
-        """The links with these numbers."""
+        """Return the links with these numbers."""
         ten, tables = numbers.inertial, self.compiled.tables
         mass = ten[:, 0]
         center = ten[:, 1:4] / np.where(mass != 0, mass, 1.0)[:, None]
@@ -139,13 +139,13 @@ class Tree:
 
 @dataclass(frozen=True, eq=False)
 class TreeDynamics:
-    """A tree with these numbers; Coulomb friction holds the coordinates that are `dry`, else it turns over a speed."""
+    """The dynamics of a tree. Coulomb friction can stick in the coordinates `dry`, or is smooth if `dry` is empty."""
 
     tree: Tree
     numbers: Numbers
     dry: tuple[int, ...] = ()
     method: Method = ORDER_8
-    frozen: bool = False  # whether steps are differentiated with their equations frozen halfway
+    frozen: bool = False  # whether derivatives use the equations linearized at the midpoint of a step
 
     @property
     def nv(self) -> int:
@@ -153,12 +153,12 @@ class TreeDynamics:
 
     @property
     def is_dry(self) -> Mask:
-        """(nv,)"""
+        """Whether each coordinate (nv,) can stick."""
         return np.isin(np.arange(self.nv), self.dry)
 
     @property
     def friction(self) -> Array:
-        """(nv,) the most that friction pushes along a coordinate: of its joint and of those that follow it."""
+        """The largest friction (nv,) along each coordinate: that of its joint and of the joint's followers."""
         return np.asarray(self.numbers.coulomb @ np.abs(self.tree.spread))
 
     @cached_property
@@ -177,12 +177,12 @@ class TreeDynamics:
         return kernel(KERNEL).TreeSystem(self.links.tables, *map(_array, arrays), 0.0 if self.dry else SLIP_SPEED)
 
     def _push(self, u: Array) -> Array:
-        """(N, n) the forces of inputs u (N, nu)."""
+        """Return the forces (N, n) of inputs u (N, nu)."""
         inputs = np.clip(u, -self.numbers.limit, self.numbers.limit) * self.numbers.strength
         return np.asarray(inputs @ self.tree.actuation.T)
 
     def grip(self, x: Array, u: Array, released: Array | None = None) -> Grip:
-        """Of a motion that begins at x (N, nx); joints at rest are held, unless `released` or pushed too hard."""
+        """Return the grip at x (N, nx); joints at rest stick unless they are `released` or the force is too large."""
         v, free = x[:, -self.nv :], np.zeros((len(x), self.nv)) if released is None else released
         turn = np.where(self.is_dry, np.where(np.abs(v) > REST, np.sign(v), free), 0.0)
         grip = Grip(turn, (self.is_dry & (turn == 0)).astype(float))
@@ -198,17 +198,17 @@ class TreeDynamics:
         return grip
 
     def accelerate(self, x: Array, u: Array) -> Array:
-        """(N, nv) at x (N, nx) under u (N, nu)."""
+        """Return the accelerations (N, nv) at x (N, nx) under u (N, nu)."""
         return self.accelerate_and_hold(x, u, self.grip(x, u))[0]
 
     def accelerate_and_hold(self, x: Array, u: Array, grip: Grip) -> tuple[Array, Array]:
-        """(N, nv), and the forces (N, nv) that hold joints still."""
+        """Return the accelerations (N, nv), and the friction forces (N, nv) on sticking joints."""
         a, holding = np.empty((2, len(x), self.nv))
         kernel(KERNEL).accelerate(self._system, *map(_array, (x, self._push(u), *grip)), a, holding)
         return a, holding
 
     def step(self, x: Array, h: Array, u: Array, grip: Grip | None = None) -> Array:
-        """The states (N, nx) after steps of h (N,) [s] from x under u (N, nu)."""
+        """Return the states (N, nx) after steps of h (N,) [s] from x under u (N, nu)."""
         nothing, out = np.zeros((len(x), self.nv)), np.empty(x.shape)
         grip = Grip(nothing, nothing) if grip is None else grip
         points = map(_array, (*self.method, x, h, self._push(u), *grip))
@@ -216,11 +216,11 @@ class TreeDynamics:
         return out
 
     def step_jacobians(self, x: Array, h: Array, u: Array, by: Array, grip: Grip | None = None) -> Array:
-        """(N, nx, nx + P) of these steps; `by` (count, P) is how the numbers change with parameters."""
+        """Return the Jacobians (N, nx, nx + P) of these steps; `by` (count, P) is d numbers / d parameters."""
         (N, nx), nothing, h = x.shape, np.zeros((len(x), self.nv)), h[:, None, None]
         grip = Grip(nothing, nothing) if grip is None else grip
         if self.frozen:
-            # d' = J d + C halfway through the step, by the diagonal Pade approximation of the exponential of order 4
+            # d' = J d + C with J, C at the midpoint, solved by the diagonal Pade approximation of exp of order 4
             halfway = replace(self, method=ORDER_4).step(x, h[:, 0, 0] / 2, u, grip)
             _, J, C = self._rates(halfway, u, by, grip)
             X, identity = h * J, np.eye(nx)
@@ -238,7 +238,7 @@ class TreeDynamics:
         return np.asarray(start + h * np.tensordot(weights, changes, 1))
 
     def _rates(self, x: Array, u: Array, by: Array, grip: Grip) -> tuple[Array, Array, Array]:
-        """dx/dt (N, nx), and its derivatives by x (N, nx, nx) and by parameters (N, nx, P)."""
+        """Return dx/dt (N, nx), and its derivatives with respect to x (N, nx, nx) and parameters (N, nx, P)."""
         (N, nx), nv, coordinates = x.shape, self.nv, self.tree.coordinates
         q, v, nq = x[:, : nx - nv], x[:, -nv:], nx - nv
         a, by_state = self.acceleration_jacobians(x, u, by, grip)
@@ -249,7 +249,7 @@ class TreeDynamics:
         return np.concatenate([(rate @ v[..., None])[..., 0], a], axis=1), J, C
 
     def acceleration_jacobians(self, x: Array, u: Array, by: Array, grip: Grip | None = None) -> tuple[Array, Array]:
-        """(N, nv), and (N, nv, 2 nv + P) by small motion, by v and by parameters."""
+        """Return accelerations (N, nv), derivatives (N, nv, 2 nv + P) with respect to q (tangent), v, parameters."""
         tree, numbers, nv, n = self.tree, self.numbers, self.nv, self.tree.n
         grip, E, places = self.grip(x, u) if grip is None else grip, self.tree.spread, self.numbers.places
         a, _ = self.accelerate_and_hold(x, u, grip)
@@ -277,9 +277,9 @@ class TreeDynamics:
         return a, np.asarray(-np.linalg.solve(M, right), dtype=float)
 
     def inverse_dynamics(self, q: Array, v: Array, a: Array, by: Array | None = None) -> tuple[Array, Array, Array]:
-        """tau (N, n) of the links, mass (N, n, n), and tau by small motion, by v and by parameters (N, n, 2 n + P).
+        """Return tau (N, n), mass (N, n, n), and d tau (N, n, 2 n + P) with respect to q's tangent, v and parameters.
 
-        At q, v and a of all joints, those that follow others included.
+        q, v and a are those of all joints, including mimic joints.
         """
         moved = self.links(q, v, a, derivatives=by is not None)
         if by is None:
@@ -299,9 +299,9 @@ class TreeDynamics:
         return moved.tau, moved.mass, np.concatenate([moved.by_q, moved.by_v, by_parameters], axis=2)
 
     def frames(self, q: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
-        """Of each link the pose (N, L, 3, 4), and its motion and the change of that (N, L, 6) in its frame.
+        """Return poses (N, L, 3, 4) of the links, and velocities and accelerations (N, L, 6) in the links' frames.
 
-        At q, v and a of all joints; the change is that in a frame that falls freely.
+        q, v and a are those of all joints. The accelerations are relative to free fall.
         """
         moved = self.links(q, v, a, derivatives=False)
         motion, change, _ = self._motions(moved, v, a)
@@ -311,10 +311,10 @@ class TreeDynamics:
         return moved.poses, V, A
 
     def _motions(self, moved: Moved, v: Array, a: Array) -> tuple[Array, Array, Mask]:
-        """Of each joint (N, J, 6) motion and its change about the world's origin, and (J, n) what carries it."""
+        """Return joint velocities and accelerations (N, J, 6) at the world's origin, and a mask (J, n) of ancestors."""
         t, (N, n), S = self.links.tables, v.shape, moved.S
         J = len(t.parent)
-        V, A = np.zeros((2, N, J + 1, 6))  # the last is the world's, which -1 finds
+        V, A = np.zeros((2, N, J + 1, 6))  # the last entry is the world, with index -1
         A[:, J, 3:] = -t.gravity
         carries = np.zeros((J + 1, n), dtype=bool)
         for j, (up, first, size) in enumerate(zip(t.parent, t.first, t.size, strict=True)):
@@ -327,7 +327,7 @@ class TreeDynamics:
         return V, A, carries
 
     def regressors(self, q: Array, v: Array, a: Array) -> Array:
-        """(N, n, L, 10) the force of inverse dynamics at q, v and a of all joints by the ten numbers of each link."""
+        """Return the derivatives (N, n, L, 10) of inverse dynamics with respect to the ten numbers of each link."""
         return self._regressors(self.links(q, v, a, derivatives=False), v, a)
 
     def _regressors(self, moved: Moved, v: Array, a: Array) -> Array:
@@ -342,24 +342,24 @@ class TreeDynamics:
 
     @property
     def efforts(self) -> Array:
-        """(nv, nu) the generalized force by the inputs."""
+        """The matrix (nv, nu) from inputs to generalized forces."""
         return np.asarray(self.tree.spread.T @ (self.tree.actuation * self.numbers.strength))
 
     def inputs_for(self, x: Array, a: Array) -> Array:
-        """(N, nu) the inputs that give accelerations a (N, nv), the nearest where none do; limits are not looked at."""
+        """Return inputs (N, nu) for accelerations a (N, nv), by least squares and without regard to limits."""
         free = self.accelerate(x, np.zeros((len(x), self.tree.actuation.shape[1])))
         needed = (self.mass(x) @ (a - free)[..., None])[..., 0]
         return np.asarray(needed @ np.linalg.pinv(self.efforts).T)
 
     def mass(self, x: Array) -> Array:
-        """(N, nv, nv) with reflected inertia."""
+        """Return the mass matrices (N, nv, nv), including reflected inertia."""
         tree, still = self.tree, np.zeros((len(x), self.tree.n))
         mass = self.inverse_dynamics(tree.joint_positions(x[:, : x.shape[1] - self.nv]), still, still)[1]
         return np.asarray(tree.spread.T @ (mass + np.diag(self.numbers.reflected)) @ tree.spread)
 
 
 def _array(values: Any) -> Any:
-    """Contiguous, of float64 or int64: of other arrays the kernel would be compiled once more."""
+    """Return a contiguous array of float64 or int64; for other arrays the kernel would be compiled again."""
     array = np.asarray(values)
     return np.ascontiguousarray(array, dtype=np.int64 if array.dtype.kind == "i" else float)
 
@@ -370,14 +370,14 @@ def _cross_motion(motion: Array, other: Array) -> Array:
 
 
 def _in_frame(X: Array, motion: Array) -> Array:
-    """Motions (N, k, 6) about the world's origin, in frames whose poses are X (N, 3, 4)."""
+    """Transform spatial vectors (N, k, 6) about the world's origin to frames with poses X (N, 3, 4)."""
     R, p = X[:, :, :3], X[:, None, :, 3]
     w = motion[..., :3]
     return np.concatenate([w @ R, (motion[..., 3:] + cross(w, p)) @ R], axis=2)
 
 
 def _wrench(motion: Array, change: Array) -> Array:
-    """(N, 6, 10) moment and force on a link by its ten numbers, where it moves and accelerates so (N, 6)."""
+    """Return the regressor (N, 6, 10) of moment and force on a link for its velocity and acceleration (N, 6)."""
     w, w_dot = motion[:, :3], change[:, :3]
     a = change[:, 3:] + cross(w, motion[:, 3:])
     turn, wrench = skew(w), np.zeros((len(w), 6, 10))
@@ -388,7 +388,7 @@ def _wrench(motion: Array, change: Array) -> Array:
 
 
 def _spun(w: Array) -> Array:
-    """(N, 3, 6) inertia times w (N, 3), by xx yy zz xy xz yz."""
+    """Return the matrix (N, 3, 6) from inertia (xx yy zz xy xz yz) to inertia times w (N, 3)."""
     spun = np.zeros((len(w), 3, 6))
     for k, (i, j) in enumerate(INERTIA):
         spun[:, i, k], spun[:, j, k] = w[:, j], w[:, i]
@@ -396,7 +396,7 @@ def _spun(w: Array) -> Array:
 
 
 def tree_for_identification(model: Model) -> Tree | Refusal:
-    """The tree of a model's own values; a Refusal that says what in it moves otherwise."""
+    """Return the tree of a model with its own values, or a Refusal that names what a tree cannot represent."""
     if model.num_constraints:
         return Refusal("joints are held by constraints")
     if any(actuator.has_controller() for actuator in actuators(model.plant)):
@@ -454,19 +454,19 @@ def tree_for_identification(model: Model) -> Tree | Refusal:
 
 
 def ten_numbers(mass: Any, center: Any, inertia: Any) -> Any:
-    """(10,) of a body: mass, centre of mass (3,), and xx yy zz xy xz yz about the centre; complex or float."""
+    """Return the ten numbers for mass, centre of mass (3,) and inertia (6,) about the centre; complex or float."""
     x, y, z = center
     about = [y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z]
     return np.array([mass, *(mass * c for c in center), *(i + mass * s for i, s in zip(inertia, about, strict=True))])
 
 
 def numbers_of(link: Link) -> Array:
-    """(10,) of a body in its own frame."""
+    """Return the ten numbers of a body in its own frame."""
     return np.asarray(ten_numbers(link.mass, link.center_of_mass, link.inertia[tuple(np.transpose(INERTIA))]))
 
 
 def _moved_by(pose: Any) -> Array:
-    """(10, 10) the ten numbers of a body in a frame in which its own has this pose, by those in its own."""
+    """Return the map (10, 10) of a body's ten numbers to a frame in which the body's frame has this pose."""
     R, p = pose.rotation().matrix(), np.array(pose.translation())
     columns = []
     for basis in np.eye(10):

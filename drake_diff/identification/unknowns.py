@@ -1,10 +1,10 @@
-"""What is estimated: named quantities, the coordinates z in which they move, and the numbers of the tree that they set.
+"""The unknowns: named quantities, their coordinates z, and the numbers of the tree that they set.
 
-A mass moves by its logarithm, an inertia by the log-Cholesky coordinates of its second moment about the centre of mass
-and the centre of mass by itself: with all three free these are the log-Cholesky coordinates of the pseudo-inertia
-(Rucker and Wensing, "Smooth parameterization of rigid-body inertia", 2022), so that every z is a body that can be.
-Damping, stiffness, friction and rotor inertia enter the equations of motion linearly and may be 0: they move by
-themselves, and are kept at 0 or above.
+A mass has its logarithm as coordinate, an inertia the log-Cholesky coordinates of its second moment about the centre
+of mass, and the centre of mass itself. If all three are free, these are the log-Cholesky coordinates of the
+pseudo-inertia (Rucker and Wensing, "Smooth parameterization of rigid-body inertia", 2022), and every z is a physically
+consistent body. Damping, stiffness, friction and rotor inertia enter the equations of motion linearly and may be 0.
+They are their own coordinates, with a lower bound of 0.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,7 +30,7 @@ from drake_diff.model.plant import bodies, joints, labelled, radius_of_gyration,
 MASS, CENTER, INERTIA = "mass", "center_of_mass", "inertia"
 COULOMB, STRENGTH, BIAS = "coulomb_friction", "strength", "bias"
 DELAY, LIMIT = "input_delay", "limit"  # [s] of all inputs; of one input
-OF_JOINTS = {  # one number of a joint, as `tree.Numbers` calls it
+OF_JOINTS = {  # quantities with one number per joint, and their names in `tree.Numbers`
     "damping": "damping",
     COULOMB: "coulomb",
     "spring_stiffness": "stiffness",
@@ -42,21 +42,21 @@ OF_TREE = (
     "gear_ratio", "rotor_inertia", "gravity", COULOMB, STRENGTH,
 )  # fmt: skip
 OF_ALL = (MASS, CENTER, INERTIA, "damping", "spring_stiffness", "rotor_inertia")
-FAR = 3.0  # how many times its own size a quantity may be wrong by before what the data say is doubted, at one sigma
+FAR = 3.0  # prior standard deviation of a quantity's change, in units of its own size
 
 
 @dataclass(frozen=True, eq=False)
 class Unknown:
-    """One quantity: the model's value (k,), its unit, and the size [unit] of a change that counts as 100 %."""
+    """An unknown quantity: the model's value (k,), its unit, and the size [unit] of a change by 100 %."""
 
     name: str
     unit: str
     start: Array
     lower: float
-    size: float  # 0 where the model says nothing of it, such as a damping of 0
+    size: float  # 0 if the model gives no size, as for a damping of 0
     upper: float = np.inf
-    prior: tuple[Array, Array] | None = None  # mean (k,) and standard deviation (k,), as somebody else knows it
-    shifts: bool = False  # whether inputs act so much later
+    prior: tuple[Array, Array] | None = None  # mean (k,) and standard deviation (k,), from the user
+    shifts: bool = False  # whether it is a delay of the inputs
 
     @property
     def label(self) -> str:
@@ -68,17 +68,17 @@ class Unknown:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """A name for each entry."""
+        """The name of each entry."""
         return (self.name,) if len(self.start) == 1 else tuple(f"{self.name}[{i}]" for i in range(len(self.start)))
 
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """All of them, one after the other."""
+    """All unknowns, concatenated."""
 
     each: tuple[Unknown, ...]
     as_in_files: bool = (
-        False  # a centre of mass moves with the inertia about it, as in files; in Drake's plant, without
+        False  # whether a new centre of mass keeps its central inertia, as in files but not in Drake's plant
     )
 
     @property
@@ -98,7 +98,7 @@ class Unknowns:
 
     @property
     def start(self) -> Array:
-        """(np,) the model's values."""
+        """The model's values (np,)."""
         return np.concatenate([unknown.start for unknown in self.each]) if self.each else np.zeros(0)
 
     @property
@@ -114,7 +114,7 @@ class Unknowns:
 
     @property
     def widths(self) -> Array:
-        """(np,) in z, how far the data may move it before they must say more than the file; infinite without a size."""
+        """The widths (np,) in z of the weak regularization towards the file's values; infinite without a size."""
         widths = np.empty(len(self.start))
         for unknown, s in self.items():
             relative = unknown.quantity in (MASS, INERTIA)
@@ -123,7 +123,7 @@ class Unknowns:
 
     @property
     def pulls(self) -> Array:
-        """(np,) the widths of those whose file's value is all that is known before; infinite where there is a prior."""
+        """The widths (np,), but infinite for unknowns with a prior."""
         pulls = self.widths
         for unknown, s in self.items():
             if unknown.prior is not None:
@@ -131,7 +131,7 @@ class Unknowns:
         return pulls
 
     def prior_rows(self, z: Array) -> tuple[Array, Array]:
-        """How far the values (m, in standard deviations) are from their priors, and by z (m, np)."""
+        """Return the deviations (m,) from priors in standard deviations, and their derivatives (m, np) in z."""
         priors = [(unknown.prior, s) for unknown, s in self.items() if unknown.prior is not None]
         if not priors:
             return np.zeros(0), np.zeros((0, len(z)))
@@ -141,7 +141,7 @@ class Unknowns:
 
     @property
     def bounds(self) -> tuple[Array, Array]:
-        """Lower and upper z (np,)."""
+        """The lower and upper bounds (np,) of z."""
         lower, upper = np.full(len(self.start), -np.inf), np.full(len(self.start), np.inf)
         for unknown, s in self.items():
             if unknown.quantity == MASS:
@@ -153,16 +153,16 @@ class Unknowns:
 
     @property
     def z_first(self) -> Array:
-        """Where a search begins: the model's own values, within bounds."""
+        """The initial z of a search: the model's own values, clipped to the bounds."""
         return np.clip(self.z_start, *self.bounds)
 
     @property
     def delay(self) -> int | None:
-        """Which column of z is a delay of inputs."""
+        """The column of z that is a delay of inputs, or None."""
         return next((s.start for unknown, s in self.items() if unknown.shifts), None)
 
     def values(self, z: Any) -> Any:
-        """(np,) of z (np,), complex or float; as in files a mass takes along the inertia of its body."""
+        """Return the values (np,) at z (np,), complex or float; with `as_in_files`, inertia scales with mass."""
         values, heavier = np.array(z), dict[str, Any]()
         for unknown, s in self.items():
             if unknown.quantity == MASS:
@@ -176,24 +176,24 @@ class Unknowns:
         return values
 
     def by_z(self, z: Array) -> Array:
-        """(np, np) the derivative of the values."""
+        """Return the derivative (np, np) of the values with respect to z."""
         return by_complex_step(self.values, z)
 
     def named(self, values: Array) -> dict[str, Any]:
-        """By name; a number where it is one."""
+        """Return the values by name; a single entry becomes a float."""
         return {
             unknown.name: float(values[s][0]) if len(unknown.start) == 1 else frozen(values[s])
             for unknown, s in self.items()
         }
 
     def named_intervals(self, intervals: Array) -> dict[str, Array]:
-        """By name, (2,) or (k, 2) of the intervals (np, 2)."""
+        """Return the intervals (np, 2) by name, as (2,) or (k, 2)."""
         return {u.name: frozen(intervals[s][0] if len(u.start) == 1 else intervals[s]) for u, s in self.items()}
 
     def consistent(self, values: Array, tree: Tree) -> bool:
-        """Whether some distribution of mass has every body's numbers: a centre of mass alone may leave it.
+        """Return whether every body is physically consistent; a change of only the centre of mass may violate this.
 
-        Points and rods have no room to begin with, and are not looked at.
+        Points and rods are at the limit of consistency already, and are not checked.
         """
         given = self.named(values)
         for unknown in self.each:
@@ -207,7 +207,7 @@ class Unknowns:
 
 
 def by_complex_step(function: Any, z: Array) -> Array:
-    """(m, n) the derivative of an analytic function of z (n,), to rounding."""
+    """Return the derivative (m, n) of an analytic function of z (n,), exact to rounding."""
     tiny, columns = 1e-30, []
     for j in range(len(z)):
         moved = np.array(z, dtype=complex)
@@ -217,7 +217,7 @@ def by_complex_step(function: Any, z: Array) -> Array:
 
 
 def _spread(unknown: Unknown) -> float:
-    """[m sqrt(kg)] the size of the entries beside the diagonal of the Cholesky factor."""
+    """Return the size [m sqrt(kg)] of the off-diagonal entries of the Cholesky factor."""
     return float(np.sqrt(max(np.trace(second_moment(unknown.start)) / 3, 1e-300)))
 
 
@@ -229,9 +229,9 @@ def choose_unknowns(
     bounds: Mapping[str, Any] | None = None,
     columns: Sequence[str] = (),
 ) -> Unknowns:
-    """The quantities called `names`; "all" are all inertias, dampings, spring stiffnesses and rotor inertias.
+    """Return the unknowns `names`; "all" are all inertial parameters, dampings, spring stiffnesses and rotor inertias.
 
-    Raises UnknownNameError, which lists those that exist, or InputError where one cannot be estimated.
+    Raises UnknownNameError, which lists the existing names, or InputError if a quantity cannot be estimated.
     """
     known = {p.name: (p.unit, p.value, p.lower) for p in list_parameters(model)}
     parameters = list(known)
@@ -266,7 +266,7 @@ def choose_unknowns(
 
 
 def _bounds_of(name: str, given: Any, lower: float) -> tuple[float, float]:
-    """The lower and the upper bound: those that were given, within what is possible."""
+    """Return the lower and the upper bound: the given ones, limited to possible values."""
     if given is None:
         return lower, np.inf
     subject = f"bounds of {name}"
@@ -284,7 +284,7 @@ def _bounds_of(name: str, given: Any, lower: float) -> tuple[float, float]:
 
 
 def _prior_of(name: str, given: Any, count: int) -> tuple[Array, Array]:
-    """Mean and standard deviation (count,)."""
+    """Return mean and standard deviation (count,) of a prior."""
     above = ", the mean above 0" if name.endswith(f".{MASS}") else ""
     expected = f"a mean and a standard deviation above 0, of 1 or {count} numbers each{above}"
     try:
@@ -298,7 +298,7 @@ def _prior_of(name: str, given: Any, count: int) -> tuple[Array, Array]:
 
 
 def _extra(model: Model) -> dict[str, tuple[str, Array, float]]:
-    """What Drake's plant has no number for."""
+    """Return the quantities that are not parameters of Drake's plant."""
     quantities = {}
     for label, joint in labelled(joints(model.plant)).items():
         if joint.num_velocities() == 1:
@@ -308,7 +308,7 @@ def _extra(model: Model) -> dict[str, tuple[str, Array, float]]:
                 f"{unit}/{'m' if unit == 'N' else 'rad'}",
                 np.zeros(1),
                 0.0,
-            )  # rest: 0
+            )  # the rest position is 0
     for name in model.input_names:
         quantities[f"{name}.{STRENGTH}"] = ("1", np.ones(1), -np.inf)
     for name in (*model.position_names, *model.velocity_names):
@@ -334,7 +334,7 @@ def _why_not(model: Model, tree: Tree | None, name: str, value: Array) -> str | 
 
 
 def _size(model: Model, name: str, value: Array) -> float:
-    """What counts as a change by 100 %: of a centre of mass the radius of gyration, or how far off it is."""
+    """Return the size of a change by 100 %: for a centre of mass, its distance or the radius of gyration."""
     label, quantity = name.rsplit(".", 1)
     if quantity == CENTER:
         body = labelled(bodies(model.plant))[label]
@@ -349,7 +349,7 @@ def _size(model: Model, name: str, value: Array) -> float:
 
 
 def _central(tree: Tree, label: str, given: dict[str, Any], *, as_in_files: bool = False) -> tuple[Any, Any, Any]:
-    """Mass, centre of mass and inertia (6,) about it of a body, as Drake's parameters set them one after the other."""
+    """Return a body's mass, centre of mass and inertia (6,) about it, as Drake's parameters set them in sequence."""
     link = tree.bodies[label]
     mass, center = given.get(f"{label}.{MASS}", link.mass), given.get(f"{label}.{CENTER}", link.center_of_mass)
     inertia = np.array([link.inertia[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))])
@@ -357,13 +357,13 @@ def _central(tree: Tree, label: str, given: dict[str, Any], *, as_in_files: bool
         return mass, center, given[f"{label}.{INERTIA}"]
     if as_in_files:
         return mass, center, inertia * (mass / link.mass)
-    unit = ten_numbers(1.0, link.center_of_mass, inertia / link.mass)[4:]  # about the body's origin, which stays
+    unit = ten_numbers(1.0, link.center_of_mass, inertia / link.mass)[4:]  # about the body's origin; it is constant
     shift = ten_numbers(1.0, center, np.zeros(6))[4:]
     return mass, center, mass * (unit - shift)
 
 
 def numbers_at(model: Model, tree: Tree, unknowns: Unknowns, z: Array) -> tuple[Numbers, Array]:
-    """(the tree's numbers at z (np,), how all of them in a row change with it (count, np))."""
+    """Return (the tree's numbers at z (np,), their derivatives (count, np) with respect to z)."""
 
     def flat(z: Array) -> Array:
         return np.asarray(set_numbers(model, tree, unknowns, unknowns.values(z)).flat)
@@ -372,7 +372,7 @@ def numbers_at(model: Model, tree: Tree, unknowns: Unknowns, z: Array) -> tuple[
 
 
 def set_numbers(model: Model, tree: Tree, unknowns: Unknowns, values: Any) -> Numbers:
-    """The tree's numbers where the unknowns have `values` (np,), complex or float."""
+    """Return the tree's numbers for `values` (np,) of the unknowns, complex or float."""
     given: dict[str, Any] = {}
     for unknown, s in unknowns.items():
         given[unknown.name] = values[s][0] if len(unknown.start) == 1 else values[s]
@@ -414,7 +414,7 @@ def _set_rotors(model: Model, by_joint: dict[str, Any], given: dict[str, Any], r
 
 
 def possible_changes(model: Model, tree: Tree) -> list[str]:
-    """Names of everything in which the motion of a tree may differ from the model's."""
+    """Return the names of all quantities of a tree that may be wrong in the model."""
     known = {p.name: p.value for p in list_parameters(model)} | {n: e[1] for n, e in _extra(model).items()}
     return [
         name

@@ -1,6 +1,6 @@
-"""The model file with the values that were found: the user's own text, changed only where a value differs.
+"""A corrected model file: the user's own text with the estimated values, changed only where a value differs.
 
-A comment at each changed element says what it was, what it is, with which interval and from which recordings.
+A comment at each changed element gives the old and the new value, the interval and the recordings.
 """
 
 import json
@@ -30,8 +30,8 @@ SPRING = {
 }
 ROTOR = ("rotor_inertia", "gear_ratio")
 IN_URDF, IN_SDF = (*BODY, "damping", "offset", *ROTOR), (*BODY, "damping", *SPRING, *ROTOR)
-SAME = 1e-9  # of a parameter's largest entry: what printing, and moving an inertia to its centre of mass, may change
-ROUNDING = 1e-13  # of m c^2: what is left of an inertia of 0 that was moved from the body's origin
+SAME = 1e-9  # relative to a parameter's largest entry: rounding by printing and by shifting an inertia
+ROUNDING = 1e-13  # relative to m c^2: rounding of a zero inertia that was shifted from the body's origin
 OVERLAY = ".dmd.yaml"
 KINDS = (".urdf", ".sdf", OVERLAY)
 NO_ROOM = {
@@ -44,24 +44,24 @@ NO_ROOM = {
 
 
 def write_model(identification: Identification, path: str | Path) -> Path:
-    """Write the model's file with the values that were found, and say at each changed element what was changed and why.
+    """Write the model's file with the estimated values, and a comment at each changed element.
 
-    The text of the file stays as it is elsewhere. The new file is loaded, and each parameter of it compared with what
-    was found, before it stays.
+    The rest of the file's text is unchanged. The new file is loaded and each of its parameters is compared with the
+    estimates; the file is deleted if they differ.
 
     Args:
-        identification: What `identify` returned, of a model from one URDF or SDF file, or from a .dmd.yaml file that
-            adds such files. Where it is not explained, the file says so at its top.
-        path: The file to write, of the same kind. It must not exist yet, and it names meshes as the old one does. Of a
-            .dmd.yaml this is the same overlay of welds, frames and default positions, over a corrected copy of each
-            robot file in which a value changed, NAME_FILE beside it.
+        identification: The result of `identify` for a model from one URDF or SDF file, or from a .dmd.yaml file that
+            adds such files. If the recordings are not explained, a comment at the top of the file says so.
+        path: The file to write, of the same kind. It must not exist yet. Its mesh paths are those of the old file. For
+            a .dmd.yaml file, the overlay of welds, frames and default positions is kept, and a corrected copy of each
+            robot file with a changed value is written as NAME_FILE in the same folder.
 
     Returns:
         The path.
 
     Raises:
-        InputError: The path is taken or of another kind, or a value is one that no file of this kind can have.
-        ModelError: The model is not from such a file, or the new file does not have the values.
+        InputError: The path exists or is of another kind, or a file of this kind cannot represent a value.
+        ModelError: The model is not from such a file, or the new file does not reproduce the values.
 
     Example:
         >>> import pathlib, tempfile
@@ -112,7 +112,7 @@ def _changed(e: Identification) -> dict[str, Any]:
 
 
 def _overlay(e: Identification, asked: Request, source: Path, path: Path) -> dict[Path, str]:
-    """The texts to write of a model from a .dmd.yaml: corrected copies of robot files, and the overlay over them."""
+    """Return the texts to write for a .dmd.yaml model: corrected copies of robot files, and the overlay."""
     packages, text = PackageMap(), source.read_text()
     options = asked.model.options or {}
     add_packages(packages, source, options.get("packages"))
@@ -144,7 +144,7 @@ def _overlay(e: Identification, asked: Request, source: Path, path: Path) -> dic
 
 
 def _pointed(text: str, uri: str, new: str, source: Path) -> str:
-    """A .dmd.yaml that names the file `new` in place of `uri`."""
+    """Return the text of a .dmd.yaml file with the file `new` in place of `uri`."""
     line = re.compile(rf"^([^#\n]*\bfile:\s*)(['\"]?){re.escape(uri)}\2(?=[\s,}}]|$)", re.MULTILINE)
     matches = list(line.finditer(text))
     if len(matches) != 1:
@@ -165,7 +165,7 @@ def _data(asked: Request) -> str:
 
 
 class _Corrected:
-    """The text of a file, and the changes to it."""
+    """The text of a model file, and the changes to it."""
 
     def __init__(self, e: Identification, asked: Request, source: Path, changed: Mapping[str, Any]):
         self.e, self.model, self.is_sdf = e, asked.model, source.suffix == ".sdf"
@@ -198,7 +198,7 @@ class _Corrected:
         return str(self.xml)
 
     def _element(self, label: str, *tags: str) -> Element:
-        # A joint that has no type is a mention of one, in a transmission.
+        # A joint element without a type is a reference in a transmission.
         named = [element for element in self.xml.root.iter(*tags) if element.get("name") == label]
         elements = [element for element in named if element.tag != "joint" or element.get("type")]
         if len(elements) != 1:
@@ -207,7 +207,7 @@ class _Corrected:
         return elements[0]
 
     def _comment_on(self, label: str, quantities: Iterable[str]) -> str:
-        """What each number was and is, with its interval."""
+        """Return the comment with the old and the new value of each number, and its interval."""
         texts = []
         for name in (f"{label}.{quantity}" for quantity in quantities):
             was, now = np.atleast_1d(self.e.start[name]), np.atleast_1d(self.e.values[name])
@@ -258,7 +258,7 @@ class _Corrected:
             self.xml.set(dynamics, "damping", tags["damping"])
 
     def _set_children(self, element: Element, tags: dict[str, str]) -> None:
-        """Texts of an SDF element's children, values of a URDF's; those that it lacks are appended."""
+        """Set the texts of an SDF element's children, or the values of a URDF element's; append missing children."""
         missing = []
         for tag, value in tags.items():
             child, text = element.find(tag), f"<{tag}>{value}</{tag}>" if self.is_sdf else f'<{tag} value="{value}"/>'
@@ -296,13 +296,13 @@ class _Corrected:
 
 
 def _parameter_values(model: Model, e: Identification) -> dict[str, Any]:
-    """The values that are parameters of the model."""
+    """Return the values that are parameters of the model."""
     known = {p.name for p in list_parameters(model)}
     return {name: value for name, value in e.values.items() if name in known}
 
 
 def _inertia(model: Model, e: Identification, label: str) -> tuple[float, Array, Array]:
-    """Mass, centre of mass (3,) and inertia (3, 3) about it, in the body's frame, as the plant has them there."""
+    """Return mass, centre of mass (3,) and inertia (3, 3) about it, in the body's frame, at the estimated values."""
     with applied(select(model, _parameter_values(model, e))):
         spatial = model.double.body(label).CalcSpatialInertiaInBodyFrame(model.double.context)
     mass, center = float(spatial.get_mass()), np.asarray(spatial.get_com(), dtype=float)
@@ -312,7 +312,7 @@ def _inertia(model: Model, e: Identification, label: str) -> tuple[float, Array,
 
 
 def _check(e: Identification, model: Model, path: Path) -> None:
-    """ModelError where the file, loaded as the model was, has another parameter than the model with what was found."""
+    """Raise an error if the loaded file has other parameters than the model with the estimated values."""
     options: dict[str, Any] = dict(model.options or {})
     new = {p.name: p.value for p in list_parameters(load_model(path, **options))}
     with applied(select(model, _parameter_values(model, e))):
@@ -336,7 +336,7 @@ def _check(e: Identification, model: Model, path: Path) -> None:
 
 
 def _comment(words: str) -> str:
-    """Text as an XML comment: in one line, and without what would end it."""
+    """Return text as an XML comment on one line, without character sequences that would end it."""
     plain = "".join(c if c.isprintable() else " " for c in words)
     return f"<!-- {re.sub('-(?=-)', '- ', plain).rstrip('-')} -->"
 
