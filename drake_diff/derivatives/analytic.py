@@ -1,7 +1,7 @@
-"""Jacobians from steps' own equations, certified equal to AutoDiffXd's first: of smooth steps, and with impulses.
+"""Jacobians of smooth steps and of steps with impulses from the steps' own equations, certified against AutoDiffXd.
 
-The equation of a model's smooth steps (`smooth_step`) is certified when it is first asked for, at random states; that
-of its steps with contact (`contact.jacobian`) at the first of them that are met.
+The equation of a model's smooth steps (`smooth_step`) is certified at random states when it is first used. The equation
+of its steps with contact (`contact.jacobian`) is certified at the first such steps that occur.
 """
 
 from dataclasses import dataclass
@@ -33,13 +33,13 @@ from drake_diff.model.parameters import select, write_autodiff
 from drake_diff.model.repairs import JointCoupling
 from drake_diff.model.step import advance, set_state
 
-# Of the largest entry: two derivatives of one smooth step differ by rounding, which a mass matrix may magnify.
+# Relative to the largest entry: two derivatives of a smooth step differ by rounding, which a mass matrix may magnify.
 SAME_JACOBIAN = 1e-9
-# Differences of a step solved to rounding: friction turns within 1e-4 m/s, but where SceneGraph iterates to the point
-# of contact, it leaves up to 1e-8 of noise, and may jump on one side.
+# For differences of a step solved to rounding: friction changes within 1e-4 m/s, but contact points that SceneGraph
+# computes iteratively have noise of up to 1e-8, and may jump on one side.
 SAME_DIFFERENCES, SAME_WHERE_ITERATED, DIFFERENCES = 1e-5, 3e-4, (3e-7, 1e-5, 1e-4)
-SAME_END = 1e-10  # of x' with reduced joints: both are of Drake's own step, projected by the same matrix
-SAME_STEP = 1e-12  # of the largest entry of x' (or 1): the same positions, summed in another order
+SAME_END = 1e-10  # tolerance of x' with reduced joints: both are Drake's own step, projected by the same matrix
+SAME_STEP = 1e-12  # relative to the largest entry of x' (or 1): the same positions, summed in a different order
 CERTIFIED_STATES, STATES_TRIED = 3, 60
 FAR = 4.0  # [m or rad]
 ACTS = "contact, a limit or a constraint acts"
@@ -48,15 +48,15 @@ DIFFERS, STEP_DIFFERENCES = "its Jacobian with impulses differs from", "the diff
 
 
 class Analytic:
-    """The Jacobians of smooth steps and of steps with contact of spheres, by the state, inputs and contact's material.
+    """Jacobians of smooth steps and steps with contact of spheres, with respect to state, inputs and contact material.
 
-    A step that was not smooth where nothing touches is known by its end: the smooth step leads elsewhere.
+    A nonsmooth step without contact is detected by its end state, which differs from that of the smooth step.
     """
 
     name = "analytic"
 
     def differentiate(self, steps: Steps) -> Jacobians | Refusal:
-        """All in one call."""
+        """Differentiate all steps in one call."""
         parameters, count = steps.vector.parameters, steps.model.nx + steps.model.nu
         if parameters and any(p.kind.quantity not in QUANTITIES for p in parameters):
             return Refusal("derivatives by parameters other than those of contact are requested")
@@ -69,7 +69,7 @@ class Analytic:
         free = np.flatnonzero(~impulsive)
         if len(free) == len(steps) and not parameters:
             values, known = smooth(steps)
-            if np.count_nonzero(known) == len(known):  # as a rule
+            if np.count_nonzero(known) == len(known):  # the usual case
                 return Jacobians(values, {})
         else:
             values, known = np.zeros((len(steps), steps.model.nx, steps.width)), np.zeros(len(steps), dtype=bool)
@@ -84,7 +84,7 @@ class Analytic:
         return answer
 
     def _of_reduced(self, steps: Steps, coupling: JointCoupling) -> Jacobians | Refusal:
-        """Where mimic joints are reduced: from the whole plant's."""
+        """Differentiate the steps of a model with reduced mimic joints by those of the whole plant."""
         model = steps.model
         if steps.vector.parameters:
             return Refusal("derivatives by parameters are requested of a model with reduced mimic joints")
@@ -108,7 +108,7 @@ class Analytic:
 
 
 def analytic_of(model: Model) -> SmoothStep | Refusal:
-    """The model's smooth step, certified when it is first asked for; else why there is none."""
+    """Return the model's smooth step, certified at its first use, or a Refusal."""
     if model.other_quantities.difference(QUANTITIES):
         return Refusal("parameters are applied that are not the model's own")
 
@@ -118,11 +118,11 @@ def analytic_of(model: Model) -> SmoothStep | Refusal:
         except ModelError as error:
             return Refusal(str(error))
 
-    return model.cache("analytic", make, of_structure=True)  # parameters of contact alone may be applied
+    return model.cache("analytic", make, of_structure=True)  # only contact parameters may be applied
 
 
 def one_smooth_step(model: Model, steps: Steps) -> Array | None:
-    """(nx, nx + nu) of one step in which nothing touches; None where `SmoothStep.single` does not know it."""
+    """Return the Jacobian (nx, nx + nu) of one step without contact, or None if `SmoothStep.single` returns None."""
     if model.coupling is not None or model.num_constraints:
         return None
     smooth = analytic_of(model)
@@ -130,9 +130,9 @@ def one_smooth_step(model: Model, steps: Steps) -> Array | None:
 
 
 def certified(model: Model, smooth: SmoothStep) -> SmoothStep | Refusal:
-    """`smooth` where it has the derivative, by AutoDiffXd, of Drake's equation at three random states; else why not.
+    """Return `smooth` if its Jacobian equals AutoDiffXd's of Drake's equation at three random states, or a Refusal.
 
-    Whether a step solves that equation is seen at its end; here nothing has to be apart, nor within its limits.
+    The states may have overlaps and violated limits, as whether a step solves this equation is checked at each step.
     """
     here = model.double.state()
     try:
@@ -143,7 +143,7 @@ def certified(model: Model, smooth: SmoothStep) -> SmoothStep | Refusal:
 
 
 def _first_difference(model: Model, smooth: SmoothStep) -> str:
-    """How one of the steps, or its Jacobian, is another than by Drake's equation; empty where none is."""
+    """Describe how a step or its Jacobian differs from Drake's equation, or return "" if all agree."""
     random, left, exact = np.random.default_rng(0), CERTIFIED_STATES, np.empty((model.nx, model.nx + model.nu))
     for _ in range(STATES_TRIED):
         x, u = _random_point(model, smooth.coordinates, random)
@@ -171,9 +171,9 @@ def _first_difference(model: Model, smooth: SmoothStep) -> str:
 
 
 def _random_point(model: Model, coordinates: Coordinates, random: np.random.Generator) -> tuple[Array, Array]:
-    """A state in the middle half of the limits, quaternions of unit norm, and inputs within half their limits.
+    """Return a state in the middle half of the limits, with unit quaternions, and inputs within half their limits.
 
-    Limits wider than FAR are as good as none: what is far from 0 is not what a derivative can be checked at.
+    Limits wider than FAR are ignored, as derivatives cannot be checked at states far from 0.
     """
     lower, upper = model.position_limits
     middle = np.clip(0.0, lower, upper)
@@ -187,7 +187,7 @@ def _random_point(model: Model, coordinates: Coordinates, random: np.random.Gene
 
 
 def _with_impulses(smooth: SmoothStep, steps: Steps, touch: bool) -> Jacobians | Refusal:
-    """Of N steps in which impulses act, all with contact or all without."""
+    """Differentiate N steps in which impulses act, all with contact or all without contact."""
     model, vector = steps.model, steps.vector
     form = contact_form(model, smooth)
     if isinstance(form, Refusal):
@@ -218,7 +218,7 @@ def _joined(texts: list[str]) -> str:
 
 
 def _certify(steps: Steps, k: int, jacobian: Array, trials: list[SourceTrial], *, iterated: bool) -> None:
-    """Compare a step's Jacobian for the trials that are still open."""
+    """Compare a step's Jacobian for the trials that are not complete."""
     if still_open := [trial for trial in trials if trial.left and not trial.refusal]:
         refusal, note = _other_jacobian(steps, k, jacobian, iterated=iterated)
         for trial in still_open:
@@ -226,10 +226,10 @@ def _certify(steps: Steps, k: int, jacobian: Array, trials: list[SourceTrial], *
 
 
 def _other_jacobian(steps: Steps, k: int, jacobian: Array, *, iterated: bool) -> tuple[str, str]:
-    """How a step's Jacobian with impulses differs from AutoDiffXd's, empty where it does not; and a note if not its.
+    """Describe how a step's Jacobian with impulses differs from AutoDiffXd's (or return ""), and the reference used.
 
-    Where Drake takes no AutoDiffXd step, as beside shapes that it does not differentiate, it is compared with
-    differences of the step solved to rounding.
+    If Drake cannot compute the AutoDiffXd step, as for shapes that it does not differentiate, the Jacobian is compared
+    with differences of the step solved to rounding.
     """
     model, vector = steps.model, steps.vector
     write_autodiff(vector, model, vector.values)
@@ -243,11 +243,11 @@ def _other_jacobian(steps: Steps, k: int, jacobian: Array, *, iterated: bool) ->
 
 
 def _unlike_differences(steps: Steps, k: int, jacobian: Array, *, iterated: bool) -> tuple[str, str]:
-    """As `_other_jacobian`, of differences over the size that comes nearest.
+    """Compare as `_other_jacobian` does, with finite differences of the size that agrees best.
 
-    They are of the step solved to rounding, with what Drake's solver left of the momentum held: where impulses turn
-    quickly it stops far enough beside the solution for the Jacobian to be another there. Where Drake's points of
-    contact are `iterated`, the nearest of each column counts, and may be the difference to one side.
+    The differences are of the step solved to rounding with the momentum residual of Drake's solver as a constant. Where
+    impulses change direction quickly, the solver stops so far from the solution that the Jacobian is different. If
+    Drake's contact points are `iterated`, the best difference of each column is used, which may be one-sided.
     """
     gaps = []
     for size in DIFFERENCES:
@@ -268,13 +268,13 @@ def _unlike_differences(steps: Steps, k: int, jacobian: Array, *, iterated: bool
 
 
 def _gap(jacobian: Array, other: Array) -> float:
-    """Of the first columns, in parts of the largest entry; NaN counts as no agreement."""
+    """Return the largest difference of the first columns relative to the largest entry, or inf for NaN."""
     gap = float(np.abs(jacobian[:, : other.shape[1]] - other).max() / np.abs(other).max())
     return gap if np.isfinite(gap) else np.inf
 
 
 def _differences(steps: Steps, k: int, width: float) -> tuple[Array, Array] | Refusal:
-    """(nx, nx + nu) forward and backward differences over `width` of the equation at Drake's own end of the step."""
+    """Return forward and backward differences (nx, nx + nu) over `width` of the equation at Drake's own end state."""
     nx, vector, point = steps.model.nx, steps.vector, np.concatenate([steps.xs[k], steps.us[k]])
     size = width * np.maximum(1.0, np.abs(point))
     points = np.concatenate([point + np.diag(size), point - np.diag(size), point[None]])
@@ -289,10 +289,10 @@ def _differences(steps: Steps, k: int, width: float) -> tuple[Array, Array] | Re
 
 @dataclass(frozen=True, eq=False)
 class ReducedStep:
-    """What of a model with reduced mimic joints does not change from step to step.
+    """The data of a model with reduced mimic joints that does not change from step to step.
 
-    A step is that of the whole plant, from q = r q_own + offset and v = E v_own, whose velocities v' are then brought
-    back as an impulse on the joints would: with A the mass matrix and h D,
+    A step is the step of the whole plant from q = r q_own + offset and v = E v_own. Its velocities v' are then
+    projected as by an impulse on the joints. With A the mass matrix plus h D,
 
         E' A (v' - E v_own') = 0,   so   E' A E dv_own' = E' (A dv' + dA (v' - E v_own'))
 
@@ -305,14 +305,14 @@ class ReducedStep:
 
     @classmethod
     def build(cls, model: Model, coupling: JointCoupling, smooth: SmoothStep) -> "ReducedStep":
-        """Of the smooth step of `model.whole`; raises ModelError where its tree is none of ours."""
+        """Build from the smooth step of `model.whole`; raise ModelError if its tree is not supported."""
         tree = compiled_tree(describe_tree(model.whole))
         if tree is None:
             raise ModelError("a free body is not joined to the world by its own frame")
         return cls(coupling, tree, smooth)
 
     def whole(self, steps: Steps) -> tuple[Steps, Flags]:
-        """The same steps of the whole plant, and which (N,) of them lead where these do."""
+        """Return the same steps of the whole plant, and which (N,) of them have the same end states."""
         model = steps.model
         xs = self.coupling.state(steps.xs)
         steps_of_whole, same = (
@@ -326,10 +326,10 @@ class ReducedStep:
         return steps_of_whole, same
 
     def jacobians(self, steps: Steps, whole: Steps, of_whole: Array) -> Array:
-        """(N, nx, nx + nu) from those of the whole plant."""
+        """Return the Jacobians (N, nx, nx + nu) from those of the whole plant."""
         coupling, c, h = self.coupling, self.smooth.coordinates, self.smooth.time_step
         E, nq, nx = coupling.spread, len(coupling.own_q), steps.model.nx
-        into = np.zeros((whole.model.nx, nx))  # of the own state into the whole one
+        into = np.zeros((whole.model.nx, nx))  # derivative of the whole state with respect to the own state
         into[np.arange(c.nq), coupling.of_q] = coupling.ratio_q
         into[c.nq :, nq:] = E
         chained = np.concatenate([of_whole[:, :, : whole.model.nx] @ into, of_whole[:, :, whole.model.nx :]], axis=2)
@@ -338,7 +338,7 @@ class ReducedStep:
         moving = self.tree(q, still, slack)
         A = moving.mass + np.diag(self.smooth.dynamics.armature)
         right = A @ chained[:, c.nq :]
-        by_motion = moving.by_q - self.tree(q, still, still).by_q  # of M slack
+        by_motion = moving.by_q - self.tree(q, still, still).by_q  # derivative of M slack
         right[:, :, :nq] += by_motion @ c.motion(q) @ into[: c.nq, :nq]
         velocities = np.linalg.solve(E.T @ A @ E, E.T @ right)
         positions = h * c.rate(q) @ (E @ velocities)

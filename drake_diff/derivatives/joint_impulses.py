@@ -1,25 +1,25 @@
-"""The impulses of joint limits, of PD controllers and of couplers on joints, as Drake's solver has them.
+"""The impulses of joint limits, PD controllers and couplers on joints, as in Drake's solver.
 
-Each acts along one direction j of the velocities, J' g with
+Each impulse acts along one direction j of the velocities, as J' g with
 
     g = clip((v_hat - j . v') / R, lower, upper)
 
-and w = j diag(A)^-1 j' its effective inverse mass, h the time step:
+With the effective inverse mass w = j diag(A)^-1 j' and the time step h:
 
-- a limit at the distance d >= 0: v_hat = -d / 2h, R = max(b w, 1 / (2 h^2 1e12)), g >= 0, where the joint may reach it
-  in two steps at the velocity before the step or without constraints;
-- a controller: h times its effort, so 1 / R = h (h kp + kd) and v_hat = R h (u - kp (q - q_ref) + kd v_ref), |g| at
-  most h times the effort limit; gains too stiff for the time step, R < b w, are lowered by one factor until R = b w;
-- a coupler q_0 = ratio q_1 + offset that is off by d: v_hat = -d / 2h, R = b w;
-- a point of a body that is held at one of another, off by g in world axes: three with the Jacobian J of the difference
-  of their velocities, v_hat = -g / 2h, R = b |J diag(A)^-1 J'| / 3, in the norm of Frobenius.
+- a limit at the distance d >= 0 has v_hat = -d / 2h, R = max(b w, 1 / (2 h^2 1e12)), g >= 0. It is active if the joint
+  may reach it in two steps, at the velocity before the step or at the velocity without constraints;
+- a controller exerts h times its effort, so 1 / R = h (h kp + kd) and v_hat = R h (u - kp (q - q_ref) + kd v_ref), with
+  |g| at most h times the effort limit. Gains too stiff for the time step, R < b w, are scaled down until R = b w;
+- a coupler q_0 = ratio q_1 + offset with the position error d has v_hat = -d / 2h, R = b w;
+- a point of a body constrained to a point of another, with the position error g in world axes, has three impulses along
+  J, the Jacobian of the relative velocity: v_hat = -g / 2h, R = b |J diag(A)^-1 J'| / 3, in the Frobenius norm.
 
 b = 0.1^2 / (4 pi^2) is Drake's near-rigid factor (Castro, Permenter and Han, "An unconstrained convex formulation of
 compliant contact", 2022).
 
-The couplers of a plant are read from Drake's own steps, as it gives them in no other way. With no other constraint than
-one coupler the step's problem is quadratic and Drake solves it to rounding. The impulse A (v' - v*) of such a step lies
-along (1, -ratio) of the two joints; its size says how far the joints are off.
+Drake does not expose the couplers of a plant, so they are identified from Drake's own steps. With one coupler as the
+only constraint, the step's problem is quadratic and Drake solves it to rounding. The impulse A (v' - v*) of such a step
+is along (1, -ratio) of the two joints, and its size gives the position error.
 """
 
 from collections.abc import Sequence
@@ -38,22 +38,22 @@ from drake_diff.model.plant import joints
 from drake_diff.model.repairs import joints_of_mimics
 
 NEAR_RIGID = 0.1**2 / (4 * np.pi**2)
-LIMIT_STIFFNESS = 1e12  # Drake's [N/m or N m/rad]
-LIMIT_WINDOW = 2.0  # of how far a joint moves in a step: where Drake looks for its limits
+LIMIT_STIFFNESS = 1e12  # Drake's value [N/m or N m/rad]
+LIMIT_WINDOW = 2.0  # Drake considers the limits within this number of steps
 
 
 @dataclass(frozen=True, eq=False)
 class JointImpulses:
-    """S of them in each of N problems; one whose bounds are both 0 does not act."""
+    """S joint impulses in each of N problems. An impulse does not act if both its bounds are 0."""
 
-    direction: Array  # (S, nv) j, or (N, S, nv) where those of points of loops are among them
+    direction: Array  # (S, nv) j, or (N, S, nv) if there are impulses of loop points
     target: Array  # (N, S) v_hat [m/s or rad/s]
     compliance: Array  # (N, S) R [1/kg or 1/(kg m^2)]
     lower: Array  # (N, S) [N s or N m s]
     upper: Array
 
     def subset(self, which: Indices) -> "JointImpulses":
-        """Those of some of the problems."""
+        """Return the impulses of some of the problems."""
         direction = self.direction if self.direction.ndim == 2 else self.direction[which]
         return JointImpulses(direction, *(array[which] for array in self._of_problems))
 
@@ -62,18 +62,18 @@ class JointImpulses:
         return self.target, self.compliance, self.lower, self.upper
 
     def reach(self) -> NDArray[np.bool_]:
-        """(N, nv) which degrees of freedom they may move."""
+        """Return which degrees of freedom (N, nv) the impulses may move."""
         return np.asarray(((self.lower < self.upper)[:, None, :] @ (self.direction != 0))[:, 0])
 
     def evaluate(self, v: Array) -> tuple[Array, Array]:
-        """The impulses (N, S) at the velocities v (N, nv), and their derivatives (N, S) by -j . v', none at a bound."""
+        """Return impulses (N, S) at v (N, nv), and their derivatives with respect to -j . v' (N, S), 0 at bounds."""
         wanted = (self.target - (self.direction @ v[..., None])[..., 0]) / self.compliance
         free = (wanted > self.lower) & (wanted < self.upper)
         return np.clip(wanted, self.lower, self.upper), np.where(free, 1 / self.compliance, 0.0)
 
 
 def gather(parts: Sequence[JointImpulses]) -> JointImpulses:
-    """All of some parts as one."""
+    """Concatenate several sets of impulses."""
     of_problems = zip(*(impulses._of_problems for impulses in parts), strict=True)
     directions = [impulses.direction for impulses in parts]
     if any(direction.ndim == 3 for direction in directions):
@@ -83,10 +83,10 @@ def gather(parts: Sequence[JointImpulses]) -> JointImpulses:
 
 
 def impulses_of_loops(jacobian: Array, gap: Array, diagonal: Array, h: float) -> JointImpulses:
-    """Of L points in N problems that are held at others.
+    """Return the impulses of L pairs of points with loop constraints in N problems.
 
-    `jacobian` (N, L, 3, nv) is that of the difference of their velocities, `gap` (N, L, 3) the difference of places,
-    `diagonal` (N, nv) that of A.
+    `jacobian` (N, L, 3, nv) is the Jacobian of the points' relative velocity, `gap` (N, L, 3) their relative position,
+    and `diagonal` (N, nv) the diagonal of A.
     """
     count, L = gap.shape[:2]
     delassus = np.einsum("nlav,nv,nlbv->nlab", jacobian, 1 / diagonal, jacobian)
@@ -97,9 +97,9 @@ def impulses_of_loops(jacobian: Array, gap: Array, diagonal: Array, h: float) ->
 
 
 def limit_impulses(limits: Array, q: Array, v: Array, free: Array, diagonal: Array, h: float) -> list[JointImpulses]:
-    """Of N states: positions q and velocities v (N, nv) of each degree of freedom, `free` (N, nv) v' without impulses.
+    """Return the impulses of joint limits at N states with positions q and velocities v (N, nv).
 
-    `limits` (2, nv) are infinite where there are none, `diagonal` (N, nv) is that of A.
+    `free` (N, nv) is v' without impulses, `limits` (2, nv) may be infinite, and `diagonal` (N, nv) is that of A.
     """
     window = LIMIT_WINDOW * h * np.maximum(np.abs(v), np.abs(free))
     impulses, stiffest = [], 1 / (2 * h * h * LIMIT_STIFFNESS)
@@ -115,16 +115,16 @@ def limit_impulses(limits: Array, q: Array, v: Array, free: Array, diagonal: Arr
 
 @dataclass(frozen=True, eq=False)
 class Controllers:
-    """C of PD control, in N states."""
+    """C PD controllers, in N states."""
 
-    velocity: NDArray[np.intp]  # (C,) the degree of freedom of each
+    velocity: NDArray[np.intp]  # (C,) the degree of freedom of each controller
     kp: Array  # (N, C)
     kd: Array
     reference: Array  # (2, N, C) positions and velocities
-    limit: Array  # (C,) of the effort
+    limit: Array  # (C,) effort limits
 
     def impulses(self, q: Array, us: Array, diagonal: Array, h: float) -> JointImpulses:
-        """q and `diagonal` (N, nv) are as for limits, us (N, C) the inputs of the controllers' actuators."""
+        """Return the impulses for q and `diagonal` (N, nv) as for limits, and the actuators' inputs us (N, C)."""
         softest = NEAR_RIGID / diagonal[:, self.velocity]
         lowered = np.minimum(1.0, 1 / (h * (h * self.kp + self.kd) * softest))
         kp, kd = lowered * self.kp, lowered * self.kd
@@ -134,8 +134,8 @@ class Controllers:
         return JointImpulses(direction, effort / total, 1 / (h * total), -bound, bound)
 
 
-PROBES = 3  # two to read, one more to check
-SAME = 1e-8  # of the largest entry: what Drake's solver leaves of a quadratic problem is rounding
+PROBES = 3  # two to identify a coupler, one more to check it
+SAME = 1e-8  # relative to the largest entry: Drake solves a quadratic problem to rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,14 +146,14 @@ class Couplers:
     offset: Array  # (K,)
 
     def impulses(self, q: Array, diagonal: Array, h: float) -> JointImpulses:
-        """Of N states: q (N, nv) of each degree of freedom, `diagonal` (N, nv) that of A."""
+        """Return the impulses at N states: q (N, nv) of each degree of freedom, `diagonal` (N, nv) of A."""
         off, w = q @ self.direction.T - self.offset, 1 / diagonal @ (self.direction**2).T
         infinite = np.full(off.shape, np.inf)
         return JointImpulses(self.direction, -off / (2 * h), NEAR_RIGID * w, -infinite, infinite)
 
 
 def couplers_of(model: Model) -> Couplers | Refusal:
-    """Those that act in the model's steps; a Refusal where a constraint is none, or could not be read."""
+    """Return the couplers that act in the model's steps, or a Refusal if a constraint is not a known coupler."""
 
     if model.coupling is not None:
         return model.cache("couplers", lambda: _known(model), of_structure=True)
@@ -176,7 +176,7 @@ def couplers_of(model: Model) -> Couplers | Refusal:
 
 
 def _known(model: Model) -> Couplers:
-    """Those of mimic joints that are reduced, in the velocities of the whole plant."""
+    """Return the couplers of the reduced mimic joints, in the velocities of the whole plant."""
     pairs = joints_of_mimics(model.plant, model.coupling.mimics if model.coupling is not None else ())
     directions = np.zeros((len(pairs), model.plant.num_velocities()))
     for row, (mimic, follower, leader) in zip(directions, pairs, strict=True):
@@ -185,12 +185,12 @@ def _known(model: Model) -> Couplers:
 
 
 def _read(model: Model, constraint: Any) -> tuple[Array, float] | Refusal:
-    """The direction (nv,) and the offset of one."""
+    """Identify the direction (nv,) and the offset of a coupler."""
     plant, random = model.plant, np.random.default_rng(0)
     root = model.diagram.CreateDefaultContext()
     context = plant.GetMyMutableContextFromRoot(root)
     scene_graph = model.double.scene_graph
-    if scene_graph is not None:  # nothing touches in this context
+    if scene_graph is not None:  # disable contact in this context
         everything = GeometrySet(scene_graph.model_inspector().GetAllGeometryIds())
         filters = scene_graph.collision_filter_manager(scene_graph.GetMyMutableContextFromRoot(root))
         filters.Apply(CollisionFilterDeclaration().ExcludeWithin(everything))
@@ -226,9 +226,9 @@ def _read(model: Model, constraint: Any) -> tuple[Array, float] | Refusal:
 
 
 def _probe(model: Model, context: Any, random: np.random.Generator) -> tuple[Array, Array, Array, Array]:
-    """q, v', A (v' - v*) and A of one step from rest, where all other forces are held, so that v* = 0.
+    """Return q, v', A (v' - v*) and A of one step from rest, with all other forces compensated, so that v* = 0.
 
-    Else a robot falls, and beside its momentum the impulse of a light finger is a matter of rounding.
+    Otherwise the robot falls, and relative to its momentum the impulse of a light finger is lost to rounding.
     """
     plant = model.plant
     lower, upper = (
@@ -250,9 +250,9 @@ def _probe(model: Model, context: Any, random: np.random.Generator) -> tuple[Arr
 
 
 def single_joints(model: Model) -> tuple[Indices, Array, NDArray[np.bool_]]:
-    """Of each degree of freedom its index in q (nv,), its limits (2, nv), and whether (nv,) it is a joint of its own.
+    """Return, for each degree of freedom, its index in q (nv,), limits (2, nv), and if its joint has no others (nv,).
 
-    Of others, as of free bodies, the first are 0 and infinite.
+    For other degrees of freedom, such as those of free bodies, the index is 0 and the limits are infinite.
     """
 
     def read() -> tuple[Indices, Array, NDArray[np.bool_]]:

@@ -1,22 +1,22 @@
 """Drake's discrete step solved to rounding.
 
-Where contact, joint limits, PD controllers or couplers act, Drake's step solves a convex problem and stops at
+If contact, joint limits, PD controllers or couplers act, Drake's step solves a convex problem and stops at
 
     |D (A (v' - v*) - j)| <= 1e-14 + 1e-6 max(|D A v'|, |D j|),    D = diag(A)^-1/2, j = J' g the impulses
 
-(Castro, Permenter and Han, "An unconstrained convex formulation of compliant contact", 2022), which is the noise of its
-differences. `refine_steps` states the same problem again, with Drake's mass matrix, forces and contacts, checks that
-Drake's solution solves it within this very tolerance, and solves it to rounding from there. Where Drake's does not, the
-problem is not Drake's and a Refusal says by how much.
+(Castro, Permenter and Han, "An unconstrained convex formulation of compliant contact", 2022). This tolerance causes the
+noise of its differences. `refine_steps` builds the same problem with Drake's mass matrix, forces and contacts, checks
+that Drake's solution solves it within the same tolerance, and then solves it to rounding. If the check fails, the
+problem differs from Drake's, and a Refusal states the difference.
 
-For A = M + h D, v* the velocity without impulses and convex potentials l_c of contacts and joints, v' is the only
+For A = M + h D, v* the velocity without impulses and convex potentials l_c of contacts and joints, v' is the unique
 minimum of
 
     l(v') = (v' - v*)' A (v' - v*) / 2 + sum_c l_c(J_c v'),
 
-where A (v' - v*) = sum_c J_c' g_c(J_c v'), g_c = -dl_c / d(J_c v') being the impulses (see `contact.laws` and
-`joint_impulses`). A few Newton steps from Drake's solution leave rounding only. A line search along each step looks for
-the minimum of l, of which it needs the slope alone.
+where A (v' - v*) = sum_c J_c' g_c(J_c v') with the impulses g_c = -dl_c / d(J_c v') (see `contact.laws` and
+`joint_impulses`). A few Newton steps from Drake's solution reach rounding. A line search along each step finds the
+minimum of l, for which it needs only the derivative of l along the step.
 """
 
 from collections.abc import Callable, Iterator
@@ -51,28 +51,28 @@ from drake_diff.model.parameters import ParameterVector, applied
 from drake_diff.model.plant import joints, proximity_property
 from drake_diff.model.step import advance, set_state
 
-ROUNDING = 64 * float(np.finfo(float).eps)  # of the sums
-SOLVED = 1e-12  # of the momentum; from there on steps are taken as long as they halve what is missing
+ROUNDING = 64 * float(np.finfo(float).eps)  # relative rounding error of the sums
+SOLVED = 1e-12  # relative to the momentum; below, steps are taken as long as they halve the residual
 MAX_STEPS = 60
 BISECTIONS = 30
 
 
 @dataclass(frozen=True, eq=False)
 class ContactImpulses:
-    """M contacts of N problems, those of one problem side by side."""
+    """M contacts of N problems; the contacts of each problem are contiguous."""
 
     problem: Indices  # (M,)
     jacobian: Array  # (M, nv, 3) J'
     law: ContactLaw
 
     def subset(self, which: Indices) -> "ContactImpulses":
-        """Those of some of the problems, in ascending order."""
+        """Return the contacts of some of the problems, in ascending order."""
         chosen = np.flatnonzero(np.isin(self.problem, which))
         problem = np.searchsorted(which, self.problem[chosen])
         return ContactImpulses(problem, self.jacobian[chosen], self.law.subset(chosen))
 
     def sums(self, values: Array, count: int) -> Array:
-        """(count, ...) the sums of values (M, ...) over the contacts of each problem."""
+        """Return the sums (count, ...) of values (M, ...) over the contacts of each problem."""
         total = np.zeros((count, *values.shape[1:]))
         if len(values):
             first = np.flatnonzero(np.diff(self.problem, prepend=-1))
@@ -80,7 +80,7 @@ class ContactImpulses:
         return total
 
     def evaluate(self, v: Array) -> tuple[Array, Array]:
-        """J' g (N, nv) at the velocities v (N, nv), and the derivative of -J' g by them (N, nv, nv)."""
+        """Return J' g (N, nv) at the velocities v (N, nv), and d(-J' g)/dv (N, nv, nv)."""
         J = self.jacobian
         impulse, slope = self.law.impulses((v[self.problem][:, None, :] @ J)[:, 0])
         push, stiffness = (J @ impulse[..., None])[..., 0], -J @ slope @ J.swapaxes(-1, -2)
@@ -89,7 +89,7 @@ class ContactImpulses:
 
 @dataclass(frozen=True, eq=False)
 class Balance:
-    """What is left of the momentum balance of N problems at some velocities."""
+    """The residual of the momentum balance of N problems at some velocities."""
 
     missing: Array  # (N, nv) A (v' - v*) - J' g
     given: Array  # (N, nv) J' g
@@ -98,26 +98,26 @@ class Balance:
 
 @dataclass(frozen=True, eq=False)
 class ConvexSteps:
-    """N problems."""
+    """The convex problems of N steps."""
 
     A: Array  # (N, nv, nv)
-    momentum: Array  # (N, nv) A v*, which is better known than v* where A is ill conditioned
+    momentum: Array  # (N, nv) A v*, which is more accurate than v* if A is ill-conditioned
     contacts: ContactImpulses
     joints: JointImpulses
     same_tree: NDArray[np.bool_]  # (nv, nv)
 
     def subset(self, which: Indices) -> "ConvexSteps":
-        """Some of the problems."""
+        """Return some of the problems."""
         contacts, joints = self.contacts.subset(which), self.joints.subset(which)
         return ConvexSteps(self.A[which], self.momentum[which], contacts, joints, self.same_tree)
 
     def taking_part(self) -> NDArray[np.bool_]:
-        """(N, nv) the degrees of freedom of the trees that an impulse may reach, which Drake solves for."""
+        """Return the degrees of freedom (N, nv) of trees on which an impulse may act, for which Drake solves."""
         by_contacts = self.contacts.sums((self.contacts.jacobian != 0).any(axis=2).astype(float), len(self.A)) > 0
         return np.asarray((self.joints.reach() | by_contacts) @ self.same_tree)
 
     def evaluate(self, v: Array) -> Balance:
-        """The balance at v (N, nv)."""
+        """Return the balance at v (N, nv)."""
         j, (pull, stiffness) = self.joints.direction, self.joints.evaluate(v)
         by_contacts, curvature = self.contacts.evaluate(v)
         across = j.swapaxes(-1, -2)
@@ -127,24 +127,24 @@ class ConvexSteps:
         return Balance(had - self.momentum - given, given, curvature)
 
     def norm(self, momentum: Array) -> Array:
-        """(N,) that of Drake's solver, |diag(A)^-1/2 p| of p (N, nv)."""
+        """Return the norm (N,) of Drake's solver, |diag(A)^-1/2 p|, for p (N, nv)."""
         return np.asarray(np.sqrt((momentum * momentum / np.einsum("kii->ki", self.A)).sum(axis=1)))
 
     def scale(self, v: Array, given: Array) -> Array:
-        """(N,) the momentum that Drake's solver compares with."""
+        """Return the reference momentum (N,) of the relative tolerance in Drake's solver."""
         had = (self.A @ v[..., None])[..., 0]
         return np.asarray(np.maximum(self.norm(had), self.norm(given)))
 
     def rounding(self, v: Array, balance: Balance) -> Array:
-        """(N,) what of the momentum rounding may leave at v (N, nv): of sums, and of stiff impulses.
+        """Return the rounding error (N,) of the momentum balance at v (N, nv), due to sums and stiff impulses.
 
-        The sums may be far larger than what they amount to, as where a heavy tree has a light link.
+        The terms may be much larger than their sum, for example if a heavy tree has a light link.
         """
         of_sums = (np.abs(balance.curvature) @ np.abs(v)[..., None])[..., 0] + np.abs(self.momentum)
         return np.maximum(SOLVED * self.scale(v, balance.given), ROUNDING * self.norm(of_sums)) + np.finfo(float).tiny
 
     def solve(self, v: Array, balance: Balance) -> tuple[Array, NDArray[np.bool_]]:
-        """v' (N, nv) to rounding from v (N, nv) with its balance, and whether it was reached (N,)."""
+        """Solve for v' (N, nv) to rounding from v (N, nv) with its balance; return also which (N,) converged."""
         v, reached = np.array(v), np.zeros(len(v), dtype=bool)
         open_, problems = np.arange(len(v)), self
         for _ in range(MAX_STEPS):
@@ -154,9 +154,9 @@ class ConvexSteps:
             ahead = problems.evaluate(v_open + step)
             ahead_size = problems.norm(ahead.missing)
             near = size <= problems.rounding(v_open, balance)
-            last = near & (ahead_size >= size / 2)  # as far as rounding lets it
+            last = near & (ahead_size >= size / 2)  # converged to rounding
             slope = (ahead.missing * step).sum(axis=1)
-            search = ~near & (slope > 0) & (ahead_size > size / 2)  # beyond the minimum along the step
+            search = ~near & (slope > 0) & (ahead_size > size / 2)  # the step ends beyond the minimum along it
             if search.any():
                 which = np.flatnonzero(search)
                 step[which] *= _along(problems.subset(which), v_open[which], step[which])[:, None]
@@ -174,7 +174,7 @@ class ConvexSteps:
 
 
 def _along(problems: ConvexSteps, v: Array, step: Array) -> Array:
-    """(N,) the part of each step (N, nv) at which l is smallest along it, l being larger again at its end."""
+    """Return the fraction (N,) of each step (N, nv) that minimizes l along the step, if l increases at its end."""
     lower, upper = np.zeros(len(v)), np.ones(len(v))
     for _ in range(BISECTIONS):
         middle = (lower + upper) / 2
@@ -183,31 +183,31 @@ def _along(problems: ConvexSteps, v: Array, step: Array) -> Array:
     return (lower + upper) / 2
 
 
-# Drake's A, v* and J are ours to rounding, and so is what it compared with its tolerance.
+# A, v* and J equal Drake's to rounding, and so does the residual that Drake compares with its tolerance.
 DRAKES_STOP = SAP_RELATIVE_TOLERANCE * (1 + 1e-3)
-AT_REST = 1e-14 / SAP_RELATIVE_TOLERANCE  # [J^1/2] 1e-14 is its absolute tolerance
-FREE_STEP = 1e-9  # of the momentum: what no impulse reaches is not solved for, so that only rounding is left
+AT_REST = 1e-14 / SAP_RELATIVE_TOLERANCE  # [J^1/2] 1e-14 is the solver's absolute tolerance
+FREE_STEP = 1e-9  # relative to the momentum: without impulses Drake does not iterate, so only rounding errors remain
 
 
 @dataclass(eq=False)
 class RefinedSteps:
-    """N steps solved to rounding; those that are refused hold NaN."""
+    """N steps solved to rounding; refused steps are NaN."""
 
     x_next: Array  # (N, nx)
-    drake: Array  # (N, nx) where Drake's own steps lead
-    acts: NDArray[np.bool_]  # (N,) whether an impulse may act, so that Drake's solver has something to solve
-    left: Array  # (N,) what Drake's own leaves of the momentum, which is to be at most 1e-6; NaN where not known
-    missing: Array  # (N, nv) that, as a momentum, of the whole plant
+    drake: Array  # (N, nx) end states of Drake's own steps
+    acts: NDArray[np.bool_]  # (N,) whether an impulse may act, so that Drake uses its solver
+    left: Array  # (N,) relative momentum residual of Drake's own step, at most 1e-6; NaN if not known
+    missing: Array  # (N, nv) momentum residual of Drake's own step of the whole plant
     refused: dict[int, Refusal] = field(default_factory=dict)
 
     @classmethod
     def unknown(cls, xs: Array, nv: int) -> "RefinedSteps":
-        """Steps from xs (N, nx) of which nothing is known yet."""
+        """Return steps from xs (N, nx) without results."""
         unknown, N = np.full_like(xs, np.nan), len(xs)
         return cls(unknown, np.array(unknown), np.zeros(N, dtype=bool), np.full(N, np.nan), np.full((N, nv), np.nan))
 
     def put(self, which: Indices, some: "RefinedSteps") -> None:
-        """Take over some of the steps."""
+        """Store the results of some of the steps."""
         for name in ("x_next", "drake", "acts", "left", "missing"):
             getattr(self, name)[which] = getattr(some, name)
         self.refused |= {int(which[k]): why for k, why in some.refused.items()}
@@ -221,13 +221,13 @@ def refine_steps(
     values: Array | None = None,
     held: Array | None = None,
 ) -> RefinedSteps:
-    """The steps from each of xs (N, nx) under each of us (N, nu); many in one call cost far less than one by one.
+    """Solve the steps from each of xs (N, nx) under each of us (N, nu); one call is much faster than single calls.
 
-    `values` (N, np) are the parameters of each step, those of `vector`, which is applied, where it is None. `held`
-    (N, nv) is a momentum that is left in the balance of each step: with what Drake's solver left at a point, steps
-    around it begin at Drake's own, and their slopes are those of the equation there, where a derivative is taken.
+    `values` (N, np) are the parameters of each step, by default those of `vector`, which is applied. `held` (N, nv) is
+    a constant momentum residual of each step. With the residual of Drake's solver at a point, the solution at this
+    point is Drake's own, and differences around it are those of the equation at the point of the derivative.
 
-    Raises SimulationError where Drake cannot take a step.
+    Raises SimulationError if Drake cannot compute a step.
     """
     if values is None or vector.step_entry is None:
         return _refine(model, vector, xs, us, values if vector.parameters else None, held)
@@ -244,13 +244,13 @@ def refine_steps(
 
 
 def solves_the_step(model: Model, x: Array, u: Array, end: Array) -> bool:
-    """Whether `end` (nx,) solves the step from x (nx,) under u (nu,) within the tolerance of Drake's solver.
+    """Check if `end` (nx,) solves the step from x (nx,) under u (nu,) within the tolerance of Drake's solver.
 
-    False where the step's equation is not known, or is not Drake's.
+    Returns False if the step's equation is not known or differs from Drake's.
     """
     form, couplers = form_of(model), couplers_of(model)
     if model.coupling is not None or isinstance(couplers, Refusal) or form.driven:
-        return False  # of reduced coordinates what Drake's solver leaves in the others is not known from `end`
+        return False  # with reduced coordinates, the solver's residual in the others is not known from `end`
     drake = advance(model.double, x, u)
     read = _read(model, _Settings(np.asarray(model.double.damping()), *form.gains(), {}))
     if isinstance(read, Refusal):
@@ -264,7 +264,7 @@ def solves_the_step(model: Model, x: Array, u: Array, end: Array) -> bool:
 
 @contextmanager
 def _written(model: Model, vector: ParameterVector, values: Array | None) -> Iterator[Callable[[int], None]]:
-    """A function that applies the parameters of a step, which are the vector's again afterwards."""
+    """Provide a function that applies the parameters of a step, and restore those of the vector at the end."""
     if values is None:
         yield lambda k: None
         return
@@ -277,7 +277,7 @@ def _written(model: Model, vector: ParameterVector, values: Array | None) -> Ite
 def _refine(
     model: Model, vector: ParameterVector, xs: Array, us: Array, values: Array | None, held: Array | None
 ) -> RefinedSteps:
-    """Of one time step. Reduced coordinates are read from the step of the whole plant, as in `advance`."""
+    """Solve steps of the same time step. Reduced coordinates are read from the whole plant's step, as in `advance`."""
     if model.coupling is None:
         return _refine_whole(model, vector, xs, us, values, held, couplers_of(model))
     refined = _refine_whole(model.whole, vector, model.coupling.state(xs), us, values, held, couplers_of(model))
@@ -301,7 +301,7 @@ def _refine_whole(
     held: Array | None,
     couplers: Couplers | Refusal,
 ) -> RefinedSteps:
-    """With all coordinates of the plant."""
+    """Solve the steps in all coordinates of the plant."""
     form, refined = form_of(model), RefinedSteps.unknown(xs, model.nv)
     why = couplers.reason if isinstance(couplers, Refusal) else form.driven
     read: list[_Read] = []
@@ -332,27 +332,27 @@ def _refine_whole(
 
 @dataclass(frozen=True, eq=False)
 class _Settings:
-    """What parameters may change between steps."""
+    """The data that parameters may change between steps."""
 
     damping: Array  # (nv,)
     kp: Array  # (nu,)
     kd: Array
-    material: dict[Any, Array]  # by geometry, read when it touches
+    material: dict[Any, Array]  # by geometry, read at its first contact
 
 
 @dataclass(frozen=True, eq=False)
 class _Read:
-    """What Drake says of one step."""
+    """The data of one step read from Drake."""
 
     settings: _Settings
     mass: Array  # (nv, nv)
-    bias: Array  # (nv,) the force that no acceleration needs, less those that act
-    contacts: list[tuple[Array, ...]]  # of both bodies `_motions`; the point, normal, phi, and material (2, 4)
-    held: tuple[Array, Array]  # `relative_motion` of the model's held points
+    bias: Array  # (nv,) inverse dynamics at zero acceleration, minus applied forces
+    contacts: list[tuple[Array, ...]]  # `_motions` of both bodies, then point, normal, phi, and material (2, 4)
+    held: tuple[Array, Array]  # `relative_motion` of the points with loop constraints
 
 
 def _read(model: Model, settings: _Settings) -> _Read | Refusal:
-    """Of the step that was taken last on the double twin."""
+    """Read the data of the last step of the double twin."""
     contacts = _contacts(model, settings) if model.contract.contact.collision_pairs else []
     if isinstance(contacts, Refusal):
         return contacts
@@ -362,7 +362,7 @@ def _read(model: Model, settings: _Settings) -> _Read | Refusal:
 
 
 def _contacts(model: Model, settings: _Settings) -> list[tuple[Array, ...]] | Refusal:
-    """Of each point of contact in Drake's last step: see `_Read`."""
+    """Read each contact point in Drake's last step. See `_Read`."""
     plant, context = model.plant, model.double.context
     results = plant.get_contact_results_output_port().Eval(context)
     if results.num_hydroelastic_contacts():
@@ -386,7 +386,7 @@ def _contacts(model: Model, settings: _Settings) -> list[tuple[Array, ...]] | Re
 
 
 def _motions(model: Model, body: Any) -> tuple[Array, Array]:
-    """(6, nv) the velocity [angular; linear] of a body's origin by the degrees of freedom, and where that is (3,)."""
+    """Return the Jacobian (6, nv) of a body's spatial velocity [angular; linear] at its origin, and the origin (3,)."""
     plant, context = model.plant, model.double.context
     if body.index() == plant.world_body().index():
         return np.zeros((6, model.nv)), np.zeros(3)
@@ -396,7 +396,7 @@ def _motions(model: Model, body: Any) -> tuple[Array, Array]:
 
 
 def _material(model: Model, settings: _Settings, geometry: Any) -> Array | Refusal:
-    """(4,) the QUANTITIES of a geometry."""
+    """Return the QUANTITIES (4,) of a geometry, or a Refusal that names the missing one."""
     if geometry not in settings.material:
         inspector = model.double.inspector
         read = [proximity_property(inspector, geometry, quantity) for quantity in QUANTITIES]
@@ -410,14 +410,14 @@ def _material(model: Model, settings: _Settings, geometry: Any) -> Array | Refus
 def _problems(
     model: Model, form: Form, read: list[_Read], xs: Array, us: Array, couplers: Couplers | Refusal
 ) -> ConvexSteps:
-    """The convex problems of N steps."""
+    """Build the convex problems of N steps."""
     h, nq, diagonal = model.time_step, model.nq, np.arange(model.nv)
     controlled = np.full(model.nu, False)
     if form.pd:
         controlled[:] = [a.has_controller() for a in form.actuators]
     A = np.array([r.mass for r in read])
     A[:, diagonal, diagonal] += h * np.array([r.settings.damping for r in read])
-    inputs = np.where(controlled, 0.0, np.clip(us, -form.limit, form.limit))  # a controller's are clipped with its own
+    inputs = np.where(controlled, 0.0, np.clip(us, -form.limit, form.limit))  # a controller clips its total effort
     force = inputs @ form.actuation.T - np.array([r.bias for r in read])
     v, weights = xs[:, nq:], A[:, diagonal, diagonal]
     momentum = (A @ v[..., None])[..., 0] + h * force
@@ -441,7 +441,7 @@ def _problems(
 
 
 def _same_tree(model: Model) -> NDArray[np.bool_]:
-    """(nv, nv) whether two degrees of freedom belong to one tree: Drake solves for all of a tree, or none."""
+    """Return whether two degrees of freedom belong to the same tree (nv, nv): Drake solves for whole trees only."""
 
     def read() -> NDArray[np.bool_]:
         count, tree = model.plant.num_bodies(), np.empty(model.nv, dtype=np.intp)
@@ -459,7 +459,7 @@ def _same_tree(model: Model) -> NDArray[np.bool_]:
 
 
 def _contact_impulses(model: Model, read: list[_Read], v: Array, weights: Array) -> ContactImpulses:
-    """Of all contacts that move something: two shapes of one body may overlap, and Drake leaves them to no motion."""
+    """Return the impulses of all contacts with relative motion; overlaps of two shapes of one body have no effect."""
     problem = np.repeat(np.arange(len(read)), [len(r.contacts) for r in read])
     shapes = (6, model.nv), (3,), (6, model.nv), (3,), (3,), (3,), (), (2, 4)
     columns = ([contact[i] for r in read for contact in r.contacts] for i in range(len(shapes)))
@@ -486,7 +486,7 @@ def _contact_impulses(model: Model, read: list[_Read], v: Array, weights: Array)
 
 
 def _at_point(motions: Array, from_origin: Array) -> Array:
-    """(M, nv, 3) the velocity of points of bodies by the degrees of freedom, of `_motions` (M, 6, nv)."""
+    """Return the transposed Jacobians (M, nv, 3) of the velocity of bodies' points, from `_motions` (M, 6, nv)."""
     moves = motions.swapaxes(1, 2)
     return np.asarray(moves[..., 3:] + cross(moves[..., :3], from_origin[:, None, :]))
 
@@ -494,10 +494,10 @@ def _at_point(motions: Array, from_origin: Array) -> Array:
 def _solved(
     problems: ConvexSteps, before: Array, drake: Array, held: Array | None = None
 ) -> tuple[Array, Array, Array, dict[int, str]]:
-    """v' (N, nv) to rounding, what Drake's v' (N, nv) leaves, as a momentum (N, nv) and as a part of it (N,), and those
-    that are refused; `held` (N, nv) is left in the balance.
+    """Return v' (N, nv) to rounding, the momentum residual of `drake` (N, nv), this relative (N,), and refusals.
 
-    Without impulses the step is a sum, rounded by its larger terms: from `before` (N, nv) it may end at rest.
+    `held` (N, nv) is a constant residual. Without impulses the step is a sum with the rounding error of its largest
+    term, as a step from `before` (N, nv) may end at rest.
     """
     balance, solved = problems.evaluate(drake), problems.taking_part()
     missing = problems.norm(balance.missing * solved), problems.norm(balance.missing * ~solved)
@@ -523,7 +523,7 @@ def _solved(
 
 
 def _states(model: Model, xs: Array, v_next: Array) -> Array:
-    """(N, nx) q' = q + h N(q) v' and v'."""
+    """Return q' = q + h N(q) v' and v' (N, nx)."""
     if model.plant.IsVelocityEqualToQDot():
         rates = v_next
     else:

@@ -1,28 +1,28 @@
 """The Jacobians of smooth steps from their own equation, without differentiating Drake's solver.
 
-Where no contact, joint limit or constraint carries a force, Drake's discrete step solves, for the velocities v',
+If no contact, joint limit or constraint exerts a force, Drake's discrete step solves, for the velocities v',
 
     r(v'; q, v, u) = ID(q, v, (v' - v) / h) - f(q, v) + D (v' - v) + P (q + h v') - P q - ... = 0
 
-ID being the inverse dynamics M a + bias, f gravity, springs and joint damping -D v, all explicit in (q, v). Joint
+ID is the inverse dynamics M a + bias. f are gravity, springs and joint damping -D v, all explicit in (q, v). Joint
 damping D and the PD controllers are implicit. With the inputs clipped at their effort limits,
 
     input_i = clip(u_i - kp_i (q_i + h v'_i - q_ref_i) - kd_i (v'_i - v_ref_i)),
 
 so dv' = -(dr/dv')^-1 dr with dr/dv' = M / h + D + B (kd + h kp) B' for the inputs that are not clipped, and
-q' = q + h N(q) v'. By the time step dr = (B kp v' - M (v' - v) / h^2) dh. Only r is differentiated, at Drake's own v',
-by AutoDiffXd (`Implicit`).
-r(v') = 0 is checked: where it does not hold, something else acts, or the AutoDiffXd plant is not the double one.
+q' = q + h N(q) v'. With respect to the time step, dr = (B kp v' - M (v' - v) / h^2) dh. Only r is differentiated, at
+Drake's own v', by AutoDiffXd (`Implicit`).
+r(v') = 0 is checked. If it does not hold, another force acts, or the AutoDiffXd plant differs from the double plant.
 
-Of a tree it is, by the derivatives of the tree's accelerations (`SmoothStep`),
+For a tree (`SmoothStep`), the derivatives of the tree's accelerations are used in the equivalent form
 
     (M + h D) a = B u + c - K q - D v - bias(q, v),   v' = v + h a,   q' = q + h N(q) v'
 
-with M the mass matrix and reflected inertia, K the stiffness of springs and of PD control (kp), D joint damping and
-what PD control adds (kd + h kp), and c what their rest positions add. As h D stands beside the reflected inertia, the
-whole step is forward dynamics with h D as additional armature (`mechanics.tree`). Inputs are clipped at their effort
-limits as Drake does; a PD controller at its limit, as anything that this form leaves out, shows in Drake's own step,
-which is not this one then.
+where M is the mass matrix plus reflected inertia, K the stiffness of springs and of PD control (kp), D joint damping
+plus the damping of PD control (kd + h kp), and c the constant force of their rest positions. As h D is added to the
+reflected inertia, the whole step is forward dynamics with h D as additional armature (`mechanics.tree`). Inputs are
+clipped at their effort limits as in Drake. A PD controller at its limit, and any force that this form does not include,
+is detected because Drake's own step then differs.
 """
 
 from dataclasses import dataclass
@@ -45,20 +45,20 @@ from drake_diff.model.parameters import write_autodiff
 from drake_diff.model.plant import actuators, joints
 from drake_diff.model.step import set_state
 
-# Rounding of the forces that balance, relative to the largest of them. What a solver leaves is larger.
+# Rounding error of the force balance, relative to the largest force. The residual of a solver is larger.
 RESIDUAL_TOLERANCE = 1e-9
 
 
 class Implicit:
-    """The Jacobians of smooth steps from their own equation; parameters that are differenced have zeros.
+    """The Jacobians of smooth steps from their own equation; columns of parameters that need differences are zero.
 
-    But for the time step, which is in the equation.
+    The column of the time step is not zero, as the equation contains it.
     """
 
     name = "implicit"
 
     def differentiate(self, steps: Steps) -> Jacobians | Refusal:
-        """Step by step."""
+        """Differentiate step by step."""
         form, values = form_of(steps.model), np.empty((len(steps), steps.model.nx, steps.width))
         if form.excluded:
             return Refusal(form.excluded)
@@ -75,9 +75,9 @@ class Implicit:
 
 
 def differentiate_equation(form: "Form", steps: Steps, k: int, jacobian: Array) -> float:
-    """Step k's derivative into `jacobian` (nx, nx + nu + np); returns the force that is not accounted for.
+    """Write step k's derivative to `jacobian` (nx, nx + nu + np) and return the relative residual of the forces.
 
-    Where some is missing nothing is written: the equation is not the step's.
+    If the residual exceeds the tolerance, nothing is written, as the equation does not describe the step.
     """
     model, vector = steps.model, steps.vector
     x, u, v_next = steps.xs[k], steps.us[k], steps.x_next[k, model.nq :]
@@ -85,7 +85,7 @@ def differentiate_equation(form: "Form", steps: Steps, k: int, jacobian: Array) 
     twin, nq, nx, h = model.double, model.nq, model.nx, model.time_step
     change, damping = v_next - x[nq:], twin.damping()
     effort, free, (kp, kd) = form.effort(x[:nq], v_next, u, h)
-    applied = form.actuation @ np.minimum(np.maximum(effort, -form.limit), form.limit)  # clip() takes thrice as long
+    applied = form.actuation @ np.minimum(np.maximum(effort, -form.limit), form.limit)  # three times faster than clip()
 
     variables = InitializeAutoDiff(np.concatenate([x, vector.values])).ravel()
     write_autodiff(vector, model, variables[nx:])
@@ -98,13 +98,13 @@ def differentiate_equation(form: "Form", steps: Steps, k: int, jacobian: Array) 
     rows = gradient_rows(needed, len(variables))
     if vector.parameters:
         rows = rows + gradient_rows(model.autodiff.damping() * change, len(variables))
-    pressed = form.actuation * free  # (nv, nu) what an effort that is not at its limit does
+    pressed = form.actuation * free  # (nv, nu) the actuation of the efforts that are not at their limits
     by_point = np.concatenate([rows[:, :nx], -pressed * form.per_input, rows[:, nx:]], axis=1)
     by_next = model.double.mass_matrix() / h
     by_next[form.diagonal] += damping
     by_point[:, nq:nx] -= by_next  # through (v' - v) / h and D (v' - v)
     if form.pd:
-        np.add.at(by_point.T, form.position, (pressed * kp * form.ratio).T)  # two may be of one coordinate
+        np.add.at(by_point.T, form.position, (pressed * kp * form.ratio).T)  # two inputs may have the same coordinate
         by_next += (pressed * (kd + h * kp)) @ form.actuation.T
     step = None if vector.step_entry is None else nx + model.nu + vector.step_entry
     if step is not None:
@@ -120,7 +120,7 @@ def differentiate_equation(form: "Form", steps: Steps, k: int, jacobian: Array) 
 
 
 def _positions(model: Model, form: "Form", v_next: Array, velocities: Array, num_parameters: int) -> Array:
-    """(nq, nx + nu + np) the derivative of q' = q + h N(q) v'; the AutoDiffXd twin stands at the step's state."""
+    """Return the derivative (nq, nx + nu + np) of q' = q + h N(q) v', with the AutoDiffXd twin at the step's state."""
     if form.q_dot_is_v:
         moved = model.time_step * velocities
         moved[form.diagonal] += 1.0
@@ -135,28 +135,28 @@ def _positions(model: Model, form: "Form", v_next: Array, velocities: Array, num
 
 @dataclass(frozen=True, eq=False)
 class Form:
-    """What of a model does not change from step to step."""
+    """The data of a model's equation that does not change from step to step."""
 
-    excluded: str  # why the form describes no step of the model; empty where it may
-    driven: str  # the same, but for constraints and what the diagram's systems exert
+    excluded: str  # why the form describes no step of the model; "" if it may describe one
+    driven: str  # the same, ignoring constraints and the forces of the diagram's systems
     actuators: list[Any]
-    velocity: NDArray[np.int64]  # (nu,) the index in v of the joint that an input drives, and in q; 0 of other inputs
-    position: NDArray[np.int64]
-    ratio: Array  # (nu,) and `offset`: the joint's position by that entry; 1 and 0 unless it follows another joint
+    velocity: NDArray[np.int64]  # (nu,) the index in v of the joint that an input drives; 0 for other inputs
+    position: NDArray[np.int64]  # (nu,) likewise the index in q
+    ratio: Array  # (nu,) the joint's position is ratio * entry + offset; 1 and 0 unless it follows another joint
     offset: Array
     actuation: Array  # (nv, nu)
-    limit: Array
-    cut: Array  # (nu,) beyond what Drake cuts off an input itself: infinite under PD control, whose sum it cuts off
-    reference: Array  # (2, nu) the positions and velocities that PD control holds; 0 where an input commands them
-    commanded: NDArray[np.bool_]  # (nu,) whether it does
-    diagonal: tuple[Any, ...]  # the indices of that of (nv, nv)
-    pd: bool
+    limit: Array  # (nu,) effort limits
+    cut: Array  # (nu,) limits at which Drake clips an input; infinite with PD control, where Drake clips the sum
+    reference: Array  # (2, nu) the reference positions and velocities of PD control; 0 if an input commands them
+    commanded: NDArray[np.bool_]  # (nu,) whether the input is a commanded position
+    diagonal: tuple[Any, ...]  # indices of the diagonal of a matrix (nv, nv)
+    pd: bool  # whether there are PD controllers
     q_dot_is_v: bool
 
     def effort(self, q: Array, v_next: Array, u: Array, h: float) -> tuple[Array, NDArray[np.bool_], Any]:
-        """(..., nu) what the inputs are before they are clipped, whether they are not beyond their limits, and kp, kd.
+        """Return the inputs (..., nu) before clipping, whether they are within their limits, and (kp, kd).
 
-        Exactly at a limit the derivative is that of the inside, as AutoDiffXd's is: there plans end up, and stay.
+        Exactly at a limit the derivative is that of the interior, as with AutoDiffXd. Optimal plans stay at limits.
         """
         kp, kd = self.gains()
         effort = self.feedforward(u)
@@ -168,15 +168,15 @@ class Form:
 
     @property
     def per_input(self) -> Array:
-        """(nu,) the effort by an input: kp of a commanded position, else 1."""
+        """The derivative (nu,) of the effort with respect to the input: kp for a commanded position, else 1."""
         return np.where(self.commanded, self.gains()[0], 1.0)
 
     def feedforward(self, u: Array) -> Array:
-        """(..., nu) the efforts of inputs (..., nu), those of commanded positions where their joints are at 0."""
+        """Return the efforts (..., nu) of inputs (..., nu), for commanded positions with the joints at 0."""
         return u * self.per_input if self.commanded.any() else u
 
     def gains(self) -> tuple[Array, Array]:
-        """kp (nu,) and kd (nu,), zero where there is no controller; they may change as parameters do."""
+        """Return kp (nu,) and kd (nu,), zero without a controller; they may change with parameters."""
         if not self.pd:
             return np.zeros(len(self.limit)), np.zeros(len(self.limit))
         gains = [a.get_controller_gains() if a.has_controller() else None for a in self.actuators]
@@ -184,7 +184,7 @@ class Form:
 
 
 def form_of(model: Model) -> Form:
-    """Read once: nothing in it changes with parameters."""
+    """Return the form of a model, cached, as it does not change with parameters."""
     return model.cache("implicit form", lambda: _read_form(model), of_structure=True)
 
 
@@ -223,7 +223,7 @@ def _read_form(model: Model) -> Form:
 
 
 def _why_driven(model: Model) -> str:
-    """What acts on the model, beside constraints, that the form leaves out wherever it is; empty where nothing does."""
+    """Return why forces other than constraints make the form invalid for every step of the model, or ""."""
     plant = model.plant
     if any(joint.is_locked(model.double.context) for joint in joints(plant)):
         return "a joint is locked"
@@ -234,36 +234,36 @@ def _why_driven(model: Model) -> str:
     return "the diagram feeds PD targets" if any(model.feeds(port) for port in targets.values()) else ""
 
 
-# What a limit or a controller at its limit changes in x' is larger; x' known to rounding alone, as x + gap, is not.
+# A limit or a controller at its limit changes x' by more. Rounding of x', when it is computed as x + gap, is smaller.
 STEP_TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothStep:
-    """What of a model does not change from step to step."""
+    """The smooth step of a tree, with the data that does not change from step to step."""
 
-    dynamics: ForwardDynamics  # of what has h D in its armature
+    dynamics: ForwardDynamics  # with h D in the armature
     coordinates: Coordinates
     form: Form
     time_step: float
-    limit: Array  # (nu,) of the inputs that are clipped; infinite under PD control
+    limit: Array  # (nu,) limits at which inputs are clipped; infinite with PD control
     stiffness: Array  # (nv,) K
     damping: Array  # (nv,) D
     rest: Array  # (nv,) c
     positions: NDArray[np.intp]  # (nv,) the index in q of hinges and slides; 0 for free bodies, where K is 0
-    limits: Array  # (2, nv) lower and upper positions of hinges and slides; infinite of free bodies
+    limits: Array  # (2, nv) lower and upper positions of hinges and slides; infinite for free bodies
     sprung: bool  # whether any K is not 0
     loaded: bool  # whether any K, D or c is not 0
     limited: bool  # whether any input is clipped
 
     def __call__(self, steps: Steps) -> tuple[Array, NDArray[np.bool_]]:
-        """(N, nx, nx + nu) of the steps, and which (N,) are smooth: those that lead where Drake's do."""
+        """Return the Jacobians (N, nx, nx + nu), and which steps (N,) are smooth, i.e. equal Drake's steps."""
         jacobians, x_next = self.differentiate(steps.xs, steps.us)
         agree = np.abs(x_next - steps.x_next) <= STEP_TOLERANCE * np.maximum(np.abs(steps.x_next), 1.0)
         return jacobians, agree.all(axis=1) & ~steps.touching
 
     def differentiate(self, xs: Array, us: Array) -> tuple[Array, Array]:
-        """(N, nx, nx + nu) and x' (N, nx) of the steps from xs (N, nx) under us (N, nu), were they smooth."""
+        """Return the Jacobians (N, nx, nx + nu) and x' (N, nx) of smooth steps from xs (N, nx) under us (N, nu)."""
         c, h = self.coordinates, self.time_step
         q, v = xs[:, : c.nq], xs[:, c.nq :]
         force, clipped = self.force_of(q, v, us)
@@ -273,9 +273,9 @@ class SmoothStep:
         return euler_jacobian(c, h, xs, x_next, np.concatenate(parts, axis=2)), x_next
 
     def single(self, x: Array, u: Array, x_next: Array) -> Array | None:
-        """(nx, nx + nu) of the step from x (nx,) under u (nu,) to x_next (nx,), in a third of the time of `__call__`.
+        """Return the Jacobian (nx, nx + nu) of one step to x_next (nx,), in a third of the time of `__call__`.
 
-        None of free bodies, where an input is at its limit or beyond, and where a smooth step leads elsewhere.
+        Returns None for a tree with free bodies, inputs at or beyond their limits, or if the smooth step differs.
         """
         if self.coordinates.free or (self.limited and (np.abs(u) >= self.limit).any()):
             return None
@@ -293,7 +293,7 @@ class SmoothStep:
         if self.loaded:
             by_q, by_v = by_q - inverse * self.stiffness, by_v - inverse * self.damping
         jacobian = np.empty((nx, width))
-        lower, diagonal = jacobian[n:], jacobian.reshape(-1)[:: width + 1]  # of the first nx columns; views
+        lower, diagonal = jacobian[n:], jacobian.reshape(-1)[:: width + 1]  # views; diagonal of the first nx columns
         np.multiply(by_q, h, out=lower[:, :n])
         np.multiply(by_v, h, out=lower[:, n:nx])
         np.multiply(self.form.feedforward(inverse.take(self.form.velocity, axis=1)), h, out=lower[:, nx:])
@@ -303,10 +303,10 @@ class SmoothStep:
         return jacobian
 
     def curvature(self, xs: Array, us: Array, along: Array) -> Array | None:
-        """(N, nx + nu, nx + nu) the second derivative of along' x' (N, nx each); None of free bodies.
+        """Return the second derivative (N, nx + nu, nx + nu) of along' x' (N, nx each), or None with free bodies.
 
-        v' = v + h a, where inverse dynamics give tau(q, v, a) for the forces, which are linear in q, v and u. So with
-        mu = M^-1 w, w'a has the second derivative of -mu' tau(q, v, a) at the a' that the first one has.
+        v' = v + h a, where the inverse dynamics tau(q, v, a) equal the forces, which are linear in q, v and u. So with
+        mu = M^-1 w, w'a has the second derivative of -mu' tau(q, v, a), with the first derivative of a inserted.
         """
         if self.coordinates.free:
             return None
@@ -327,13 +327,13 @@ class SmoothStep:
         return hessian
 
     def at_a_limit(self, steps: Steps) -> NDArray[np.bool_]:
-        """(N,) whether a joint limit pushes: Drake's does where phi + 2 h phi' < 0, phi being how far it is."""
+        """Return whether a joint limit exerts a force (N,): Drake's does if phi + 2 h phi' < 0 at the distance phi."""
         v_next = steps.x_next[:, self.coordinates.nq :]
         ahead = steps.xs[:, self.positions] + 2 * self.time_step * v_next
         return np.asarray(((ahead <= self.limits[0]) | (ahead >= self.limits[1])).any(axis=1))
 
     def force_of(self, q: Array, v: Array, us: Array) -> tuple[Array, NDArray[np.bool_] | None]:
-        """(N, nv) B u + c - K q - D v, and which inputs (N, nu) are clipped, None where none is."""
+        """Return B u + c - K q - D v (N, nv), and which inputs (N, nu) are clipped, or None if no input is."""
         clipped = np.abs(us) > self.limit
         some = bool(clipped.any())
         if some:
@@ -344,13 +344,13 @@ class SmoothStep:
         return force, clipped if some else None
 
     def _by_input(self, inverse: Array, clipped: NDArray[np.bool_] | None) -> Array:
-        """(N, nv, nu) M^-1 B, 0 for clipped inputs."""
+        """Return M^-1 B (N, nv, nu), with 0 for clipped inputs."""
         columns = self.form.feedforward(inverse.take(self.form.velocity, axis=2))
         return columns if clipped is None else columns * ~clipped[:, None]
 
 
 def build_analytic(model: Model) -> SmoothStep:
-    """Not certified. Raises ModelError where the plant is no such tree."""
+    """Build the smooth step, not yet certified; raise ModelError if the plant is not a supported tree."""
     form = form_of(model)
     if form.driven or model.systems_act:
         raise ModelError(form.driven or model.systems_act)

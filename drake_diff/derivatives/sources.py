@@ -1,7 +1,7 @@
-"""AutoDiffXd and differences as sources of Jacobians, and the one place that chooses among all four.
+"""AutoDiffXd and finite differences as sources of Jacobians, and the choice among all four sources.
 
-The choice is by size and structure alone, so that one model, step and request give one method on every machine. What
-it goes by was measured, each source alone, on one core [us a Jacobian; the last two a whole step by a mass as well]:
+The choice depends only on size and structure, so that it is the same on every machine. It is based on these times of
+each source on one core [us per Jacobian; the last two: a whole step, also with respect to a mass]:
 
     model            joints  autodiff  implicit  analytic  differences  autodiff  implicit
     pendulum              1        41        42        20           83       221       214
@@ -33,36 +33,36 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, write_autodiff
 from drake_diff.model.step import advance
 
-# The AutoDiffXd and the double step run the same algorithm, so they differ by rounding; but where Drake's solver stops
-# one of them an iteration sooner, by that solver's tolerance.
+# The AutoDiffXd and the double step run the same algorithm, so they differ by rounding. If Drake's solver stops one of
+# them an iteration earlier, they differ by the tolerance of this solver.
 PARITY_TOLERANCE = 1e-9
-# Cube root of the double step's rounding: where truncation and rounding of a central difference balance.
+# Cube root of the double step's rounding: truncation and rounding errors of a central difference balance.
 DIFFERENCE_STEP = 1e-5
-# Friction turns within 1e-4 m/s, so that it is smaller where impulses act; 1e-5 was up to 20 times off there.
+# Smaller if impulses act, as friction changes direction within 1e-4 m/s: with 1e-5 errors were up to 20 times larger.
 REFINED_STEP = 3e-7
-TIME_STEP_DIFFERENCE = 4e-4  # of a step's length, which a step depends on smoothly where contact lasts
-# Mass matrices with derivatives in a step (2.3, of a chain of 500 links), and the most numbers in them: 1 GiB.
+TIME_STEP_DIFFERENCE = 4e-4  # fraction of the time step; the step depends on it smoothly while contact lasts
+# Mass matrices with derivatives in a step (2.3 for a chain of 500 links), and the maximum of their entries: 1 GiB.
 COPIES, MOST_CARRIED = 2.5, 2**27
-# Two ways to the same smooth Jacobian differ by rounding, which the inverse of a mass matrix may magnify.
+# Two methods for the same smooth Jacobian differ by rounding, which the inverse of a mass matrix may magnify.
 SAME_JACOBIAN = 1e-10
-# Below so many degrees of freedom AutoDiffXd takes a step with contact in less time than NumPy's calls for one take:
-# a sphere on the ground (6) takes 460 us by autodiff and 590 us by the contact equation.
+# Below this number of degrees of freedom, an AutoDiffXd step with contact is faster than NumPy calls: a sphere on the
+# ground (6) takes 460 us by autodiff and 590 us by the contact equation.
 CONTACT_SIZE = 8
-OF_ONE_KIND = ("analytic", "finite_difference")  # methods whose columns by parameters are such, too
-CHECK_ENDS = ("analytic", "implicit")  # which find out where a step does not lead where it is said to
+OF_ONE_KIND = ("analytic", "finite_difference")  # methods that also compute all parameter columns
+CHECK_ENDS = ("analytic", "implicit")  # sources that detect a wrong end state of a step
 CERTIFIED = "equal to autodiff, as certified on this model"
 
 
 class Autodiff:
-    """AutoDiffXd through Drake's own step; parameters that are differenced have zeros."""
+    """AutoDiffXd through Drake's own step; columns of parameters that need differences are zero."""
 
     name = "autodiff"
 
     def differentiate(self, steps: Steps) -> Jacobians:
-        """Step by step.
+        """Differentiate step by step.
 
-        Raises GradientError where the AutoDiffXd step is not the double step, nor another solution of it within the
-        tolerance of Drake's solver.
+        Raises GradientError if the AutoDiffXd step differs from the double step, unless it also solves the step within
+        the tolerance of Drake's solver.
         """
         values, refused = [], dict[int, DrakeDiffError]()
         for k in range(len(steps.xs)):
@@ -79,7 +79,7 @@ def _by_autodiff(steps: Steps, k: int) -> Array:
     if too_large := too_large_for_autodiff(model, len(vector.values)):
         raise GradientError(f"{too_large}: method analytic or finite_difference needs less")
     at_limit = np.abs(u) == form_of(model).cut
-    if at_limit.any():  # which side Drake's derivative is of depends on the limit's sign and on its version
+    if at_limit.any():  # the side of Drake's derivative depends on the limit's sign and on Drake's version
         u = np.where(at_limit, np.nextafter(u, 0.0), u)
     variables = InitializeAutoDiff(np.concatenate([steps.xs[k], u, vector.values])).ravel()
     twin, end = model.autodiff, model.nx + model.nu
@@ -88,14 +88,14 @@ def _by_autodiff(steps: Steps, k: int) -> Array:
     value = ExtractValue(result).ravel()
     try:
         check_parity(model, value, steps.x_next[k])
-    except GradientError:  # two ends of one solver may be as far apart as its tolerance lets them
+    except GradientError:  # two results of the solver may differ by its tolerance
         if not solves_the_step(model, steps.xs[k], steps.us[k], value):
             raise
     return gradient_rows(result, len(variables))
 
 
 def too_large_for_autodiff(model: Model, num_parameters: int = 0) -> str:
-    """Why a step with AutoDiffXd would take more than `MOST_CARRIED` numbers of memory; "" where it does not."""
+    """Return why an AutoDiffXd step needs more than `MOST_CARRIED` numbers of memory, or "" if it does not."""
     width = model.nx + model.nu + num_parameters
     count = COPIES * model.nv**2 * width
     if count <= MOST_CARRIED:
@@ -107,8 +107,8 @@ def too_large_for_autodiff(model: Model, num_parameters: int = 0) -> str:
 
 
 def check_parity(model: Model, autodiff: Array, double: Array) -> None:
-    """Refuse a derivative whose AutoDiffXd step does not lead where the double step leads."""
-    if np.abs(autodiff - double).max() <= PARITY_TOLERANCE:  # as a rule, and in half the time of what follows
+    """Raise GradientError if the AutoDiffXd step differs from the double step."""
+    if np.abs(autodiff - double).max() <= PARITY_TOLERANCE:  # the usual case, in half the time of the code below
         return
     excess = np.abs(autodiff - double) - PARITY_TOLERANCE * np.maximum(1.0, np.abs(double))
     if not np.all(excess <= 0):  # NaN must not pass
@@ -120,23 +120,23 @@ def check_parity(model: Model, autodiff: Array, double: Array) -> None:
 
 
 class Differences:
-    """Central differences of the double step; by parameters, where they depend least on their size.
+    """Central differences of the double step; for parameters, of the size on which they depend least.
 
-    Where impulses act they are of the step solved to rounding (see `refine_step`), so that what Drake's solver leaves
-    unsolved is not in them; where that is not had, of Drake's own, and the note says why.
+    If impulses act, the step is solved to rounding (see `refine_step`), so that the differences do not contain the
+    residual of Drake's solver. If this is not possible, Drake's own step is used, and the note states the reason.
     """
 
     name = "finite_difference"
 
     def differentiate(self, steps: Steps) -> Jacobians:
-        """Step by step."""
+        """Differentiate step by step."""
         answer = [_by_differences(steps, k) for k in range(len(steps))]
         notes = {k: note for k, (_, note) in enumerate(answer) if note}
         return Jacobians(np.array([jacobian for jacobian, _ in answer]), {}, notes)
 
 
 def _by_differences(steps: Steps, k: int) -> tuple[Array, str]:
-    """(nx, nx + nu + np), and of what step."""
+    """Return the Jacobian (nx, nx + nu + np), and a note on the step that is differenced."""
     width = steps.model.nx + steps.model.nu
     scale = np.maximum(1.0, np.abs(np.concatenate([steps.xs[k], steps.us[k]])))
 
@@ -150,7 +150,7 @@ def _by_differences(steps: Steps, k: int) -> tuple[Array, str]:
 
 
 def _parameter_differences(steps: Steps, k: int, entries: NDArray[np.int64]) -> Array:
-    """(nx, n) the derivative of the double step by the `entries` (n,) of the vector."""
+    """Return the derivative (nx, n) of the double step with respect to the `entries` (n,) of the vector."""
     vector = steps.vector
     if not len(entries):
         return np.zeros((steps.model.nx, 0))
@@ -168,7 +168,7 @@ def _parameter_differences(steps: Steps, k: int, entries: NDArray[np.int64]) -> 
             def led(d: Array, moved: Array = moved) -> Array:
                 return ends(np.hstack([np.zeros((len(d), width)), d @ moved]))
 
-            if which is timed:  # each size of a difference needs models of its own: two, extrapolated, and no plateau
+            if which is timed:  # each size needs models of its own: two sizes with extrapolation, without `plateau`
                 sweep = sweep_of(led, count, (TIME_STEP_DIFFERENCE, TIME_STEP_DIFFERENCE / 2))
                 coarse, fine = (sweep.forward + sweep.backward) / 2
                 columns[:, which] = fine + (fine - coarse) / 3
@@ -180,9 +180,9 @@ def _parameter_differences(steps: Steps, k: int, entries: NDArray[np.int64]) -> 
 
 
 def _differenced(steps: Steps, k: int, quotients: Callable[[Many, float], Array]) -> tuple[Array, str]:
-    """What `quotients` makes of where the step leads from displacements (K, nx + nu + np), and of what step that is.
+    """Call `quotients` with the step's ends as a function of displacements (K, nx + nu + np); also return a note.
 
-    It is called with the step size that suits the ends. Those to rounding are taken where impulses act.
+    It is also given the matching step size. The step is solved to rounding if impulses act.
     """
     model, vector, x, u = steps.model, steps.vector, steps.xs[k], steps.us[k]
     point = np.concatenate([x, u, vector.values])
@@ -212,7 +212,7 @@ def _differenced(steps: Steps, k: int, quotients: Callable[[Many, float], Array]
 
 
 def step_at(model: Model, vector: ParameterVector, x: Array, u: Array, values: Array) -> Array:
-    """(nx,) the double step with the vector's parameters at `values` (np,); the model keeps what was applied."""
+    """Return the double step (nx,) with the vector's parameters at `values` (np,), then restore the parameters."""
     if np.array_equal(values, vector.values):
         return np.asarray(advance(model.double, x, u))
     if vector.time_step(values) != model.time_step:
@@ -226,10 +226,10 @@ def step_at(model: Model, vector: ParameterVector, x: Array, u: Array, values: A
 
 
 class CertifiedImplicit(Implicit):
-    """The implicit source of a model on which it was compared with autodiff."""
+    """The implicit source, certified against autodiff on each model."""
 
     def differentiate(self, steps: Steps) -> Jacobians | Refusal:
-        """As by `Implicit`, where the two are equal."""
+        """Differentiate as `Implicit`, or return a Refusal if the two sources differ."""
         trial = implicit_trial(steps.model)
         if trial.refusal:
             return Refusal(trial.refusal)
@@ -242,13 +242,13 @@ class CertifiedImplicit(Implicit):
 
 
 def implicit_trial(model: Model) -> SourceTrial:
-    """Of comparing implicit with autodiff, at the first smooth step that is met."""
+    """Return the comparison of implicit with autodiff at the model's first smooth step."""
     return model.cache("implicit trial", lambda: SourceTrial(1), of_structure=True)
 
 
 def _compare(trial: SourceTrial, steps: Steps, k: int, jacobian: Array) -> None:
     trial.left = 0
-    if not steps.taken:  # the caller's ends are less exact than parity asks for
+    if not steps.taken:  # the caller's end states are less accurate than the parity check requires
         steps, k = take_step(steps.model, steps.vector, steps.xs[k], steps.us[k]), 0
     try:
         other = _by_autodiff(steps, k)
@@ -256,7 +256,7 @@ def _compare(trial: SourceTrial, steps: Steps, k: int, jacobian: Array) -> None:
         trial.note = f"AutoDiffXd refuses the whole step: {error}"
         return
     compared = np.ones(jacobian.shape[1], dtype=bool)
-    compared[steps.model.nx + steps.model.nu + steps.vector.differenced] = False  # of which AutoDiffXd knows nothing
+    compared[steps.model.nx + steps.model.nu + steps.vector.differenced] = False  # not supported by AutoDiffXd
     jacobian, other = jacobian[:, compared], other[:, compared]
     gap = float(np.abs(jacobian - other).max())
     if gap <= SAME_JACOBIAN * max(1.0, float(np.abs(other).max())):
@@ -277,13 +277,13 @@ SMALL_IN_CONTACT: tuple[Source, ...] = (AUTODIFF, ANALYTIC, DIFFERENCES)
 
 
 def check_method(method: str) -> None:
-    """Refuse what is no source of a step's derivative, naming those that are."""
+    """Raise UnknownNameError, with the list of known methods, if `method` is not one of them."""
     if method not in METHODS:
         raise UnknownNameError("method", got=method, known=METHODS)
 
 
 def order_of(steps: Steps, method: str, single: bool) -> tuple[Source, ...]:
-    """The sources to ask, one after the other: what is exact and fastest first, as measured above."""
+    """Return the sources in order of preference: exact and fastest first, by the table in the module's docstring."""
     if method != "auto":
         return _ORDERS[method]
     if single and steps.model.nv < CONTACT_SIZE and not steps.vector.parameters and steps.some_touch:
@@ -293,7 +293,7 @@ def order_of(steps: Steps, method: str, single: bool) -> tuple[Source, ...]:
 
 @dataclass(eq=False, slots=True)
 class Chosen:
-    """The Jacobians of N steps, the source of each and why it was taken."""
+    """The Jacobians of N steps, with the source of each and the reason for it."""
 
     values: Array  # (N, nx, nx + nu + np)
     methods: list[str]
@@ -301,10 +301,10 @@ class Chosen:
 
 
 def choose(steps: Steps, method: str, *, single: bool = False) -> Chosen:
-    """The Jacobians of the steps, each by the first source in order that knows it.
+    """Return the Jacobians of the steps, each by the first source in order that supports it.
 
-    `single` says that one step alone was asked for. Where the steps were not taken, those that no source which finds a
-    wrong end knows are taken. Raises what the last source has against a step that none knows.
+    `single` means that a single step is requested. If the caller gave the end states, only sources that detect wrong
+    ends are used, and Drake takes the other steps. If no source supports a step, the last source's error is raised.
     """
     order = order_of(steps, method, single)
     if not steps.taken:
@@ -313,7 +313,7 @@ def choose(steps: Steps, method: str, *, single: bool = False) -> Chosen:
 
 
 def _ask(order: tuple[Source, ...], steps: Steps, method: str, whys: list[str], error: DrakeDiffError | None) -> Chosen:
-    """`whys` (N,) is what the sources before had against each step, `error` the last of it."""
+    """Try the sources in order; `whys` (N,) are the reasons of earlier refusals, and `error` is the last of them."""
     if not order:
         if steps.taken and method == ANALYTIC.name:
             raise GradientError(f"method analytic: no analytic derivative of this step is known: {whys[0][:-2]}")
@@ -328,7 +328,7 @@ def _ask(order: tuple[Source, ...], steps: Steps, method: str, whys: list[str], 
     if isinstance(answer, Refusal):
         return _ask(order[1:], steps, method, [f"{why}not {source.name}: {answer}; " for why in whys], error)
     vector = steps.vector
-    # What Drake's AutoDiffXd does not carry; without parameters not even that is asked, at every single step.
+    # Columns that Drake's AutoDiffXd does not support; without parameters this check is skipped for speed.
     if vector.parameters and len(vector.differenced) and source.name not in OF_ONE_KIND:
         _fill_in(steps, answer)
     reasons = [_reason(source, steps, method, why, answer.notes.get(k, "")) for k, why in enumerate(whys)]
@@ -346,7 +346,7 @@ def _ask(order: tuple[Source, ...], steps: Steps, method: str, whys: list[str], 
 
 
 def _fill_in(steps: Steps, answer: Jacobians) -> None:
-    """Set the columns of the parameters that a source does not know, by differences."""
+    """Compute by differences the columns of the parameters that a source does not support."""
     entries = steps.vector.differenced
     if answer.timed:
         entries = entries[entries != steps.vector.step_entry]
@@ -357,7 +357,7 @@ def _fill_in(steps: Steps, answer: Jacobians) -> None:
 
 
 def _reason(source: Source, steps: Steps, method: str, why: str, note: str) -> str:
-    """Why this source was taken, and none before it; and what it has to say of the step."""
+    """Return why this source was used and the earlier ones were not, with its note on the step."""
     reason = why[:-2] if why else "the fastest for a model of this size"
     if source.name == method:
         reason = "asked for"

@@ -1,4 +1,4 @@
-"""The Jacobians of discrete steps, and the gate that each must pass before anyone sees it."""
+"""The Jacobians of discrete steps, and the check that each must pass before it is returned."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameters, ParameterVector, applied, select
 from drake_diff.model.step import check_point
 
-# By these methods a smooth step has the analytic derivative, and why.
+# The methods that use the analytic derivative for a smooth step, with the reason.
 OF_ONE_SMOOTH_STEP = {"auto": CERTIFIED, "analytic": "asked for"}
-# Lagged contact reaches 4e4 where it is right; Drake's singular poses give 1e15 and more.
+# Correct derivatives of lagged contact reach 4e4. Drake's singular poses give 1e15 and more.
 MAGNITUDE_BOUND = 1e8
 
 
 @dataclass(frozen=True, eq=False)
 class StepDerivatives(ShowsItsRepr):
-    """A step x_next = f(x, u, p) and its Jacobians; `differentiate_step` makes one. Arrays are read-only.
+    """A step x_next = f(x, u, p) and its Jacobians, returned by `differentiate_step`. Arrays are read-only.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -39,9 +39,9 @@ class StepDerivatives(ShowsItsRepr):
     B: Array  # (nx, nu) df/du
     C: Array  # (nx, np) df/dp
     parameters: tuple[str, ...]  # (np,) the names of p
-    sources: tuple[str, ...]  # (np,) where each column of C comes from
-    method: str  # where A and B come from
-    reason: str  # why from there
+    sources: tuple[str, ...]  # (np,) the method of each column of C
+    method: str  # the method of A and B
+    reason: str  # the reason for this method
 
     def __repr__(self) -> str:
         by = f"\nC by {', '.join(map(' from '.join, zip(self.parameters, self.sources, strict=True)))}"
@@ -52,36 +52,36 @@ class StepDerivatives(ShowsItsRepr):
 def differentiate_step(
     model: Model, x: ArrayLike, u: ArrayLike | None = None, *, parameters: Parameters = (), method: str = "auto"
 ) -> StepDerivatives:
-    """The Jacobians of `step(model, x, u)`, in Drake's coordinates x = [q; v].
+    """Return the Jacobians of `step(model, x, u)`, in Drake's coordinates x = [q; v].
 
     Args:
         model: The discrete model.
         x: (nx,) the state, [m or rad] and [m/s or rad/s].
-        u: (nu,) the input [N or N m]; may be left out where the model has no actuators.
-        parameters: Names of what C is by (see `list_parameters`), at the model's own values, or a mapping of the
-            names to other values.
-        method: Where the Jacobians come from:
+        u: (nu,) the input [N or N m]; may be omitted if the model has no actuators.
+        parameters: Names of the parameters for C (see `list_parameters`), at the model's own values, or a mapping of
+            the names to other values.
+        method: The method that computes the Jacobians:
 
             - "autodiff": AutoDiffXd through Drake's own step;
-            - "analytic": the step's own equation, with point contact, joint limits and couplers, on a model on which it
-              was certified equal to Drake's; by parameters, friction, stiffness, dissipation and relaxation time. What
-              it does not cover is a GradientError that says why;
-            - "implicit": from the equation of a smooth step; autodiff where contact or a limit acts;
-            - "finite_difference": central differences of the double step, solved to rounding where contact, joint
-              limits, PD controllers or couplers act and their equation is known, which the reason says;
-            - "auto": the fastest of them that is exact here, by the model's size and what acts: analytic, else
-              implicit, else autodiff, and differences where Drake refuses AutoDiffXd. For one step in contact of
-              fewer than eight degrees of freedom autodiff comes first.
+            - "analytic": the step's own equation, with point contact, joint limits and couplers, certified equal to
+              Drake's on this model. Supported parameters are friction, stiffness, dissipation and relaxation time. In
+              all other cases a GradientError with the reason is raised;
+            - "implicit": from the equation of a smooth step; autodiff if contact or a limit acts;
+            - "finite_difference": central differences of the double step. If contact, joint limits, PD controllers or
+              couplers act and their equation is known, the step is solved to rounding, as `reason` then states;
+            - "auto": the fastest exact method for the model's size and the forces that act: analytic, else implicit,
+              else autodiff, and differences if Drake does not support AutoDiffXd. For one step with contact and fewer
+              than eight degrees of freedom, autodiff is the first choice.
 
     Returns:
-        `x_next` (nx,), `A` (nx, nx), `B` (nx, nu) and `C` (nx, np), with the `method` that gave them and the `reason`.
+        `x_next` (nx,), `A` (nx, nx), `B` (nx, nu) and `C` (nx, np), with the `method` used and the `reason` for it.
 
     Raises:
-        GradientError: The AutoDiffXd step is not the double step, a derivative is not finite or beyond 1e8, or there is
-            no "analytic" one, which was asked for by name.
-        SimulationError: Drake cannot take the step.
-        UnknownNameError: There is no such method or parameter.
-        ShapeError, NonFiniteError: x or u is not the model's.
+        GradientError: The AutoDiffXd step differs from the double step, a derivative is not finite or larger than 1e8,
+            or method "analytic" does not support the step.
+        SimulationError: Drake cannot compute the step.
+        UnknownNameError: The method or a parameter does not exist.
+        ShapeError, NonFiniteError: x or u is invalid for the model.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -102,22 +102,22 @@ def differentiate_step(
 def linearize(
     model: Model, xs: ArrayLike, us: ArrayLike, method: str = "auto", x_next: ArrayLike | None = None
 ) -> tuple[Array, Array, tuple[str, ...]]:
-    """The Jacobians of many steps in one call, which costs far less than one call for each.
+    """Return the Jacobians of many steps in one call, which is much faster than one call per step.
 
     Args:
         model: The discrete model.
-        xs: (N, nx) where the steps start, or (N+1, nx) with a last state from which no step is taken.
+        xs: (N, nx) the start states, or (N+1, nx) with a last state from which no step is taken.
         us: (N, nu) the inputs [N or N m].
-        method: As of `differentiate_step`, by "auto" of each step apart.
-        x_next: (N, nx) where the steps are known to lead, which spares Drake's own. A step that is found to lead
-            elsewhere is taken.
+        method: See `differentiate_step`; "auto" chooses a method for each step.
+        x_next: (N, nx) the end states of the steps, if known, which avoids Drake's own steps. If an end state is found
+            to be wrong, the step is computed by Drake.
 
     Returns:
-        A (N, nx, nx), B (N, nx, nu), and the method (N,) that each step's came from.
+        A (N, nx, nx), B (N, nx, nu), and the method of each step (N,).
 
     Raises:
-        ShapeError, NonFiniteError, UnknownNameError: Of what was given.
-        GradientError, SimulationError: As by `differentiate_step`.
+        ShapeError, NonFiniteError, UnknownNameError: An argument is invalid.
+        GradientError, SimulationError: See `differentiate_step`.
 
     Example:
         >>> model = dd.load_model("models/cart_pole.urdf", time_step=0.01)
@@ -143,7 +143,7 @@ def linearize(
 
 
 def step_jacobians(model: Model, vector: ParameterVector, x: Array, u: Array, method: str) -> StepDerivatives:
-    """`differentiate_step` on a model that the vector is applied to; sizes are the caller's business."""
+    """Compute `differentiate_step` on a model with `vector` applied, without checks of the shapes."""
     steps = take_step(model, vector, x, u)
     reason = OF_ONE_SMOOTH_STEP.get(method)
     if reason is not None and not vector.parameters and not steps.some_touch:
@@ -167,9 +167,9 @@ def derivatives_along(
     method: str = "auto",
     xs: Array | None = None,
 ) -> list[StepDerivatives]:
-    """The step derivatives along the rollout from `x0` (nx,) under `us` (N, nu), `vector` being applied.
+    """Return the step derivatives along the rollout from `x0` (nx,) under `us` (N, nu), with `vector` applied.
 
-    Given xs (N, nx), those of the steps from each of them.
+    If xs (N, nx) is given, the steps start from these states.
     """
     steps = take_steps(model, vector or select(model, ()), x0, us, xs)
     return _derivatives_of(steps, choose(steps, method))
@@ -179,7 +179,7 @@ def _derivatives_of(steps: Steps, chosen: Chosen) -> list[StepDerivatives]:
     model, vector = steps.model, steps.vector
     _check_derivatives(model, chosen.values)
     nx, end, names = model.nx, model.nx + model.nu, vector.names
-    x_next, values = frozen(steps.x_next), frozen(chosen.values)  # what is taken of them is read-only too
+    x_next, values = frozen(steps.x_next), frozen(chosen.values)  # their views are read-only too
     derivatives, rows = [], zip(x_next, values, chosen.methods, chosen.reasons, strict=True)
     for end_state, jacobian, used, reason in rows:
         A, B, C = jacobian[:, :nx], jacobian[:, nx:end], jacobian[:, end:]
@@ -191,13 +191,13 @@ def _derivatives_of(steps: Steps, chosen: Chosen) -> list[StepDerivatives]:
 
 
 def _check_derivatives(model: Model, jacobians: Array) -> None:
-    """Refuse a derivative by x or u that is not finite or implausibly large, and by a parameter that is not finite."""
-    values: Any = jacobians  # NumPy 2.5 has no types for its methods, and np.min takes twice as long at every step
+    """Raise GradientError if a derivative is not finite or, with respect to x or u, implausibly large."""
+    values: Any = jacobians  # NumPy 2.5 has no types for its methods, and np.min takes twice as long
     if values.min(initial=0.0) >= -MAGNITUDE_BOUND and values.max(initial=0.0) <= MAGNITUDE_BOUND:
         return
     jacobian = jacobians.reshape(-1, jacobians.shape[2])
     bound = np.full(jacobian.shape[1], MAGNITUDE_BOUND)
-    bound[model.nx + model.nu :] = np.finfo(float).max  # its size is a matter of the parameter's unit
+    bound[model.nx + model.nu :] = np.finfo(float).max  # the magnitude depends on the parameter's unit
     size = np.where(np.isfinite(jacobian), np.abs(jacobian), np.inf) / bound
     if size.size and size.max() > 1:
         row, column = divmod(int(np.argmax(size)), size.shape[1])

@@ -1,4 +1,4 @@
-"""N discrete steps of a model, the one argument of every source of derivatives; and what a source answers."""
+"""N discrete steps of a model, the argument of every source of derivatives, and the result of a source."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,16 +15,16 @@ from drake_diff.model.parameters import ParameterVector
 from drake_diff.model.step import advance, set_state
 
 Flags = NDArray[np.bool_]
-TOUCHES, FREE = (np.array([touches]) for touches in (True, False))  # of one step, made once
+TOUCHES, FREE = (np.array([touches]) for touches in (True, False))  # `touching` of one step, allocated once
 
 
 class NotSmoothError(GradientError):
-    """Something acts in a step, contact or a limit, that a source of derivatives leaves out."""
+    """A force acts in a step, such as contact or a limit, that a source of derivatives does not include."""
 
 
-@dataclass(eq=False, slots=True)  # not frozen: that takes four times as long to make, at every single step
+@dataclass(eq=False, slots=True)  # not frozen, as a frozen dataclass takes four times as long to construct
 class Steps:
-    """N steps from `xs` under `us` to `x_next`; N = 1 included. The vector's values are applied to the model."""
+    """N steps from `xs` under `us` to `x_next`, with N >= 1. The vector's values are applied to the model."""
 
     model: Model
     vector: ParameterVector
@@ -32,32 +32,32 @@ class Steps:
     us: Array  # (N, nu)
     x_next: Array  # (N, nx)
     touching: Flags  # (N,) whether a contact acts
-    taken: bool = True  # False where `x_next` is the caller's word and Drake was not asked
+    taken: bool = True  # False if `x_next` was given by the caller and not computed by Drake
 
     def __len__(self) -> int:
         return len(self.xs)
 
     @property
     def width(self) -> int:
-        """nx + nu + np, the columns of a Jacobian."""
+        """The number of columns of a Jacobian, nx + nu + np."""
         return self.model.nx + self.model.nu + len(self.vector.values)
 
     @property
     def some_touch(self) -> bool:
-        """Whether a contact acts in any of them."""
+        """Whether a contact acts in any of the steps."""
         return self.touching is not FREE and bool(np.count_nonzero(self.touching))  # a sixth of the time of any()
 
     def subset(self, which: NDArray[np.intp]) -> "Steps":
-        """Some of the steps."""
+        """Return the steps with the indices `which`."""
         if len(which) == len(self.xs):
             return self
         xs, us, x_next, touching = self.xs[which], self.us[which], self.x_next[which], self.touching[which]
         return Steps(self.model, self.vector, xs, us, x_next, touching, self.taken)
 
     def stand_at(self, k: int) -> None:
-        """Put the double twin's context at the state of step k, where it does not stand there anyway.
+        """Set the double twin's context to the state of step k, unless it already has this state.
 
-        Setting a state makes Drake forget what it computed in it, so that is done only where it must be.
+        Setting a state invalidates Drake's cache, so it is done only if necessary.
         """
         twin, x = self.model.double, self.xs[k]
         if twin.state().tobytes() != x.tobytes():
@@ -65,14 +65,14 @@ class Steps:
 
 
 def take_step(model: Model, vector: ParameterVector, x: Array, u: Array) -> Steps:
-    """Drake's one step from x (nx,) under u (nu,)."""
+    """Take one step of Drake from x (nx,) under u (nu,)."""
     x_next = advance(model.double, x, u)
     touches = model.contract.contact.collision_pairs > 0 and model.double.touches()
     return Steps(model, vector, x[None], u[None], x_next[None], TOUCHES if touches else FREE)
 
 
 def take_steps(model: Model, vector: ParameterVector, x0: Array, us: Array, xs: Array | None = None) -> Steps:
-    """Drake's steps from x0 (nx,) under us (N, nu), one after the other, or from each of xs (N, nx)."""
+    """Take Drake's steps from x0 (nx,) under us (N, nu), one after the other, or from each of xs (N, nx)."""
     can_touch = model.contract.contact.collision_pairs > 0
     starts, ends = np.empty((len(us), model.nx)), np.empty((len(us), model.nx))
     touching = np.zeros(len(us), dtype=bool)
@@ -85,7 +85,7 @@ def take_steps(model: Model, vector: ParameterVector, x0: Array, us: Array, xs: 
 
 
 def known_steps(model: Model, vector: ParameterVector, xs: Array, us: Array, x_next: Array) -> Steps:
-    """Steps of which the caller says where they lead: Drake is asked only what overlaps in xs (N, nx)."""
+    """Return steps with end states from the caller; Drake only computes which geometries overlap at xs (N, nx)."""
     touching = np.zeros(len(us), dtype=bool)
     if model.contract.contact.collision_pairs:
         for k, x in enumerate(xs):
@@ -96,10 +96,10 @@ def known_steps(model: Model, vector: ParameterVector, xs: Array, us: Array, x_n
 
 @dataclass(eq=False, slots=True)
 class Jacobians:
-    """(N, nx, nx + nu + np) the derivatives of N steps by [x; u; parameters].
+    """The derivatives (N, nx, nx + nu + np) of N steps with respect to [x; u; parameters].
 
-    `refused` has the steps that the source does not know, and why; what stands in `values` for them means nothing.
-    `notes` has what there is to say of others. The column of the time step is in `values` where it is `timed`.
+    `refused` maps the steps that the source does not support to the reasons. Their entries of `values` are undefined.
+    `notes` are remarks on other steps. If `timed`, `values` includes the column of the time step.
     """
 
     values: Array
@@ -108,7 +108,7 @@ class Jacobians:
     timed: bool = False
 
     def put(self, which: NDArray[np.intp], result: "Jacobians | Refusal") -> None:
-        """Take over those of some of the steps, or why these are refused."""
+        """Store the results of some of the steps, or the reason why they are refused."""
         steps = which.tolist()
         if isinstance(result, Refusal):
             self.refused |= {k: NotSmoothError(result.reason) for k in steps}
@@ -122,24 +122,24 @@ class Jacobians:
 
 @dataclass
 class SourceTrial:
-    """How many steps of one kind a source is still to be compared on, or why it knows none of them."""
+    """The comparison of a source with a reference on steps of one kind."""
 
-    left: int
-    refusal: str = ""
-    note: str = ""  # what it was compared with
+    left: int  # number of steps that remain to be compared
+    refusal: str = ""  # why the source is refused for this kind of steps
+    note: str = ""  # the reference of the comparison
 
 
 class Source(Protocol):
-    """One way to the Jacobians of steps."""
+    """A method that computes the Jacobians of steps."""
 
     @property
     def name(self) -> str:
-        """What `method` calls it."""
+        """The name of the source as a value of `method`."""
         ...
 
     def differentiate(self, steps: Steps) -> Jacobians | Refusal:
-        """The Jacobians of the steps, or why this source has none of any step of the model.
+        """Return the Jacobians of the steps, or a Refusal if the source supports no step of the model.
 
-        ModelError is raised where the model has no AutoDiffXd twin and the source needs one.
+        Raises ModelError if the source needs an AutoDiffXd twin and the model has none.
         """
         ...

@@ -1,4 +1,4 @@
-"""The tree of bodies written out without Drake: kinematics, dynamics and their derivatives, distances."""
+"""Kinematics, dynamics and distances of a tree of bodies, and their derivatives, implemented without Drake."""
 
 from drake_diff._base import attach_stub as _attach_stub
 

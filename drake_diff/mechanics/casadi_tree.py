@@ -2,16 +2,16 @@
 
     r(q, v, a) = M(q) a + C(q, v) v - gravity - springs + D v,    r(q, v, dv/dt) = B u
 
-r by the recursive Newton-Euler algorithm, M by the composite-rigid-body algorithm (Featherstone, "Rigid Body Dynamics
-Algorithms", 2008, ch. 5 and 6), each body in a frame at its joint whose z axis is the joint's, so that most products
-are with zeros and ones and vanish. Derivatives of dv/dt = a(z) come from those of r, which is half as long:
+r is computed by the recursive Newton-Euler algorithm and M by the composite-rigid-body algorithm (Featherstone, "Rigid
+Body Dynamics Algorithms", 2008, ch. 5 and 6). Each body is described in a frame at its joint whose z axis is the joint
+axis, so that most products are with zeros and ones and vanish. The derivatives of dv/dt = a(z) are computed from the
+derivatives of r, whose expression is half as long:
 
     a_z = -M^-1 (r_z - B_z),    d^2 (w' a) = -(H_zz + H_za a_z + (H_za a_z)'),    H = d^2 (mu' r), mu = M^-1 w fixed
 
-Parameters of the model may be symbols too, at the end of the knot: z = [q, v, u, c], c their coordinates. What of r is
-quadratic in v and linear in a stays so.
-
-Whatever the tree leaves out shows in the comparison with Drake's plant, and the model is then refused.
+Parameters of the model may be symbols too. Their coordinates c are then the end of the knot: z = [q, v, u, c]. r
+remains quadratic in v and linear in a. The functions are compared with Drake's plant, and a model whose forces or
+constraints the tree does not include is refused.
 """
 
 from dataclasses import dataclass, replace
@@ -32,17 +32,17 @@ from drake_diff.model.parameters import ParameterCoordinates, ParameterVector, a
 from drake_diff.model.plant import actuators, labelled
 from drake_diff.model.step import set_state
 
-SAME_PLANT = 1e-9  # of the largest rate: rounding, as a badly conditioned mass matrix magnifies it
-ROUNDED = 1e-15  # of the frames' entries (sines of pi): zeros that would keep products alive
-TRIED = 0.1  # of a parameter's coordinate: how far away from its first value it is tried, too
+SAME_PLANT = 1e-9  # tolerance relative to the largest rate: rounding, magnified by a badly conditioned mass matrix
+ROUNDED = 1e-15  # smaller entries of the frames (sines of pi) are set to zero, so that their products vanish
+TRIED = 0.1  # the comparison moves each parameter's coordinate by up to this fraction of its first value
 Z = ca.DM([0, 0, 1])
 
 
 @dataclass(frozen=True, eq=False)
 class PlantFunctions:
-    """x' of a knot (nx,), its Jacobian, and the upper triangle of d^2 (weights' x').
+    """CasADi functions of a knot: x' (nx,), its Jacobian, and the upper triangle of d^2 (weights' x').
 
-    The last is of a knot, weights (nx,) and the Jacobian there, which a solver has by then: a third of the work.
+    The Hessian takes a knot, weights (nx,) and the Jacobian at the knot, which saves a third of the work.
     """
 
     function: Any
@@ -53,10 +53,10 @@ class PlantFunctions:
 def symbolic_plant(
     model: Model, vector: ParameterVector | None = None, coordinates: ParameterCoordinates | None = None
 ) -> PlantFunctions | Refusal:
-    """The equations of motion as SX functions, compared with Drake's plant at two states; or why there are none.
+    """Return the equations of motion as SX functions, compared with Drake's plant at two states, or a Refusal.
 
-    They are of the parameters `vector`, which `coordinates` makes the end of the knot. While parameters are applied
-    to the model there are none.
+    The functions use the parameters `vector`. With `coordinates`, the parameters' coordinates are the end of the knot.
+    A model to which other parameters are applied is refused.
     """
     if model.has_other_parameters:
         return Refusal("parameters are applied that are not the model's own")
@@ -98,7 +98,7 @@ def _compared(
 
 
 def _values(coordinates: ParameterCoordinates, c: Any) -> Any:
-    """(np,) the values of the parameters at the coordinates c, an SX: see `ParameterCoordinates.to_values`."""
+    """Return the parameters' values (np,) at the coordinates c, an SX. See `ParameterCoordinates.to_values`."""
     values = c * ca.DM(coordinates.scale)
     for s in coordinates.inertias:
         lower, (a, b, d, l10, l20, l21) = ca.SX.zeros(3, 3), ca.vertsplit(c[s])
@@ -125,11 +125,11 @@ def _functions(plant: "SymbolicTree", model: Model, c: Any, actuation: Any) -> P
     r, rows = residual(a), []
     for i in range(n):
         check_time()
-        rows.append(ca.gradient(r[i], knot).T)  # backwards: a fifth shorter than CasADi's own choice
+        rows.append(ca.gradient(r[i], knot).T)  # reverse mode: a fifth shorter than with CasADi's default choice
     pace.go_on()
     slopes = ca.Function("slopes", [knot, a], [ca.vertcat(*rows)])
     pace.go_on()
-    slope = ca.gradient(ca.dot(mu, r), ca.vertcat(q, v, a, c))  # of mu' r, linear in a, whose factor is of q and c
+    slope = ca.gradient(ca.dot(mu, r), ca.vertcat(q, v, a, c))  # mu' r is linear in a; its factor depends on q and c
     by_v = ca.jacobian(slope[n : 2 * n], v)
     pace.go_on()
     curves = ca.Function("curves", [knot, a, mu], [ca.jacobian(slope, q), by_v, ca.jacobian(slope, c)])
@@ -165,24 +165,24 @@ def _functions(plant: "SymbolicTree", model: Model, c: Any, actuation: Any) -> P
 
 @dataclass(frozen=True, eq=False)
 class _Link:
-    """A body in the frame at its joint: `rotation` and `offset` in the parent's at q = 0, and what it weighs."""
+    """A body in the frame at its joint. `rotation` and `offset` are the frame's pose in the parent's frame at q = 0."""
 
     parent: int  # -1: the world
-    kind: str  # of the joint
-    q: int  # where its positions start
-    v: int  # and its velocities
+    kind: str  # type of the joint
+    q: int  # index of the joint's first position
+    v: int  # index of the joint's first velocity
     rotation: Any
     offset: Any
     weight: tuple[Any, Any, Any]  # mass, mass times centre of mass, inertia about the joint's origin
 
     @property
     def dofs(self) -> range:
-        """Its degrees of freedom."""
+        """The joint's degrees of freedom."""
         return range(self.v, self.v + (6 if self.kind == "quaternion_floating" else 1))
 
 
 class SymbolicTree:
-    """The numbers of a tree, of which `move` makes some symbols."""
+    """The numeric data of a tree. `move` replaces some entries by symbols."""
 
     def __init__(self, tree: TreeModel):
         self.tree = tree
@@ -206,11 +206,11 @@ class SymbolicTree:
         return _Link(link.parent, link.joint.kind, link.joint.q_start, link.joint.v_start, rotation, offset, weight)
 
     def at(self, q: Any, v: Any) -> "MovingTree":
-        """The tree at the SX columns q (nq,) and v (nv,)."""
+        """Return the tree at the SX columns q (nq,) and v (nv,)."""
         return MovingTree(self, q, v)
 
     def move(self, model: Model, vector: ParameterVector, values: Any) -> str:
-        """Set the parameters of `vector` to `values` (np,), an SX; the name of one that it does not know, or ""."""
+        """Set the parameters of `vector` to `values` (np,), an SX; return the first unsupported one's name or ""."""
         given: dict[tuple[str, str], Any] = {(p.label, p.kind.quantity): values[s] for p, s in vector.pairs}
         springs = springs_of(model.plant)
         listed = read_links(model.plant, {} if isinstance(springs, Refusal) else springs)
@@ -231,7 +231,7 @@ class SymbolicTree:
         return ""
 
     def _shift(self, joint: Link, value: Any) -> None:
-        """Put a joint to `value` (3,) on its parent."""
+        """Set the translation of a joint's frame on the parent body to `value` (3,)."""
         k = next(k for k, link in enumerate(self.tree.links) if link.joint.joint == joint.joint)
         carrier, pose = self.tree.on[joint.parent]
         turn = (np.eye(3) if carrier < 0 else self.turns[carrier]).T @ pose.rotation().matrix()
@@ -239,7 +239,7 @@ class SymbolicTree:
         self.links[k] = replace(self.links[k], offset=self.links[k].offset + moved)
 
     def _reflect(self, model: Model, given: dict[tuple[str, str], Any]) -> None:
-        """The rotor inertia of each joint whose motors are among what is given."""
+        """Set the reflected inertia of each joint whose motors have a parameter in `given`."""
         labels = {a.index(): label for label, a in labelled(actuators(model.plant)).items()}
         moved = [a for a in actuators(model.plant) if any((labels[a.index()], q) in given for q in OF_MOTORS)]
         for index in {a.joint().index() for a in moved}:
@@ -252,7 +252,7 @@ class SymbolicTree:
             self.reflected[model.plant.get_joint(index).velocity_start()] = total
 
     def _weigh(self, listed: list[Link], labels: set[str], given: dict[tuple[str, str], Any]) -> None:
-        """What the bodies `labels` weigh, on the links that carry them."""
+        """Update the inertial quantities of the links that carry the bodies `labels`."""
         for body in listed:
             k, pose = self.tree.on[body.body]
             if body.body not in labels or k < 0:
@@ -278,13 +278,13 @@ OF_MOTORS = ("gear_ratio", "rotor_inertia")
 
 
 def _weight(mass: Any, center: Any, inertia: Any, *, about_center: bool) -> tuple[Any, Any, Any]:
-    """Mass, mass times centre of mass, and inertia about the body's origin."""
+    """Return the mass, the mass times the centre of mass, and the inertia about the body's origin."""
     h, C = mass * center, ca.skew(center)
     return mass, ca.SX(h), ca.SX(inertia) - mass * C @ C if about_center else ca.SX(inertia)
 
 
 def _weight_of(body: Link, given: dict[tuple[str, str], Any]) -> tuple[Any, Any, Any]:
-    """That of a body with parameters, as Drake takes them: see `parameter_kinds`."""
+    """Return the `_weight` of a body whose parameters follow Drake's conventions. See `parameter_kinds`."""
     mass = given.get((body.body, "mass"), ca.SX(body.mass))
     center = given.get((body.body, "center_of_mass"), ca.SX(ca.DM(body.center_of_mass)))
     if (body.body, "inertia") in given:
@@ -295,13 +295,13 @@ def _weight_of(body: Link, given: dict[tuple[str, str], Any]) -> tuple[Any, Any,
     about_origin = _weight(body.mass, ca.DM(body.center_of_mass), ca.DM(body.inertia), about_center=True)[2]
     return _weight(
         mass, center, mass * about_origin / body.mass if body.mass else about_origin, about_center=False
-    )  # its unit inertia
+    )  # the unit inertia is constant
 
 
 def _regrouped(links: list[_Link]) -> list[_Link]:
-    """The same motion with less to compute: inertia that the joint's motion does not show is put on the parent.
+    """Move inertia that does not affect the joint's motion to the parent, to shorten the expressions.
 
-    Of a hinged body that is diag(Iyy, Iyy, 0), the mass, and the moment of the mass along the axis (Gautier
+    For a hinged body these are diag(Iyy, Iyy, 0), the mass, and the moment of the mass along the axis (Gautier
     and Khalil, "Direct calculation of minimum set of inertial parameters of serial robots", IEEE Transactions on
     Robotics and Automation 6(3), 1990).
     """
@@ -321,7 +321,7 @@ def _regrouped(links: list[_Link]) -> list[_Link]:
 
 
 def _moved(weight: Any, R: Any, p: Any) -> Any:
-    """The weight of a body in the frame that its own lies in at R, p."""
+    """Return a body's `_weight` in the frame in which the body's frame has rotation R and origin p."""
     m, h, inertia = weight
     turned, P = R @ h, ca.skew(p)
     H = ca.skew(turned)
@@ -333,7 +333,7 @@ def _sum(a: Any, b: Any) -> Any:
 
 
 class MovingTree:
-    """A `SymbolicTree` at q and v: where its bodies are, its mass matrix, and its inverse dynamics."""
+    """A `SymbolicTree` at q and v: the poses of its bodies, its mass matrix, and its inverse dynamics."""
 
     def __init__(self, plant: SymbolicTree, q: Any, v: Any):
         self.plant, self.q, self.v, self.nv = plant, q, v, v.numel()
@@ -344,7 +344,7 @@ class MovingTree:
             self.all_q, self.all_v = self.spread @ q + ca.DM(coupling.offset), self.spread @ v
         self.links = _regrouped(plant.links)
         self.frames: list[tuple[Any, Any]] = []  # rotation and origin in the parent's frame
-        self.motions: list[tuple[list[Any], list[Any]]] = []  # each dof, angular and linear
+        self.motions: list[tuple[list[Any], list[Any]]] = []  # angular and linear motion of each dof
         for link in self.links:
             frame, motion = self._joint(link)
             self.frames.append(frame)
@@ -365,7 +365,7 @@ class MovingTree:
 
     @property
     def position_rates(self) -> Any:
-        """(nq,) q' of a tree without coupling."""
+        """The rates q' (nq,) of a tree without coupling."""
         rates = ca.SX.zeros(self.q.numel())
         for link in self.links:
             if link.kind != "quaternion_floating":
@@ -377,7 +377,7 @@ class MovingTree:
         return rates
 
     def residual(self, a: Any) -> Any:
-        """(nv,) r at the acceleration a (nv,)."""
+        """Return r (nv,) at the acceleration a (nv,)."""
         plant, a = self.plant, self.spread @ a
         motion = self._inverse_dynamics(a) + plant.reflected * a + plant.damping * self.all_v
         return self.spread.T @ (motion + plant.stiffness * self._stretch())
@@ -391,7 +391,7 @@ class MovingTree:
         return stretched
 
     def mass(self) -> Any:
-        """(nv, nv): column k are the forces that the bodies which joint k carries need for its acceleration alone."""
+        """Return the mass matrix (nv, nv); column k holds the forces of a unit acceleration of degree of freedom k."""
         carried, n = [link.weight for link in self.links], self.all_v.numel()
         mass = ca.SX.zeros(n, n)
         for k in reversed(range(len(self.links))):
@@ -410,7 +410,7 @@ class MovingTree:
         return self.spread.T @ (mass + ca.diag(self.plant.reflected)) @ self.spread
 
     def _inverse_dynamics(self, acceleration: Any) -> Any:
-        """(n,) the joints' forces of the bodies' inertia and weight: motion outwards, forces inwards."""
+        """Return the joint forces (n,) due to inertia and gravity: motion is propagated outwards, forces inwards."""
         zero = ca.DM(3, 1)
         motions: dict[int, Any] = {-1: (zero, zero, -self.plant.gravity)}
         forces: list[Any] = []
@@ -442,9 +442,9 @@ class MovingTree:
 
     @cached_property
     def _in_world(self) -> tuple[list[tuple[Any, Any]], list[list[int]], Any]:
-        """Of each link rotation and origin, and the dofs that move it; and (6, nv) the motion of each dof in world.
+        """Each link's rotation, origin and moving dofs, and the motion of each dof (6, nv), in world.
 
-        [angular; linear] about the world's origin.
+        The motion is [angular; linear] about the world's origin.
         """
         places: list[tuple[Any, Any]] = []
         above: list[list[int]] = []
@@ -462,11 +462,11 @@ class MovingTree:
 
     @property
     def S(self) -> Any:
-        """(6, nv) the motion of each degree of freedom at unit speed, [angular; linear] in world about its origin."""
+        """The motion (6, nv) of each dof at unit speed, [angular; linear] in world about the world's origin."""
         return self._in_world[2]
 
     def body(self, name: str) -> tuple[Any, Any, list[int]]:
-        """Rotation and origin of a body in world, and the degrees of freedom that move it."""
+        """Return the rotation and origin of a body in world, and the degrees of freedom that move it."""
         carrier, pose = self.plant.tree.on[name]
         R, p = ca.DM(pose.rotation().matrix()), ca.DM(pose.translation())
         if carrier < 0:
@@ -477,7 +477,7 @@ class MovingTree:
 
 
 def quaternion_rotation(q: Any) -> Any:
-    """(3, 3) of a quaternion (w, x, y, z) of any norm, as Drake reads one."""
+    """Return the rotation matrix (3, 3) of a quaternion (w, x, y, z) of any norm, in Drake's convention."""
     S, scale = ca.skew(q[1:]), 2 / ca.sumsqr(q)
     return ca.SX.eye(3) + scale * (q[0] * S + S @ S)
 
@@ -488,7 +488,7 @@ def _to_parent(force: Any, moment: Any, R: Any, p: Any) -> tuple[Any, Any]:
 
 
 def _with_z(axis: Array) -> Array:
-    """(3, 3): a rotation whose third column is the unit vector `axis` (3,); a permutation where it can be."""
+    """Return a rotation (3, 3) with third column `axis` (3,), a unit vector; a permutation if `axis` is a unit axis."""
     first = np.eye(3)[(int(np.argmax(np.abs(axis))) + 1) % 3]
     first = first - (first @ axis) * axis
     first /= np.linalg.norm(first)
@@ -496,7 +496,7 @@ def _with_z(axis: Array) -> Array:
 
 
 def agrees(function: Any, probe: Array, wanted: Array, tolerance: float) -> bool:
-    """Whether `function` gives `wanted` (P, m) at `probe` (P, nx + nu), relative to the largest value of each row."""
+    """Check if `function` equals `wanted` (P, m) at `probe` (P, nx + nu), relative to each row's largest value."""
     values = np.array([np.asarray(function(knot)).ravel() for knot in probe])
     if values.shape != wanted.shape:
         return False

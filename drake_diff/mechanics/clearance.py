@@ -1,13 +1,13 @@
-"""How far the shapes of a robot are from a ball, from a box and from each other, as functions of the state.
+"""Signed distances of the shapes of a robot from a ball, from a box and from each other, as functions of the state.
 
-Each is a function of x (nx,) in ordinary arithmetic, for floats, AutoDiffXd and symbols, with one number a row, and for
-many states at once `values`, and `linearize` with exact derivatives: the slope of a distance is that of its nearest
-points, held where they are on their pieces.
+Each function takes x (nx,) of floats, AutoDiffXd or symbols and returns one number per row. `values` and `linearize`
+evaluate many states at once, the latter with exact derivatives. The derivative of a distance is computed with the
+nearest points fixed on their pieces.
 
-From a ball and a box they are capsules that contain its shapes; from each other they are Drake's own shapes, see
-`OfShapes`. The formulas of points, segments and boxes have no branch; a capsule's distance is that of its segment less
-its radius. All are exact and continuous. Their slopes jump where another feature becomes the nearest one: nowhere for a
-point and a segment that are apart, between parallel segments, and on the planes inside a box that part its faces.
+For distances from a ball and a box, capsules that contain the robot's shapes are used. For self-collision, Drake's own
+shapes are used, see `OfShapes`. The formulas for points, segments and boxes have no branch. The distance of a capsule
+is the distance of its segment minus its radius. All distances are exact and continuous. Their derivatives jump only
+between parallel segments and, inside a box, on the planes equidistant to two faces.
 """
 
 from collections.abc import Sequence
@@ -26,20 +26,20 @@ from drake_diff.mechanics.quantities import PLACE
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
 
-TINY = 1e-24  # [m^2] keeps the slope of a length of 0 a number; it adds 1e-12 m at most
-PARALLEL = 1e-12  # of the squared sine of two segments' angle: less is 0
+TINY = 1e-24  # [m^2] keeps the derivative of a length finite at 0; it adds at most 1e-12 m
+PARALLEL = 1e-12  # regularization of the squared sine of the angle between two segments
 
 
 def length(v: Any) -> Any:
-    """(...) of vectors (..., 3)."""
+    """Return the lengths (...) of vectors (..., 3)."""
     return np.sqrt(_dot(v, v) + TINY)
 
 
 def along_segments(a: tuple[Any, Any], b: tuple[Any, Any], squared_a: Any, squared_b: Any) -> tuple[Any, Any]:
-    """Where each of two segments (start, end) is nearest to the other.
+    """Return the parameters in [0, 1] of the nearest points of two segments (start, end).
 
-    As in Ericson, "Real-Time Collision Detection", 2005, section 5.1.9.
-    For parallel ones these are two of the nearest places.
+    See Ericson, "Real-Time Collision Detection", 2005, section 5.1.9. For parallel segments, the points are one pair
+    of the nearest points.
     """
     u, v, r = a[1] - a[0], b[1] - b[0], a[0] - b[0]
     uv, ur, vr, product = _dot(u, v), _dot(u, r), _dot(v, r), squared_a * squared_b
@@ -50,7 +50,7 @@ def along_segments(a: tuple[Any, Any], b: tuple[Any, Any], squared_a: Any, squar
 
 
 def to_box(point: Any, half: Array) -> Any:
-    """(...) the signed distance of points (..., 3), in the frame of a box of half sizes (3,), from its surface."""
+    """Return the signed distance (...) of points (..., 3), in a box's frame, from the box of half sizes (3,)."""
     beyond = np.abs(point) - half
     outside = (beyond + np.abs(beyond)) / 2
     nearest = _larger(_larger(beyond[..., 0], beyond[..., 1]), beyond[..., 2])
@@ -58,7 +58,7 @@ def to_box(point: Any, half: Array) -> Any:
 
 
 def away_from_box(point: Array, half: Array) -> Array:
-    """(..., 3) the slope of `to_box`: the way in which the distance of a point grows."""
+    """Return the gradient (..., 3) of `to_box` with respect to the point."""
     beyond = np.abs(point) - half
     outside = np.maximum(beyond, 0.0)
     nearest = np.eye(3)[np.argmax(beyond, axis=-1)]
@@ -80,36 +80,36 @@ def _between_0_and_1(t: Any) -> Any:
 
 
 def _inverse(squared: Any) -> Array:
-    """Of a squared length, 0 of a point's."""
+    """Return the inverse of a squared length, or 0 if the length is 0."""
     return np.divide(1.0, squared, out=np.zeros_like(squared), where=squared > 0)
 
 
-BALL_PART = 0.1  # of a capsule's radius: how far the balls that it becomes beside a box stick out of it
+BALL_PART = 0.1  # fraction of a capsule's radius by which the balls that replace it for a box exceed it
 
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Pieces of a robot, in rows."""
+    """Pieces of a robot as arrays, one row per piece."""
 
-    at: Indices  # (m,) the link of each
-    start: Array  # (m, 3) [m] in its frame
+    at: Indices  # (m,) the link of each piece
+    start: Array  # (m, 3) [m] in the link's frame
     end: Array  # (m, 3)
     radius: Array  # (m,) [m]
-    squared: Array  # (m,) [m^2] the squared lengths
+    squared: Array  # (m,) [m^2] squared lengths of the segments
 
     def ends(self, frames: tuple[Any, Any]) -> tuple[Any, Any]:
-        """(..., m, 3) where the segments start and end in the world."""
+        """Return the start and end points (..., m, 3) of the segments in world."""
         R, p = frames[0][..., self.at, :, :], frames[1][..., self.at, :]
         return (R @ self.start[..., None])[..., 0] + p, (R @ self.end[..., None])[..., 0] + p
 
     def ways(self, frames: tuple[Array, Array]) -> Array:
-        """(K-1, m) [m] the longest of the straight ways of each piece's points, from frame to frame (K, ...)."""
+        """Return the largest displacement (K-1, m) [m] of each piece's points between successive frames (K, ...)."""
         far = [np.linalg.norm(np.diff(end, axis=0), axis=-1) for end in self.ends(frames)]
         return np.asarray(np.maximum(*far))
 
 
 def in_rows(pieces: Sequence[Piece]) -> Pieces:
-    """The same, in rows."""
+    """Convert pieces to arrays."""
     return Pieces(
         np.array([p.link for p in pieces], dtype=np.intp),
         np.array([p.start for p in pieces]).reshape(-1, 3),
@@ -120,27 +120,27 @@ def in_rows(pieces: Sequence[Piece]) -> Pieces:
 
 
 class Clearance:
-    """Signed distances [m] of a robot's pieces: `labels` (m,) tell what each row is of, `sides` its one or two."""
+    """Signed distances [m] of a robot's pieces. `labels` (m,) describe the rows, `sides` are the one or two pieces."""
 
     def __init__(self, model: Model, kinematics: ForwardKinematics, labels: Sequence[str], *sides: Pieces):
         self.model, self.kinematics, self.labels, self.sides = model, kinematics, tuple(labels), sides
 
     def __call__(self, x: Any) -> Any:
-        """(m,) [m] at x (nx,)."""
+        """Return the distances (m,) [m] at x (nx,)."""
         self.refuse_parameters()
         return self._distances(self.kinematics(np.asarray(x)[: self.model.nq]))
 
     def refuse_parameters(self) -> None:
-        """InputError where a parameter that distances depend on is changed."""
+        """Raise InputError if a parameter that the distances depend on is changed."""
         for quantity in sorted(self.model.other_quantities & PLACE):
             raise InputError("parameters", got=quantity, expected="parameters that do not change distances")
 
     def values(self, xs: Array) -> Array:
-        """(K, m) [m] at xs (K, nx)."""
+        """Return the distances (K, m) [m] at xs (K, nx)."""
         return np.asarray(self._distances(self.kinematics(xs[:, : self.model.nq])), dtype=float)
 
     def linearize(self, xs: Array) -> tuple[Array, Array]:
-        """(K, m) [m], and their derivatives by the state (K, m, nx), at xs (K, nx)."""
+        """Return the distances (K, m) [m] and their derivatives with respect to the state (K, m, nx), at xs (K, nx)."""
         q = xs[:, : self.model.nq]
         frames = self.kinematics(q)
         slopes = np.zeros((len(xs), len(self.labels), self.model.nx))
@@ -149,9 +149,9 @@ class Clearance:
         return np.asarray(self._distances(frames)), slopes
 
     def moved(self, xs: Array) -> Array:
-        """(K-1, m) [m] how far what each row is of moves from one of xs (K, nx) to the next: no distance changes more.
+        """Return upper bounds (K-1, m) [m] on the change of each distance between successive states xs (K, nx).
 
-        That is the longest of the straight ways of its points.
+        Each bound is the largest displacement of a point of the row's piece, summed over its sides.
         """
         frames = self.kinematics(xs[:, : self.model.nq])
         return np.asarray(sum(side.ways(frames) for side in self.sides))
@@ -160,14 +160,14 @@ class Clearance:
         raise NotImplementedError
 
     def _ways(self, frames: tuple[Array, Array]) -> Sequence[tuple[Array, Array]]:
-        """Of each side its nearest points (K, m, 3), and the ways in which the distances grow as these move."""
+        """Return, for each side, the nearest points (K, m, 3) and the gradients of the distances at these points."""
         raise NotImplementedError
 
 
 class FromBox(Clearance):
-    """Of balls from a box, at `center` (3,), turned by `rotation` (3, 3), of `half` its edges (3,) [m].
+    """Distances of balls from a box with `center` (3,), `rotation` (3, 3), and `half` of its edges' lengths (3,) [m].
 
-    Capsules become balls, see `balls_of`.
+    Capsules are replaced by balls, see `balls_of`.
     """
 
     def __init__(
@@ -184,7 +184,7 @@ class FromBox(Clearance):
         self.center, self.rotation, self.half = center, rotation, half
 
     def _within(self, frames: tuple[Any, Any]) -> tuple[Any, Any]:
-        """(..., m, 3) the balls' centres in the world and in the box's frame."""
+        """Return the balls' centres (..., m, 3) in world and in the box's frame."""
         points, _ = self.sides[0].ends(frames)
         return points, (points - self.center) @ self.rotation
 
@@ -197,7 +197,7 @@ class FromBox(Clearance):
 
 
 class OfPairs(Clearance):
-    """Of two capsules from each other, a row for each pair."""
+    """Distances between two capsules, one row per pair."""
 
     def __init__(
         self,
@@ -225,12 +225,12 @@ class OfPairs(Clearance):
 
 
 class OfShapes(Clearance):
-    """Of two shapes from each other, a row for each pair: Drake's signed distance, below 0 by the depth of an overlap.
+    """Drake's signed distances between two shapes, one row per pair; negative values are penetration depths.
 
-    The capsules around two shapes are never further apart than these. Where the capsules are further apart than `far`
-    their distance stands for that of the shapes, which takes a hundredth of the time; between `near` and `far` it goes
-    over into it. So no row is above the distance of its shapes, and those below `near` are that distance. Of meshes
-    Drake takes the convex hull. Of two balls or capsules ours is exact. Shapes that are only drawn are their capsules.
+    The distance of the capsules around two shapes is never larger than the distance of the shapes. Above `far`, the
+    capsules' distance is used, which takes a hundredth of the time. Between `near` and `far` the two are blended. So
+    no row exceeds the distance of its shapes, and rows below `near` equal it. Drake uses the convex hull of meshes. For
+    two balls or capsules the capsules' distance is exact. Illustration shapes are replaced by their capsules.
     """
 
     def __init__(
@@ -273,7 +273,7 @@ class OfShapes(Clearance):
         frames = self.kinematics(xs[:, : self.model.nq])
         far = np.zeros((len(xs) - 1, len(self.pairs)))
         for i, side in enumerate(self.sides):
-            corners = np.array([pair[i].corners for pair in self.pairs])  # (m, 8, 3), which contain it
+            corners = np.array([pair[i].corners for pair in self.pairs])  # (m, 8, 3) of bounding boxes
             R, p = frames[0][:, side.at], frames[1][:, side.at]
             far += np.max(
                 np.linalg.norm(np.diff(corners @ R.swapaxes(-1, -2) + p[:, :, None], axis=0), axis=-1), axis=-1
@@ -281,10 +281,10 @@ class OfShapes(Clearance):
         return far
 
     def _blended(self, xs: Array, least: Array, points: Array | None = None, way: Array | None = None) -> "_Blended":
-        """The rows (K, m) at xs (K, nx), of capsules with the distances `least` (K, m), and what slopes are made of.
+        """Return the blended rows (K, m) and their weights at xs (K, nx), from the capsules' distances `least` (K, m).
 
-        Fills, where they are given, the shapes' nearest `points` (2, K, m, 3) in the world, and the `way` (K, m, 3) in
-        which the distance grows as the first of them moves.
+        If given, `points` (2, K, m, 3) is filled with the shapes' nearest points in world, and `way` (K, m, 3) with the
+        gradient of the distance with respect to the first of them.
         """
         share = np.clip((self.far - least) / (self.far - self.near), 0.0, 1.0) * self.exact
         weight, slope = share**2 * (3 - 2 * share), -6 * share * (1 - share) / (self.far - self.near)
@@ -301,7 +301,7 @@ class OfShapes(Clearance):
                 in_a, in_b = query.GetPoseInWorld(a), query.GetPoseInWorld(b)
                 points[:, k, i] = in_a.multiply(pair.p_ACa), in_b.multiply(pair.p_BCb)
                 way[k, i] = pair.nhat_BA_W
-                if not np.all(np.isfinite(way[k, i])):  # of shapes that just touch
+                if not np.all(np.isfinite(way[k, i])):  # for shapes at distance 0
                     way[k, i] = in_a.translation() - in_b.translation()
                     way[k, i] /= length(way[k, i])
         return _Blended(
@@ -310,7 +310,7 @@ class OfShapes(Clearance):
 
 
 class _Blended(NamedTuple):
-    """Distances (K, m), and their derivatives by those of capsules and of shapes."""
+    """Distances (K, m), and their derivatives with respect to the distances of capsules and of shapes."""
 
     values: Array
     by_capsules: Array
@@ -320,21 +320,21 @@ class _Blended(NamedTuple):
 def from_ball(
     model: Model, kinematics: ForwardKinematics, pieces: Sequence[Piece], center: Array, radius: float
 ) -> OfPairs:
-    """The distances of capsules from a ball at `center` (3,) of a `radius` [m], which the world carries."""
+    """Return the distances of capsules from a ball fixed in world, with `center` (3,) and `radius` [m]."""
     ball = Piece("world", -1, center, center, radius, "sphere")
     return OfPairs(model, kinematics, [(piece, ball) for piece in pieces], [piece.body for piece in pieces])
 
 
 class Swept(Clearance):
-    """Another clearance, where the positions were `before` (p,) [s], at the velocities that they have now.
+    """Another clearance at the positions `before` (p,) [s] earlier, extrapolated with the current velocities.
 
-    That is the way of a semi-implicit step, but for the turning of a free body or a ball, which is left as it is.
+    This is the motion during a semi-implicit step, except that rotations of free bodies and ball joints stay constant.
     """
 
     def __init__(self, other: Clearance, before: Array):
         super().__init__(other.model, other.kinematics, other.labels * len(before))
         self.other, self.before = other, before
-        self.moves = np.zeros((other.model.nx, other.model.nx))  # the rates of the positions that are velocities
+        self.moves = np.zeros((other.model.nx, other.model.nx))  # 1 where a position's rate is a velocity
         for joint in joints(other.model.plant):
             q, v = other.model.places(joint)
             kind = joint.type_name()
@@ -367,11 +367,11 @@ class Swept(Clearance):
 
 
 def balls_of(piece: Piece) -> list[Piece]:
-    """Balls that contain a capsule and stick out of it by a tenth of its radius; a ball is itself."""
+    """Return balls that contain a capsule and exceed it by at most a tenth of its radius; a ball is unchanged."""
     half_length = float(np.sqrt(piece.squared)) / 2
     if half_length == 0:
         return [piece]
-    within = np.sqrt((1 + BALL_PART) ** 2 - 1) * piece.radius  # on both sides, a ball contains that much of the tube
+    within = np.sqrt((1 + BALL_PART) ** 2 - 1) * piece.radius  # half the length of the tube that one ball contains
     count = int(np.ceil(half_length / within))
     radius = float(np.hypot(piece.radius, half_length / count))
     centers = [piece.start + share * (piece.end - piece.start) for share in np.linspace(0, 1, count + 1)]

@@ -1,8 +1,8 @@
-"""What of a robot keeps clear of things: spheres and capsules that contain the shapes of its bodies.
+"""Spheres and capsules that contain the shapes of a robot's bodies, for clearance constraints.
 
-A body's collision shapes are covered, or those that are only drawn where it has none. A sphere and a capsule are taken
-as they are. Of other shapes a few capsules contain all. A body without any shape gets capsules from its joint to the
-next ones, a skeleton: that contains nothing for certain, and is told.
+The cover contains a body's collision shapes, or its illustration shapes if it has no collision shapes. Spheres and
+capsules are used unchanged. Other shapes are enclosed by a few capsules. A body without shapes gets capsules from its
+joint to the next joints, called a skeleton. A skeleton is not certain to contain the body, and is reported.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,32 +22,32 @@ from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, joints, labelled
 from drake_diff.model.triangles import read_mesh, scaled
 
-MOST_STRIPS = 4  # side by side, that cover a box
-MOST_SLABS = 4  # one after the other, that cover a hull or a mesh
-DRAKES_OWN = (".vtk", ".gltf")  # meshes that Drake alone reads: their hull is taken
+MOST_STRIPS = 4  # maximum number of parallel capsules that cover a box
+MOST_SLABS = 4  # maximum number of slabs along the axis of a hull or a mesh
+DRAKES_OWN = (".vtk", ".gltf")  # mesh formats that only Drake reads; the convex hull is used
 WHOLE_SHAPES: dict[str, Any] = {"contact": True, "contact_geometry": None, "meshes": "convex"}  # options of load_model
-WORTH_A_SLAB = 0.8  # of the volume: more slabs have to save that much
-CYLINDER_PART = 0.5  # of a cylinder's radius: how far before its ends a segment ends; it sticks out sideways by 12 %
-BONE_PART, BONE_RADII = 0.2, (0.01, 0.06)  # of its length, and the limits [m]: the radius of a skeleton's capsule
+WORTH_A_SLAB = 0.8  # another slab must reduce the volume to this fraction or less
+CYLINDER_PART = 0.5  # the segment ends this fraction of a cylinder's radius before its ends; 12 % sideways excess
+BONE_PART, BONE_RADII = 0.2, (0.01, 0.06)  # radius of a skeleton's capsule: fraction of its length, and limits [m]
 ROUNDING = 1e-9  # [m] added to a radius that is computed from corners
-WAYS = np.vstack([np.eye(3), -np.eye(3), np.random.default_rng(0).standard_normal((114, 3))])  # whose farthest points
+WAYS = np.vstack([np.eye(3), -np.eye(3), np.random.default_rng(0).standard_normal((114, 3))])  # search directions
 Around = tuple[Array, Array, float]  # the start, end and radius of a capsule
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A capsule of a `radius` [m] around the segment from `start` to `end` (3,) [m]; a sphere where they are one."""
+    """A capsule of `radius` [m] around the segment from `start` to `end` (3,) [m]; a sphere if both are equal."""
 
     body: str
-    link: int  # its place among the links of its ForwardKinematics, -1 for the world
+    link: int  # index of the link in the ForwardKinematics, -1 for the world
     start: Array  # in the link's frame
     end: Array
     radius: float
-    source: str  # the shape that it covers, such as "box", or "skeleton"
+    source: str  # the type of the covered shape, such as "box", or "skeleton"
 
     @property
     def squared(self) -> float:
-        """[m^2] the segment's length, squared."""
+        """The squared length of the segment [m^2]."""
         return float(np.sum((self.end - self.start) ** 2))
 
 
@@ -58,16 +58,16 @@ class Solid:
     body: str
     link: int
     pieces: tuple[Piece, ...]
-    geometry: Any  # Drake's, in `with_collision_shapes`; None of a shape that is only drawn and of a skeleton
+    geometry: Any  # Drake's geometry id in `with_collision_shapes`; None for an illustration shape or a skeleton
 
     @property
     def is_round(self) -> bool:
-        """Whether its piece is the shape."""
+        """Whether the piece is identical to the shape."""
         return self.pieces[0].source in ("sphere", "capsule")
 
     @property
     def corners(self) -> Array:
-        """(8, 3) of a box in the link's frame that contains it."""
+        """The corners (8, 3) of a bounding box in the link's frame."""
         ends = np.array([(p.start, p.end) for p in self.pieces])
         radii = np.array([p.radius for p in self.pieces])[:, None, None]
         low, high = np.min(ends - radii, axis=(0, 1)), np.max(ends + radii, axis=(0, 1))
@@ -76,7 +76,7 @@ class Solid:
 
 @dataclass(frozen=True)
 class Cover:
-    """The shapes of all bodies; `bare` are bodies that have none, `doubts` say what the pieces may not contain."""
+    """The shapes of all bodies. `bare` are bodies without shapes; `doubts` describe what the pieces may not contain."""
 
     solids: tuple[Solid, ...]
     bare: tuple[str, ...]
@@ -88,7 +88,7 @@ class Cover:
 
 
 def cover_of(model: Model, kinematics: ForwardKinematics) -> Cover:
-    """The cover of the shapes that `model` has."""
+    """Return the cover of the shapes of `model`."""
     return model.cache("cover", lambda: _cover(model, kinematics))
 
 
@@ -109,9 +109,9 @@ def _cover(model: Model, kinematics: ForwardKinematics) -> Cover:
 
 
 def with_collision_shapes(model: Model) -> Model:
-    """The model with the shapes that its file gives: what it touches with may be spheres inside them, or nothing.
+    """Rebuild the model with the shapes of its file, as its contact geometry may be smaller spheres or disabled.
 
-    A user's diagram has what it has.
+    A model made from a user's diagram is returned unchanged.
     """
     return model.changed(**WHOLE_SHAPES) if model.can_rebuild else model
 
@@ -130,9 +130,9 @@ def _doubts(pieces: Sequence[Piece], bare: Sequence[str]) -> Iterator[str]:
 
 
 def _of_shapes(model: Model, inspector: Any, body: Any, unread: list[str]) -> Iterator[tuple[Any, list[Piece]]]:
-    """The body's collision shapes, or those that are drawn where there are none, and their pieces in its frame.
+    """Yield the body's collision shapes, or else its illustration shapes, with their pieces in the body's frame.
 
-    A sentence is added to `unread` where shapes of a kind cannot be read.
+    A message is added to `unread` if the shapes of one of these roles cannot be read.
     """
     frame = model.plant.GetBodyFrameIdIfExists(body.index())
     if frame is None:
@@ -152,7 +152,7 @@ def _of_shapes(model: Model, inspector: Any, body: Any, unread: list[str]) -> It
 
 
 def _around(shape: Any, pose: RigidTransform) -> Iterator[Piece]:
-    """The pieces that contain a shape at `pose`; none of a half space, which no robot is made of."""
+    """Yield the pieces that contain a shape at `pose`; a half space is not part of a robot and gives no piece."""
     if isinstance(shape, HalfSpace):
         return
     for start, end, radius in pieces_around(shape):
@@ -160,7 +160,7 @@ def _around(shape: Any, pose: RigidTransform) -> Iterator[Piece]:
 
 
 def pieces_around(shape: Any) -> list[Around]:
-    """Capsules (start, end, radius) that contain a shape."""
+    """Return capsules (start, end, radius) that contain a shape."""
     z = np.array([0.0, 0.0, 1.0])
     if isinstance(shape, Sphere):
         return [(np.zeros(3), np.zeros(3), shape.radius())]
@@ -171,7 +171,7 @@ def pieces_around(shape: Any) -> list[Around]:
         return [((short - half) * z, (half - short) * z, float(np.hypot(shape.radius(), short)))]
     if isinstance(shape, Box):
         return _around_box(np.asarray(shape.size()))
-    if isinstance(shape, Ellipsoid):  # a capsule of the second axis, whose curvature at the tips is less
+    if isinstance(shape, Ellipsoid):  # a capsule with the second semi-axis as radius contains the sharper tips
         axes = np.array([shape.a(), shape.b(), shape.c()])
         longest = int(np.argmax(axes))
         radius = float(np.max(np.delete(axes, longest)))
@@ -183,7 +183,7 @@ def pieces_around(shape: Any) -> list[Around]:
 
 
 def _around_box(size: Array) -> list[Around]:
-    """Capsules along the longest edge, as many side by side as the second is longer than the third."""
+    """Return capsules along the longest edge; their number grows with the ratio of the second to the third edge."""
     c, b, a = np.argsort(size)
     count = int(np.clip(np.ceil(size[b] / max(size[c], 1e-12) / 1.5), 1, MOST_STRIPS))
     corner, short = np.hypot(size[b] / count, size[c]) / 2, size[c] / 2
@@ -193,7 +193,7 @@ def _around_box(size: Array) -> list[Around]:
 
 
 def _surface(shape: Any) -> tuple[Array, Indices]:
-    """Corners (n, 3) [m] of a mesh and its sides (e, 2), or those of the hull where Drake alone has the shape."""
+    """Return the vertices (n, 3) [m] and edges (e, 2) of a mesh, or of its hull if only Drake can read the shape."""
     source = shape.source() if isinstance(shape, Mesh) else None
     if source is not None and source.is_path() and source.extension() not in DRAKES_OWN:
         mesh = scaled(read_mesh(Path(source.path())), shape.scale3())
@@ -207,12 +207,12 @@ def _surface(shape: Any) -> tuple[Array, Indices]:
 
 
 def sides_of(triangles: Indices) -> Indices:
-    """(3 m, 2) the two corners of each side of triangles (m, 3)."""
+    """Return the two vertices (3 m, 2) of each edge of triangles (m, 3)."""
     return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
 
 def around_mesh(corners: Array, sides: Indices) -> list[Around]:
-    """Capsules that contain a body whose surface has these corners (n, 3) and sides (e, 2), along its longest way."""
+    """Return capsules along the longest axis that contain a surface with vertices (n, 3) and edges `sides` (e, 2)."""
     used = corners[np.unique(sides)]
     axis = np.linalg.svd(used - np.mean(used, axis=0), full_matrices=False)[2][0]
     best: list[Around] = []
@@ -229,9 +229,9 @@ def _volume(pieces: Sequence[Around]) -> float:
 
 
 def _slabs(corners: Array, sides: Array, axis: Array, count: int) -> list[Array]:
-    """A surface cut across `axis` into `count` slabs: the corners (n, 3) of each, and where `sides` (e, 2, 3) are cut.
+    """Cut a surface across `axis` into `count` slabs; return each slab's vertices and the cut points of its edges.
 
-    What is inside a surface is, slab by slab, within the hulls of these.
+    The edges are `sides` (e, 2, 3). The convex hulls of the slabs contain the interior of the surface.
     """
     heights, ends = corners @ axis, sides @ axis
     slabs = []
@@ -246,7 +246,7 @@ def _slabs(corners: Array, sides: Array, axis: Array, count: int) -> list[Array]
 
 
 def _around_slab(points: Array) -> Around:
-    """The slimmest of some capsules that contain `points`."""
+    """Return the capsule of least volume, among candidate axes, that contains `points`."""
     outer = points[np.unique(np.argmax(points @ WAYS.T, axis=0))]
     turned = np.linalg.svd(outer - np.mean(outer, axis=0), full_matrices=False)[2]
     tried = [_capsule_along(outer, axis) for axis in (*np.eye(3), *turned)]
@@ -255,28 +255,28 @@ def _around_slab(points: Array) -> Around:
 
 
 def _capsule_along(points: Array, axis: Array) -> Around:
-    """A capsule along `axis` that contains `points` (P, 3)."""
+    """Return a capsule along `axis` that contains `points` (P, 3)."""
     across = np.linalg.svd(axis[None])[2][1:]  # (2, 3)
     flat, heights = points @ across.T, points @ axis
     middle = _circle(flat)
     off = np.linalg.norm(flat - middle, axis=1)
-    spare = np.sqrt(np.maximum(np.max(off) ** 2 - off**2, 0.0))  # powers of one number and of arrays round apart
+    spare = np.sqrt(np.maximum(np.max(off) ** 2 - off**2, 0.0))  # scalar and array powers may round differently
     low, high = float(np.min(heights + spare)), float(np.max(heights - spare))
-    if low > high:  # a sphere: its centre anywhere in between contains all
+    if low > high:  # a sphere with its centre anywhere in between contains all points
         low = high = (low + high) / 2
     start, end = (middle @ across + height * axis for height in (low, high))
     return start, end, _radius(start, end, points)
 
 
 def _radius(start: Array, end: Array, points: Array) -> float:
-    """[m] that of the capsule around a segment that contains `points` (P, 3)."""
+    """Return the radius [m] of the capsule around a segment that contains `points` (P, 3)."""
     way = end - start
     share = np.clip((points - start) @ way / max(float(way @ way), 1e-300), 0, 1)
     return float(np.max(np.linalg.norm(points - start - share[:, None] * way, axis=1))) + ROUNDING
 
 
 def _circle(points: Array) -> Array:
-    """(2,) nearly the centre of the smallest circle around `points` (P, 2): steps to the farthest, ever shorter."""
+    """Approximate the centre (2,) of the smallest circle around `points` (P, 2), by shrinking steps to the farthest."""
     center = (np.min(points, axis=0) + np.max(points, axis=0)) / 2
     for k in range(1, 101):  # Badoiu and Clarkson (2003)
         far = points[int(np.argmax(np.sum((points - center) ** 2, axis=1)))]
@@ -285,9 +285,9 @@ def _circle(points: Array) -> Array:
 
 
 def _skeleton(model: Model, body: Any) -> Iterator[Piece]:
-    """Capsules from where a body is carried to the joints that it carries, or to its centre of mass, in its frame.
+    """Yield capsules from a body's joint to its child joints, or to its centre of mass, in the body's frame.
 
-    None of a body that the world carries, and none of a frame: no mass and nothing to carry.
+    A body fixed to the world, and a frame without mass and child joints, have no capsules.
     """
     if model.plant.IsAnchored(body):
         return

@@ -1,7 +1,7 @@
-"""The tree of a finalized Drake plant as plain numbers, link by link: what other engines are built from.
+"""The tree of a finalized Drake plant as plain numbers, link by link, from which models of other engines are built.
 
-`describe` reads links as Drake has them, welds included. `rigid_links` merges what is welded together, for engines and
-formulas that go joint by joint; `joint_contracts` gives the same in one frame, to compare engines by.
+`describe` reads the links as they are in Drake, welds included. `rigid_links` merges welded links, for engines and
+formulas that work joint by joint. `joint_contracts` returns the merged links in one frame, to compare engines.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,16 +22,16 @@ from drake_diff.model.plant import actuators, bodies, instances, joints, labelle
 
 MOVING = ("revolute", "prismatic", "quaternion_floating")
 SHAPES = ("Sphere", "Box", "Cylinder", "Capsule", "HalfSpace")
-MATERIAL = ("friction", "stiffness", "dissipation", "relaxation_time")  # of one side of a contact
+MATERIAL = ("friction", "stiffness", "dissipation", "relaxation_time")  # properties of one geometry of a contact
 T = TypeVar("T")
 Part = tuple[float, Array, Array]  # mass [kg], centre of mass (3,) [m], inertia (3, 3) about it [kg m^2]
 
 
 @dataclass(frozen=True)
 class JointContract:
-    """One joint and what it carries by welds, in the world frame where q = 0 (a free body at the origin, unturned).
+    """One joint and its link with all welded bodies, in world at q = 0 (a free body at the origin, not rotated).
 
-    Axis and anchor of all joints in one configuration, with masses and inertias there, are the whole tree.
+    The axes and anchors of all joints in one configuration, with the masses and inertias, describe the whole tree.
     """
 
     name: str
@@ -40,27 +40,27 @@ class JointContract:
     anchor: tuple[float, ...]  # a point on the axis [m], nearest to the origin; zero for a slide or a free body
     mass: float  # [kg]
     center_of_mass: tuple[float, ...]  # [m]
-    inertia: tuple[float, ...]  # xx yy zz xy xz yz about it [kg m^2]
+    inertia: tuple[float, ...]  # xx yy zz xy xz yz about the centre of mass [kg m^2]
     damping: float = 0.0  # [N s/m or N m s/rad]
-    armature: float = 0.0  # what is added to the diagonal of M: rotor inertia times gear ratio squared
+    armature: float = 0.0  # added to the diagonal of M: rotor inertia times gear ratio squared
     stiffness: float = 0.0  # of a spring [N/m or N m/rad]
-    rest: float = 0.0  # its rest position [m or rad]
-    lower: float = -np.inf  # of the position
+    rest: float = 0.0  # rest position of the spring [m or rad]
+    lower: float = -np.inf  # position limits
     upper: float = np.inf
 
 
 @dataclass(frozen=True)
 class GeometryContract:
-    """A geometry that can touch others, in the world frame where q = 0 (a free body at the origin, unturned).
+    """A geometry that can collide with others, in the world frame at q = 0 (a free body at the origin, not rotated).
 
-    `position` is its centre, and of a half space the point of its plane that is nearest to the origin. `directions` has
-    no more than the shape: nothing of a sphere, the normal of a half space, a a' of the axis a of a cylinder or capsule
-    and R diag(sizes^2) R' of a box or ellipsoid (3 by 3, its upper half: xx yy zz xy xz yz).
+    `position` is the centre, or for a half space the point of its plane nearest to the origin. `directions` has the
+    same symmetries as the shape: it is empty for a sphere, the normal for a half space, a a' with the axis a for a
+    cylinder or capsule, and R diag(sizes^2) R' for a box or ellipsoid (of matrices (3, 3): xx yy zz xy xz yz).
     """
 
     name: str
     carrier: str  # the moving joint that carries it, or "world"
-    kind: str  # as Drake names shapes, such as Sphere
+    kind: str  # Drake's name of the shape, such as Sphere
     sizes: tuple[float, ...]  # [m]
     position: tuple[float, ...]  # [m]
     directions: tuple[float, ...]
@@ -68,21 +68,21 @@ class GeometryContract:
 
 @dataclass(frozen=True)
 class PairContract:
-    """Two geometries that may touch; None is a value that the model does not give, or that the engine does not have."""
+    """Two geometries that may collide; a value is None if the model does not define it or the engine lacks it."""
 
     names: tuple[str, str]
     friction: float | None
-    stiffness: float | None  # [N/m] of both sides together, where it rests
-    dissipation: float | None = None  # Hunt and Crossley's [s/m]: similar and lagged contact
-    relaxation_time: float | None = None  # [s] damping by stiffness: sap contact
-    critical_time: float | None = None  # [s] the relaxation time at which the engine's own law is damped critically
-    margin: float = 0.0  # [m] how far apart they begin to push each other
-    more: tuple[tuple[str, float], ...] = ()  # what Drake's contact does not have, by name
+    stiffness: float | None  # [N/m] combined stiffness of both geometries, at rest
+    dissipation: float | None = None  # Hunt-Crossley dissipation [s/m]: similar and lagged contact
+    relaxation_time: float | None = None  # [s] damping over stiffness: sap contact
+    critical_time: float | None = None  # [s] relaxation time at which the engine's contact law is critically damped
+    margin: float = 0.0  # [m] distance at which the contact force begins
+    more: tuple[tuple[str, float], ...] = ()  # (name, value) of parameters that Drake's contact does not have
 
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """A body and the joint that carries it; poses are those of the joint's frames in the two bodies."""
+    """A body and the joint that carries it; the poses are the joint's frames in the parent and in the body."""
 
     body: str
     parent: str  # "world" or another link's body
@@ -90,12 +90,12 @@ class Link:
     kind: str  # weld or one of MOVING
     on_parent: RigidTransform
     on_child: RigidTransform
-    axis: Array  # (3,) in the frames of the joint
+    axis: Array  # (3,) in the joint's frames
     q_start: int
     v_start: int
     mass: float
     center_of_mass: Array  # (3,) in the body
-    inertia: Array  # (3, 3) about it
+    inertia: Array  # (3, 3) about the centre of mass
     damping: float
     armature: float
     stiffness: float
@@ -112,12 +112,12 @@ class Geometry:
     body: str
     pose: RigidTransform
     shape: Any
-    material: Mapping[str, float] = field(default_factory=dict)  # what the model gives of MATERIAL
+    material: Mapping[str, float] = field(default_factory=dict)  # the properties in MATERIAL that the model defines
 
 
 @dataclass(frozen=True)
 class Follower:
-    """A joint that follows another: its q = ratio * q of `leader` + offset, and the leader follows none."""
+    """A joint that follows another: q = ratio * q_leader + offset. The leader is not a follower itself."""
 
     joint: str
     leader: str
@@ -137,10 +137,10 @@ class Description:
     inputs: tuple[str, ...]
     actuated: tuple[str, ...]  # the joint of each input
     effort_limits: Array
-    effort_sides: Array  # (nu, 2) the least and the greatest of each, which problems keep and steps do not
+    effort_sides: Array  # (nu, 2) lower and upper bound of each input, which problems enforce and steps do not
     geometries: tuple[Geometry, ...]
     pairs: tuple[PairContract, ...]
-    followers: tuple[Follower, ...] = ()  # of `describe_whole` alone
+    followers: tuple[Follower, ...] = ()  # only `describe_whole` sets these
 
     @property
     def moving(self) -> tuple[Link, ...]:
@@ -154,7 +154,7 @@ class Description:
         return Coordinates(free, single)
 
     def by_velocity(self, name: str) -> Array:
-        """(nv,) of a number that links have; 0 for free bodies."""
+        """Return the attribute `name` of the links in the order of v (nv,), with 0 for free bodies."""
         values = np.zeros(self.coordinates.nv)
         for link in self.moving:
             if link.kind != "quaternion_floating":
@@ -163,7 +163,7 @@ class Description:
 
     @property
     def actuation(self) -> Array:
-        """B (nv, nu)."""
+        """The actuation matrix B (nv, nu)."""
         B = np.zeros((self.coordinates.nv, len(self.inputs)))
         starts = {link.joint: link.v_start for link in self.moving}
         for i, joint in enumerate(self.actuated):
@@ -172,7 +172,7 @@ class Description:
 
 
 def coordinates_of(model: Model) -> Coordinates:
-    """Where the free bodies and the hinges and slides of `model` are in its state."""
+    """Return the indices in the state of the free bodies, the hinges and the slides of `model`."""
     places = [(joint, model.places(joint)) for joint in joints(model.plant)]
     starts = sorted((v.start, q.start, joint.num_velocities() == 6) for joint, (q, v) in places if len(v))
     free, single = (tuple((i, j) for j, i, six in starts if six == kind) for kind in (True, False))
@@ -180,7 +180,7 @@ def coordinates_of(model: Model) -> Coordinates:
 
 
 def describe(model: Model) -> Description:
-    """The description of `model`; ModelError, naming the element, where the plant has what no other engine is given."""
+    """Describe `model`; raise ModelError with the name of any element that is not supported for other engines."""
     refusals = [f"actuator {a.name()} has PD gains" for a in actuators(model.plant) if a.has_controller()]
     if model.num_constraints:
         refusals.append(
@@ -193,7 +193,7 @@ def describe(model: Model) -> Description:
 
 
 def describe_whole(model: Model) -> Description:
-    """As `describe`, of a model whose mimic joints are reduced too: with all joints, and which of them follow."""
+    """Describe `model` as `describe` does, but with reduced mimic joints included as joints and followers."""
     description, coupling = describe(model.whole), model.coupling
     if coupling is None:
         return description
@@ -207,7 +207,7 @@ def describe_whole(model: Model) -> Description:
 
 
 def describe_tree(model: Model) -> Description:
-    """As `describe`, PD control of the actuators and constraints left out."""
+    """Describe `model` as `describe` does, but ignore the PD control of the actuators and the constraints."""
     plant = model.plant
     refusals = [
         f"joint {j.name()} is of type {j.type_name()}" for j in joints(plant) if j.type_name() not in ("weld", *MOVING)
@@ -241,14 +241,14 @@ def describe_tree(model: Model) -> Description:
 
 
 def names_of(plant: Any) -> tuple[dict[Any, str], dict[Any, str]]:
-    """The names of bodies and of joints by index."""
+    """Return the names of bodies and of joints by index."""
     body_names = {body.index(): label for label, body in labelled(bodies(plant)).items()}
     body_names[plant.world_body().index()] = "world"
     return body_names, {joint.index(): label for label, joint in labelled(joints(plant)).items()}
 
 
 def springs_of(plant: Any) -> dict[Any, tuple[float, float]] | Refusal:
-    """Stiffness and rest position by joint; a Refusal where a force element is none of gravity and these springs."""
+    """Return (stiffness, rest position) by joint, or a Refusal if a force element is not gravity or a joint spring."""
     springs: dict[Any, tuple[float, float]] = {}
     for i in range(plant.num_force_elements()):
         element = plant.get_force_element(ForceElementIndex(i))
@@ -265,10 +265,10 @@ def springs_of(plant: Any) -> dict[Any, tuple[float, float]] | Refusal:
 
 
 def read_links(plant: Any, springs: dict[Any, tuple[float, float]], *, backwards: bool = False) -> list[Link]:
-    """Every link of a plant, parents before their children.
+    """Return every link of a plant, parents before their children.
 
-    With `backwards`, a weld, hinge or slide whose child is nearer to the world than its parent is turned around: the
-    link then moves the joint's parent, and its mass and inertia are not that body's.
+    With `backwards`, a weld, hinge or slide whose child is nearer to the world than its parent is reversed. The link
+    then moves the joint's parent, but its mass and inertia are not those of this body.
     """
     body_names, joint_names = names_of(plant)
     reflected = dict.fromkeys(joint_names, 0.0)
@@ -342,7 +342,7 @@ def _geometries(model: Model, body_names: dict[Any, str]) -> tuple[tuple[Geometr
 
 
 def _pair(inspector: Any, ids: Sequence[Any], names: tuple[str, str]) -> PairContract:
-    """What Drake makes of two sides: see `derivatives.contact.laws`."""
+    """Combine the properties of two geometries as Drake does. See `derivatives.contact.laws`."""
     read = {name: [proximity_property(inspector, i, name) for i in ids] for name in MATERIAL}
     known = {name: (float(a), float(b)) for name, (a, b) in read.items() if a is not None and b is not None}
     friction, stiffness = (_harmonic(known[name]) if name in known else None for name in ("friction", "stiffness"))
@@ -366,15 +366,15 @@ def _harmonic(sides: tuple[float, float]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class RigidLink:
-    """A moving link and what is welded to it, in the frame of its joint on it, which at q = 0 is `on_parent`."""
+    """A moving link and the bodies welded to it, in the child frame of its joint."""
 
     joint: Link
-    parent: int  # its place in `RigidLinks.links`, -1 for the world
-    on_parent: RigidTransform
+    parent: int  # index of the parent in `RigidLinks.links`, -1 for the world
+    on_parent: RigidTransform  # pose of the frame on the parent at q = 0
     axis: Array  # (3,) unit; zero for a free body
     mass: float
     center_of_mass: Array  # (3,)
-    inertia: Array  # (3, 3) about it
+    inertia: Array  # (3, 3) about the centre of mass
 
     @property
     def free(self) -> bool:
@@ -383,20 +383,20 @@ class RigidLink:
 
 @dataclass(frozen=True, eq=False)
 class RigidLinks:
-    """`links` has every parent before its children, and one tree after the other."""
+    """The links of a description without welds, every parent before its children, one tree after the other."""
 
     links: tuple[RigidLink, ...]
-    trees: tuple[range, ...]  # of places in `links`
-    geometries: tuple[tuple[int, Geometry], ...]  # the link's place (-1 for the world), the pose on it; SHAPES only
-    pairs: tuple[PairContract, ...]  # of these geometries
+    trees: tuple[range, ...]  # ranges of indices in `links`
+    geometries: tuple[tuple[int, Geometry], ...]  # (index of the link or -1 for the world, geometry); SHAPES only
+    pairs: tuple[PairContract, ...]  # pairs of `geometries`
     left_out: tuple[tuple[str, str], ...]  # the other pairs
-    anchored_energy: float  # [J] the potential energy of what is fixed to the world
+    anchored_energy: float  # [J] the potential energy of the bodies fixed to the world
 
 
 def rigid_links(description: Description) -> RigidLinks:
-    """The description without its welds.
+    """Merge the welded links of a description.
 
-    Raises ModelError for a free body whose joint's frames are not its own and the world's.
+    Raises ModelError if a free body is not joined to the world by its own frame.
     """
     for link in description.moving:
         is_identity = all(pose.IsExactlyIdentity() for pose in (link.on_parent, link.on_child))
@@ -424,10 +424,10 @@ def rigid_links(description: Description) -> RigidLinks:
 def without_welds(
     links: Sequence[Link],
 ) -> tuple[tuple[RigidLink, ...], dict[str, tuple[int, RigidTransform]], list[Part]]:
-    """The moving links with what is welded to them; where each body went; what is fixed to the world, in its frame.
+    """Return the moving links merged with their welded bodies, a map of bodies to links, and the parts fixed to world.
 
-    A body went to a place among the links (-1 for the world), with its pose there. The links of one tree come after
-    those of another.
+    The map gives for each body the index of its link (-1 for the world) and its pose on the link. The links of each
+    tree are contiguous. The parts are in the world frame.
     """
     tree = {"world": -1}
     for i, link in enumerate(links):
@@ -436,7 +436,7 @@ def without_welds(
     on: dict[str, tuple[int, RigidTransform]] = {"world": (-1, RigidTransform())}
     moving: list[tuple[Link, int, RigidTransform]] = []
     carried: dict[int, list[Part]] = {-1: []}
-    for link in sorted(links, key=lambda link: tree[link.body]):  # what is fixed to the world comes first
+    for link in sorted(links, key=lambda link: tree[link.body]):  # links fixed to the world come first
         parent, pose = on[link.parent]
         frame = pose @ link.on_parent
         if link.kind == "weld":
@@ -454,14 +454,14 @@ def without_welds(
 
 
 def _moved(body: Part, pose: RigidTransform) -> Part:
-    """A part in the frame that its own has this pose in."""
+    """Transform a part to the frame in which its own frame has the pose `pose`."""
     mass, center_of_mass, inertia = body
     R = pose.rotation().matrix()
     return mass, pose @ center_of_mass, R @ inertia @ R.T
 
 
 def joint_contracts(description: Description) -> tuple[JointContract, ...]:
-    """Each moving joint with what it carries by welds, in the world frame where q = 0, in the order of v."""
+    """Return each moving joint with its link and the welded bodies, in the world frame at q = 0, in the order of v."""
     frames: list[RigidTransform] = []
     contracts: dict[int, JointContract] = {}
     for link in without_welds(description.links)[0]:
@@ -479,7 +479,7 @@ def joint_contracts(description: Description) -> tuple[JointContract, ...]:
 
 
 def joint_contract(*, kind: str, axis: Array, anchor: Array, carried: list[Part], **rest: Any) -> JointContract:
-    """A JointContract from parts (mass, centre of mass (3,), inertia (3, 3) about it) in the world frame."""
+    """Make a JointContract from parts (mass, centre of mass (3,), inertia about it (3, 3)) in the world frame."""
     mass, com, total = merged(carried)
     i, j = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
     on_axis = anchor - axis * (axis @ anchor) if kind == "revolute" else np.zeros(3)
@@ -491,7 +491,7 @@ def joint_contract(*, kind: str, axis: Array, anchor: Array, carried: list[Part]
 
 
 def merged(parts: list[Part]) -> Part:
-    """Parts (mass, centre of mass (3,), inertia (3, 3) about it) as one."""
+    """Merge parts (mass, centre of mass (3,), inertia about it (3, 3)) into one."""
     mass = float(sum(m for m, _, _ in parts))
     com = sum((m * c for m, c, _ in parts), np.zeros(3)) / mass if mass else np.zeros(3)
     total = np.zeros((3, 3))
@@ -502,7 +502,7 @@ def merged(parts: list[Part]) -> Part:
 
 
 def split(given: Sequence[tuple[tuple[T, T], float]]) -> dict[T, float]:
-    """s with s_a + s_b = the value of each pair (a, b): the least squares' solution, the smallest where many are."""
+    """Solve s_a + s_b = value for each pair (a, b) by least squares; return the solution of minimum norm."""
     sides = list(dict.fromkeys(side for pair, _ in given for side in pair))
     sums = np.zeros((len(given), len(sides)))
     for row, (pair, _) in zip(sums, given, strict=True):

@@ -1,10 +1,10 @@
-"""A tree of hinges and slides with points that the world holds: equations of motion, the holding forces, an impact.
+"""Equations of motion, contact forces and impacts of a tree of hinges and slides with points fixed in the world.
 
     [M  -J'] [dv/dt ]   [B u - r(q, v, 0)]        [M  -J'] [v+    ]   [M v-]
     [J   0 ] [forces] = [-(dJ/dt) v      ],       [J   0 ] [impact] = [0   ]
 
 with the points' velocities J v (Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 8 and 11). Drake evaluates
-them for the motion that is judged; the same as CasADi expressions, compared with Drake's, is what a solver gets.
+these equations to check a trajectory. A solver uses the same equations as CasADi expressions, compared with Drake's.
 """
 
 from collections.abc import Callable
@@ -26,13 +26,13 @@ from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.model import Model
 from drake_diff.model.step import set_state
 
-NO_WAY = 1e-9  # of the largest: a direction in which no joint moves a point
-DEPENDENT = 1e-6  # of the largest: the least singular value of points that can be held one by one
-TRIED = 3  # states
+NO_WAY = 1e-9  # relative to the largest Jacobian entry: below this, no joint moves the coordinate
+DEPENDENT = 1e-6  # smallest allowed ratio of the singular values of the fixed coordinates' Jacobian
+TRIED = 3  # number of states at which the equations are compared
 
 
 class _Expression:
-    """An SX function of a knot, in any arithmetic."""
+    """An SX function of a knot, callable with floats, AutoDiffXd or Symbols."""
 
     def __init__(self, symbol: Any, value: Any):
         self.function = ca.Function("value", [symbol], [ca.densify(value)])
@@ -47,37 +47,37 @@ class _Expression:
 
 @dataclass(frozen=True, eq=False)
 class FixedContactPlant:
-    """What the equations come to for the `rows` of all points' coordinates that are held; see `fixed_contact_plant`."""
+    """The equations of motion with the coordinates `rows` of the points fixed; see `fixed_contact_plant`."""
 
     model: Model
     places: Callable[[Any], Any]  # x -> (P,) all coordinates of the points
-    speeds: Callable[[Any], Any]
-    rows: Indices  # (m,) of those, that some joint moves
+    speeds: Callable[[Any], Any]  # x -> (P,) their velocities
+    rows: Indices  # (m,) the coordinates that some joint moves
     equations: EquationsOfMotion
     tree: TreeModel
     may_jump = False
 
     def values(self, knots: Array) -> Array:
-        """(K, nx) dx/dt at `knots` (K, nx + nu), by Drake's own mass matrix, bias and velocities."""
+        """Return dx/dt (K, nx) at `knots` (K, nx + nu), from Drake's own mass matrix, bias and velocities."""
         return np.array([self._solved(knot)[0] for knot in knots]).reshape(len(knots), self.model.nx)
 
     def forces_at(self, knot: Array) -> Array:
-        """(m,) the forces that hold the points, by Drake."""
+        """Return the contact forces (m,) at the points, computed with Drake."""
         return self._solved(knot)[1]
 
     def linearize(self, knots: Array) -> tuple[Array, Array]:
-        """(K, nx) the rates and (K, nx, nx + nu) their Jacobians, these by CasADi."""
+        """Return the rates (K, nx) and their Jacobians (K, nx, nx + nu), the latter from CasADi."""
         return self.values(knots), np.array([self.expressions["rates"].jacobian(knot) for knot in knots])
 
     def jump_at(self, x: Array) -> tuple[Array, Array]:
-        """(nv,) what an impact adds to the velocities so that it stops the points, and its impulses (m,), by Drake."""
+        """Return the velocity jump (nv,) of an impact that stops the points, and its impulses (m,), from Drake."""
         n = self.model.nv
         J = speed_slopes(self.model, self.speeds, x)[self.rows, n:]
         set_state(self.model.double, x)
         return self._solve(J, np.zeros(n), -J @ x[n:])
 
     def _solved(self, knot: Array) -> tuple[Array, Array]:
-        """(nx,) the rates and (m,) the holding forces."""
+        """Return the rates (nx,) and the contact forces (m,)."""
         model, n = self.model, self.model.nv
         if not np.all(np.isfinite(knot)):
             return np.full(model.nx, np.nan), np.full(len(self.rows), np.nan)
@@ -89,7 +89,7 @@ class FixedContactPlant:
         return np.concatenate([x[n:], acceleration]), forces
 
     def _solve(self, J: Array, top: Array, bottom: Array) -> tuple[Array, Array]:
-        """The two rows of the equations above in the context's state."""
+        """Solve the block equations of the module docstring at the context's state."""
         whole = np.block([[self.model.double.mass_matrix(), -J.T], [J, np.zeros((len(J), len(J)))]])
         try:
             solution = np.linalg.solve(whole, np.concatenate([top, bottom]))
@@ -99,9 +99,9 @@ class FixedContactPlant:
 
     @cached_property
     def expressions(self) -> dict[str, _Expression]:
-        """Of a knot: the `rates` (nx,) and holding `forces` (m,).
+        """Functions of a knot: the `rates` (nx,) and the contact `forces` (m,).
 
-        Of an impact that stops the points, whatever the input: the `jump` of velocities (nv,), the `impulses` (m,).
+        For an impact that stops the points: the velocity `jump` (nv,) and the `impulses` (m,), for any input.
         """
         model, n = self.model, self.model.nv
         knot = ca.SX.sym("knot", model.nx + model.nu)
@@ -121,16 +121,16 @@ class FixedContactPlant:
 
 
 def speed_slopes(model: Model, speeds: Callable[[Any], Any], x: Array) -> Array:
-    """(P, nx) of the points' velocities by the state."""
+    """Return the derivative (P, nx) of the points' velocities with respect to the state."""
     return gradient_rows(np.asarray(speeds(InitializeAutoDiff(x).ravel())).ravel(), model.nx)
 
 
 def fixed_contact_plant(
     model: Model, places: Callable[[Any], Any], speeds: Callable[[Any], Any]
 ) -> FixedContactPlant | Refusal:
-    """The equations with the points at `places` held, whose velocities are `speeds`; why there are none.
+    """Return the equations with the points at `places`, of velocities `speeds`, fixed in the world, or a Refusal.
 
-    What no joint moves is not held: the y of a planar leg. Both functions take the state in any arithmetic.
+    Coordinates that no joint moves, such as the y of a planar leg, are omitted. The functions take x in any arithmetic.
     """
     if model.has_other_parameters:
         return Refusal("parameters are applied that are not the model's own")

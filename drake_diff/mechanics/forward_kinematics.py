@@ -1,13 +1,13 @@
-"""Where the links of a tree are and how they move, in ordinary arithmetic.
+"""Forward kinematics of the links of a tree, in ordinary arithmetic.
 
-It serves floats, many states at once, AutoDiffXd and symbols. A collocation traces functions of the state with symbols,
-to have their exact second derivatives; what is traced is compared with Drake's own numbers before it is used.
+The functions take floats, many states at once, AutoDiffXd and symbols. A collocation traces functions of the state with
+symbols to get exact second derivatives. The traced functions are compared with Drake's own values before they are used.
 
     R = R_parent R_F exp(axis q),  p = p_parent + R_parent p_F        of a hinge
     R = R_parent R_F,              p = p_parent + R_parent (p_F + R_F axis q)   of a slide
 
-and a free body's from its quaternion, which need not be of length 1, and its position: what Drake does. A joint of
-several other coordinates is a chain of hinges and slides, with links between them that are no bodies.
+As in Drake, the pose of a free body is given by its quaternion, which need not be normalized, and its position. Any
+other joint with several coordinates is a chain of hinges and slides, with massless virtual links between them.
 """
 
 from collections.abc import Iterator
@@ -29,8 +29,8 @@ from drake_diff.model.repairs import JointCoupling
 from drake_diff.model.step import set_state
 
 X, Y, Z = np.eye(3)
-ROUNDED = 1e-15  # of the frames' entries (sines of pi): zeros that would keep products of symbols alive
-TURNS = (("revolute", Z, 2), ("revolute", Y, 1), ("revolute", X, 0))  # roll, pitch and yaw
+ROUNDED = 1e-15  # smaller entries of the frames (sines of pi) are set to zero, so that products of symbols vanish
+TURNS = (("revolute", Z, 2), ("revolute", Y, 1), ("revolute", X, 0))  # yaw, pitch and roll
 CHAINS: dict[str, tuple[tuple[str, Array, int], ...]] = {  # the kind, axis and coordinate of each link
     "planar": (("prismatic", X, 0), ("prismatic", Y, 1), ("revolute", Z, 2)),
     "universal": (("revolute", X, 0), ("revolute", Y, 1)),
@@ -39,12 +39,12 @@ CHAINS: dict[str, tuple[tuple[str, Array, int], ...]] = {  # the kind, axis and 
 }
 RPY = "ball_rpy", "rpy_floating"
 KNOWN = ("weld", "revolute", "prismatic", "quaternion_floating", *CHAINS)
-SAME_PLACE = 1e-11  # [m, and of a rotation's entries] rounding, relative to the largest
+SAME_PLACE = 1e-11  # [m, or entries of a rotation matrix] tolerance for rounding, absolute and relative
 
 
 @dataclass(frozen=True)
 class Moving:
-    """A frame in the world: rotation (3, 3), origin (3,) [m], angular velocity (3,) and its origin's (3,) [m/s]."""
+    """A frame in the world: rotation (3, 3), origin (3,) [m], angular velocity (3,), velocity of origin (3,) [m/s]."""
 
     R: Any
     p: Any
@@ -52,21 +52,21 @@ class Moving:
     v: Any
 
     def shifted(self, R: Array, p: Array) -> "Moving":
-        """The frame that lies at rotation R (3, 3), origin p (3,) in this one."""
+        """Return the frame whose pose in this frame is R (3, 3), p (3,)."""
         arm = self.R @ p
         return Moving(self.R @ R, self.p + arm, self.w, self.v + cross(self.w, arm))
 
 
 @dataclass(frozen=True, eq=False)
 class ForwardKinematics:
-    """The links of a tree, every parent before its children; `on` is where each body went, -1 for the world."""
+    """Forward kinematics of the links of a tree, every parent before its children."""
 
     links: tuple[RigidLink, ...]
-    on: dict[str, tuple[int, Any]]  # body -> (place among the links, pose on it)
-    between: frozenset[int]  # the links that are no bodies
-    carried: NDArray[np.bool_]  # (L, L): whether link j carries link i, or is i
+    on: dict[str, tuple[int, Any]]  # body -> (index of its link, -1 for the world; pose on the link)
+    between: frozenset[int]  # the virtual links, which are not bodies
+    carried: NDArray[np.bool_]  # (L, L) entry i, j: link j is link i or an ancestor of link i
     spins: frozenset[int]  # the hinges whose three velocities are the angular velocity in the joint's frame
-    labels: dict[int, str]  # of the bodies by their indices
+    labels: dict[int, str]  # body index -> body label
     model: Model
 
     @property
@@ -75,18 +75,18 @@ class ForwardKinematics:
 
     @property
     def coupling(self) -> JointCoupling | None:
-        """Where q has the independent coordinates alone."""
+        """The coupling of mimic joints, if q has only the independent coordinates."""
         return self.model.coupling
 
     def carrier(self, link: int) -> int:
-        """The next link below that is a body, -1 for the world."""
+        """Return the nearest ancestor of a link that is a body, or -1 for the world."""
         parent = self.links[link].parent
         return self.carrier(parent) if parent in self.between else parent
 
     def __call__(self, q: Any) -> tuple[Any, Any]:
-        """Rotations (..., L + 1, 3, 3) and origins (..., L + 1, 3) of the links, the world last, at q (..., nq)."""
+        """Return rotations (..., L + 1, 3, 3) and origins (..., L + 1, 3) of the links, world last, at q (..., nq)."""
         q = self._all(np.asarray(q))
-        zero = 0.0 * q[..., :1]  # of the same kind of number as all else
+        zero = 0.0 * q[..., :1]  # zero of the same scalar type
         world, origin = np.eye(3) + zero[..., None], np.zeros(3) + zero
         turns: list[Any] = []
         places: list[Any] = []
@@ -109,9 +109,9 @@ class ForwardKinematics:
         return np.stack([*turns, world], axis=-3), np.stack([*places, origin], axis=-2)
 
     def pushes(self, q: Array, frames: tuple[Array, Array], carriers: Indices, points: Array, ways: Array) -> Array:
-        """(K, m, nx) how much each entry of the state moves `points` (K, m, 3) along `ways` (K, m, 3).
+        """Return the gradient (K, m, nx) of the points' motion along `ways` (K, m, 3) with respect to the state.
 
-        They are fixed in the links `carriers` (m,), for q (K, nq) and the `frames` there.
+        The `points` (K, m, 3) are fixed in the links `carriers` (m,), at q (K, nq) with the links' `frames`.
         """
         turns, places = frames
         q = self._all(q)
@@ -123,9 +123,9 @@ class ForwardKinematics:
             start, way = link.joint.q_start, ways[:, rows]
             arm = points[:, rows] - places[:, j, None]
             if link.free:
-                A = turns[:, link.parent] @ link.on_parent.rotation().matrix()  # -1 is the world, the last
+                A = turns[:, link.parent] @ link.on_parent.rotation().matrix()  # -1 is the world, the last entry
                 slopes[:, rows, start + 4 : start + 7] = way @ A
-                moment = cross(arm, way) @ A  # about the axes that the quaternion is of
+                moment = cross(arm, way) @ A  # in the frame of the quaternion
                 slopes[:, rows, start : start + 4] = moment @ _turning(q[:, start : start + 4])
                 continue
             axis = (turns[:, j] @ link.axis)[:, None]
@@ -139,7 +139,7 @@ class ForwardKinematics:
         return independent
 
     def frame(self, x: Any, frame: Any, *, speeds: bool = False) -> Moving:
-        """A `frame` of the plant at the state x (nx,); without `speeds` as if at rest, which is less to trace."""
+        """Return a `frame` of the plant at the state x (nx,); without `speeds`, its velocities are 0, to trace less."""
         x = np.asarray(x)
         turns, places = self(x[: self.model.nq])
         link, pose = self._on(frame)
@@ -147,7 +147,7 @@ class ForwardKinematics:
         return (self._moving(x, turns, places, link) if speeds else still).shifted(*pose)
 
     def _on(self, frame: Any) -> tuple[int, tuple[Array, Array]]:
-        """The link that carries a frame, and the frame's rotation and origin on it."""
+        """Return the link that carries a frame, and the frame's rotation and origin on the link."""
         link, pose = self.on[self.labels[int(frame.body().index())]]
         return link, _without_rounding(pose @ frame.GetFixedPoseInBodyFrame())
 
@@ -160,7 +160,7 @@ class ForwardKinematics:
             if i < 0:
                 continue
             if carrier.free or j in self.spins:
-                before = turns[carrier.parent] @ _without_rounding(carrier.on_parent)[0]  # -1 is the world, the last
+                before = turns[carrier.parent] @ _without_rounding(carrier.on_parent)[0]  # -1: the world, the last one
                 spin = before @ v[i : i + 3]
                 angular, linear = angular + spin, linear + cross(spin, arm)
                 if carrier.free:
@@ -174,7 +174,7 @@ class ForwardKinematics:
         return Moving(turns[link], origin, angular, linear)
 
     def quaternion(self, x: Any, frame: Any) -> Any:
-        """(4,) w, x, y, z of the rotation of `frame` in the world, of either sign, at the state x (nx,)."""
+        """Return the quaternion w, x, y, z (4,), of either sign, of `frame` in the world, at the state x (nx,)."""
         q = self._all(np.asarray(x)[: self.model.nq])
         link, (R, _) = self._on(frame)
         turned = _quaternion_of(R)
@@ -190,7 +190,7 @@ class ForwardKinematics:
         return turned
 
     def center_of_mass(self, x: Any) -> Any:
-        """(3,) [m] of all bodies but the world, at the state x (nx,)."""
+        """Return the centre of mass (3,) [m] of all bodies except the world, at the state x (nx,)."""
         total, moment, (turns, places) = 0.0, np.zeros(3), self(np.asarray(x)[: self.model.nq])
         for link, mass, center in self._masses:
             total, moment = total + mass, moment + mass * (places[link] + turns[link] @ center)
@@ -198,7 +198,7 @@ class ForwardKinematics:
 
     @cached_property
     def _masses(self) -> list[tuple[int, float, Array]]:
-        """(link, mass [kg], centre of mass (3,) in it [m]) of the bodies."""
+        """A list of (link, mass [kg], centre of mass (3,) in the link [m]) of the bodies."""
         context, masses = self.model.plant.CreateDefaultContext(), []
         for label, body in labelled(bodies(self.model.plant)).items():
             mass, (link, pose) = float(body.get_mass(context)), self.on[label]
@@ -207,7 +207,7 @@ class ForwardKinematics:
         return masses
 
     def _all(self, q: Any) -> Any:
-        """The positions (..., n) of all joints."""
+        """Return the positions (..., n) of all joints."""
         return q if self.coupling is None else self.coupling.positions(q)
 
 
@@ -216,14 +216,14 @@ def _times(matrix: Any, vector: Any) -> Any:
 
 
 def _turning(quaternion: Array) -> Array:
-    """(K, 3, 4): the angular velocity of a change of w x y z (K, 4), 2 vec(dq q*) / |q|^2."""
+    """Return the matrix (K, 3, 4) of dq -> angular velocity 2 vec(dq q*) / |q|^2, at the quaternion w x y z (K, 4)."""
     w, v = quaternion[:, 0], quaternion[:, 1:]
     parts = [-v[:, :, None], w[:, None, None] * np.eye(3) + skew(v)]
     return np.asarray(np.concatenate(parts, axis=2) * (2 / np.sum(quaternion**2, axis=1))[:, None, None])
 
 
 def product(a: Any, b: Any) -> Any:
-    """(4,) the quaternion a b."""
+    """Return the quaternion product a b (4,)."""
     return np.array([a[0] * b[0] - a[1:].dot(b[1:]), *(a[0] * b[1:] + b[0] * a[1:] + cross(a[1:], b[1:]))])
 
 
@@ -240,7 +240,7 @@ def _rounded(values: Any) -> Array:
 
 
 def forward_kinematics(model: Model) -> ForwardKinematics | Refusal:
-    """The tree of `model`, compared with Drake's at two states; a Refusal names the joint that has no formula here."""
+    """Make the kinematics of `model`, compared with Drake's at two states, or a Refusal that names the joint."""
 
     def compared() -> ForwardKinematics | Refusal:
         if not model.nq:
@@ -275,7 +275,7 @@ def forward_kinematics(model: Model) -> ForwardKinematics | Refusal:
 
 
 def _chain(link: Link) -> Iterator[Link]:
-    """A link as it is, or one for each coordinate of its joint; the body is the last."""
+    """Yield a link unchanged, or one link for each coordinate of its joint, of which the last is the body."""
     chain = CHAINS.get(link.kind)
     if chain is None:
         yield link
@@ -288,7 +288,7 @@ def _chain(link: Link) -> Iterator[Link]:
         )
         body = link.body if last else f"{link.body} behind {i + 1} of {len(chain)} coordinates"
         starts: dict[str, Any] = {"q_start": link.q_start + k, "v_start": link.v_start + k}
-        if link.kind in RPY and kind == "revolute":  # the first has all of the angular velocity
+        if link.kind in RPY and kind == "revolute":  # the first hinge has the whole angular velocity
             starts["v_start"] = link.v_start if axis is Z else -1
         yield replace(link, body=body, parent=parent, kind=kind, axis=axis, on_parent=pose, **starts, **massless)
         parent, pose = body, RigidTransform()

@@ -1,13 +1,13 @@
-"""Functions of the state that tasks are written with: positions, rotations, velocities and contact forces.
+"""Functions of the state for costs and constraints: positions, rotations, velocities and contact forces.
 
-Each takes a model and names, checks them at once, and returns a function of x (nx,), or of x and u (nu,), for floats
-and for AutoDiffXd, to use in costs and in a `dd.Constraint`. Those of the state alone, contact apart, also take the
-symbols of a collocation, which so has their exact second derivatives.
+Each function takes a model and names, checks them immediately, and returns a function of x (nx,), or of x and u (nu,),
+for floats and AutoDiffXd, to use in costs and in a `dd.Constraint`. All of them except the contact forces also take the
+symbols of a collocation, which computes exact second derivatives with them.
 
-They belong to the model's own parameters and have no derivative by any. Where other parameters are applied that they
-depend on (joint offsets; masses and centres of mass; for contact forces all), they raise InputError, and so does a
-Problem that optimizes such parameters. A frame is named "frame", "instance::frame" where two model instances have one
-of that name, or by its body.
+The functions use the model's own parameters and have no derivatives with respect to parameters. They raise InputError
+while other parameters are applied that they depend on (joint offsets; masses and centres of mass; for contact forces
+all), and so does a Problem that optimizes such parameters. The name of a frame is "frame", "instance::frame" if two
+model instances have a frame of this name, or the name of its body.
 
 Example:
     >>> model = dd.load_model("models/cart_pole.urdf", time_step=0.01)
@@ -38,32 +38,32 @@ from drake_diff.model.step import advance, set_state
 from drake_diff.model.twin import Twin
 
 PLACE = frozenset({"offset"})  # the parameters that frames depend on
-BALANCE = PLACE | {"mass", "center_of_mass"}
+BALANCE = PLACE | {"mass", "center_of_mass"}  # the parameters that the centre of mass depends on
 ORIGIN = (0.0, 0.0, 0.0)
 UP = (0.0, 0.0, 1.0)
-ROTATION_TOLERANCE = 1e-9  # of R' R = I: a goal written down with fewer digits would be another rotation
+ROTATION_TOLERANCE = 1e-9  # of R' R = I: a goal given with fewer digits would be a different rotation
 
-CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])  # times a quaternion
-RECORDED = "recorded_as"  # the attribute of a function of this module by which a record knows it
+CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])  # a quaternion times this, entry by entry, is its conjugate
+RECORDED = "recorded_as"  # the attribute that identifies a function of this module in a record
 
 OfState = Callable[[Any], Any]
 OfStateAndInput = Callable[[Any, Any], Any]
 
 
 def frame_position(model: Model, frame: str, point: ArrayLike = ORIGIN, relative_to: str = "world") -> OfState:
-    """Where a point that is fixed in a frame is, as a function of the state.
+    """Return the position of a point fixed in a frame, as a function of the state.
 
     Args:
         model: The model.
-        frame: The frame that carries the point; a body's name will do.
+        frame: The name of the frame, or of a body.
         point: (3,) [m] in `frame`.
-        relative_to: The frame that the answer is expressed in.
+        relative_to: The frame in which the position is expressed.
 
     Returns:
         x (nx,) -> (3,) [m].
 
     Raises:
-        UnknownNameError: There is no such frame; the message lists those that exist.
+        UnknownNameError: The frame does not exist. The message lists the existing frames.
         ShapeError: `point` is not (3,).
 
     Example:
@@ -82,24 +82,24 @@ def frame_position(model: Model, frame: str, point: ArrayLike = ORIGIN, relative
 
 
 def frame_rotation_error(model: Model, frame: str, R_goal: ArrayLike, relative_to: str = "world") -> OfState:
-    """How far a frame is turned from a goal, as a function of the state: 2 sin(angle / 2) times the axis.
+    """Return the rotation of a frame relative to a goal, 2 sin(angle / 2) times the axis, as a function of the state.
 
-    That is twice the vector part of the quaternion of R R_goal', whose scalar part is taken not negative: 0 at the
-    goal, near it the small rotation itself [rad], and smooth but at half a turn, where its axis may have either sign.
-    Its square is 2 (1 - cos angle).
+    The result is twice the vector part of the quaternion of R R_goal' with nonnegative scalar part. It is 0 at the
+    goal, approximates the rotation vector [rad] near the goal, and is smooth except at a rotation by 180 degrees, where
+    the axis may have either sign. Its square is 2 (1 - cos angle).
 
     Args:
         model: The model.
-        frame: The frame; a body's name will do.
-        R_goal: (3, 3) the rotation wanted, as of `relative_to`.
+        frame: The name of the frame, or of a body.
+        R_goal: (3, 3) the goal rotation relative to `relative_to`.
         relative_to: The frame that both rotations are relative to.
 
     Returns:
-        x (nx,) -> (3,) [rad, for small ones].
+        x (nx,) -> (3,) [rad, for small rotations].
 
     Raises:
-        UnknownNameError: There is no such frame.
-        ShapeError, InputError: R_goal is not (3, 3), or no rotation.
+        UnknownNameError: The frame does not exist.
+        ShapeError, InputError: R_goal is not (3, 3), or not a rotation.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -127,18 +127,18 @@ def frame_rotation_error(model: Model, frame: str, R_goal: ArrayLike, relative_t
 
 
 def frame_velocity(model: Model, frame: str, point: ArrayLike = ORIGIN) -> OfState:
-    """The velocity in the world of a point that is fixed in a frame, as a function of the state.
+    """Return the velocity in the world of a point fixed in a frame, as a function of the state.
 
     Args:
         model: The model.
-        frame: The frame that carries the point; a body's name will do.
+        frame: The name of the frame, or of a body.
         point: (3,) [m] in `frame`.
 
     Returns:
         x (nx,) -> (3,) [m/s].
 
     Raises:
-        UnknownNameError: There is no such frame.
+        UnknownNameError: The frame does not exist.
         ShapeError: `point` is not (3,).
 
     Example:
@@ -153,17 +153,17 @@ def frame_velocity(model: Model, frame: str, point: ArrayLike = ORIGIN) -> OfSta
 
 
 def frame_angular_velocity(model: Model, frame: str) -> OfState:
-    """The angular velocity of a frame in the world, as a function of the state.
+    """Return the angular velocity of a frame in the world, as a function of the state.
 
     Args:
         model: The model.
-        frame: The frame; a body's name will do.
+        frame: The name of the frame, or of a body.
 
     Returns:
         x (nx,) -> (3,) [rad/s].
 
     Raises:
-        UnknownNameError: There is no such frame.
+        UnknownNameError: The frame does not exist.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -177,21 +177,21 @@ def frame_angular_velocity(model: Model, frame: str) -> OfState:
 
 
 def frame_tilt(model: Model, frame: str, axis: ArrayLike = UP) -> OfState:
-    """How far an axis of a frame leans from upright, as a function of the state: 2 sin(angle / 2) towards x and y.
+    """Return the tilt of a frame's axis from vertical, 2 sin(angle / 2) towards x and y, as a function of the state.
 
-    0 where the axis points up, along the world's z; near it the small angles that it leans by [rad], and of norm 2
-    where it points down.
+    The result is 0 if the axis points up along the world's z. Near this orientation it approximates the tilt angles
+    [rad]. Its norm is 2 if the axis points down.
 
     Args:
         model: The model.
-        frame: The frame; a body's name will do.
-        axis: (3,) what is to point up, in `frame`; of any length.
+        frame: The name of the frame, or of a body.
+        axis: (3,) the axis in `frame` that should point up, of any length.
 
     Returns:
-        x (nx,) -> (2,) [rad, for small ones].
+        x (nx,) -> (2,) [rad, for small tilts].
 
     Raises:
-        UnknownNameError: There is no such frame.
+        UnknownNameError: The frame does not exist.
         ShapeError, InputError: `axis` is not (3,), or 0.
 
     Example:
@@ -207,7 +207,7 @@ def frame_tilt(model: Model, frame: str, axis: ArrayLike = UP) -> OfState:
 
     def tilt(x: Any) -> Any:
         pointing = _pose(model, x, here, world)[0] @ a
-        if not _is_symbolic(x) and not plain([1 + pointing[2]])[0] > 0:  # upside down: it leans every way
+        if not _is_symbolic(x) and not plain([1 + pointing[2]])[0] > 0:  # upside down: the direction is arbitrary
             return np.array([2.0, 0.0]) + 0 * pointing[:2]
         return pointing[:2] / np.sqrt((1 + pointing[2]) / 2)
 
@@ -215,7 +215,7 @@ def frame_tilt(model: Model, frame: str, axis: ArrayLike = UP) -> OfState:
 
 
 def center_of_mass(model: Model) -> OfState:
-    """The centre of mass of all bodies in the world, as a function of the state.
+    """Return the position in the world of the centre of mass of all bodies, as a function of the state.
 
     Args:
         model: The model.
@@ -244,21 +244,21 @@ def center_of_mass(model: Model) -> OfState:
 
 
 def contact_force(model: Model, body: str) -> OfStateAndInput:
-    """The sum of all contact forces on a body, in the world, as a function of the state and the input.
+    """Return the sum of all contact forces on a body, in the world, as a function of the state and the input.
 
-    It is the force over the step that is taken from (x, u), so it needs a Constraint of (x, u) or a cost of both. Its
-    derivative is 0 where nothing touches: a search has to start from a motion that does.
+    The force acts during the step from (x, u), so it must be used in a Constraint of (x, u) or in a cost of both. Its
+    derivative is 0 without contact. An optimization must start from a trajectory with contact.
 
     Args:
         model: The model.
-        body: The body that is pushed.
+        body: The name of the body on which the forces act.
 
     Returns:
-        (x (nx,), u (nu,)) -> (3,) [N]. It raises what `step` raises, such as SimulationError for pairs of shapes that
-        Drake cannot do.
+        (x (nx,), u (nu,)) -> (3,) [N]. The function raises the errors of `step`, such as SimulationError for pairs of
+        shapes that Drake does not support.
 
     Raises:
-        UnknownNameError: There is no such body; the message lists those that exist.
+        UnknownNameError: The body does not exist. The message lists the existing bodies.
 
     Example:
         >>> model = dd.load_model("models/sphere_on_ground.sdf", time_step=0.01)
@@ -285,19 +285,19 @@ def contact_force(model: Model, body: str) -> OfStateAndInput:
 
 
 def recorded(function: Any, name: str, **arguments: Any) -> Any:
-    """`function` with what made it, so that a record can tell it and make it again: see `made_from`."""
+    """Attach the name and arguments to `function`, so that a record can make the function again. See `made_from`."""
     setattr(function, RECORDED, (function, {name: arguments}))
     return function
 
 
 def description_of(function: Any) -> dict[str, Any] | None:
-    """The name and the arguments of the function of this module that made `function`; None where none did."""
+    """Return the name and arguments of this module's function that made `function`, or None for other functions."""
     made, description = getattr(function, RECORDED, (None, None))
-    return description if made is function else None  # a function that wraps one has its attributes, not its values
+    return description if made is function else None  # a wrapper copies the attributes but may return other values
 
 
 def made_from(model: Model, description: Any) -> OfState | OfStateAndInput:
-    """The function that `description_of` described, on `model`. InputError where it describes none."""
+    """Make the function on `model` from the result of `description_of`; raise InputError for another description."""
     makers: tuple[Any, ...] = (
         *(frame_position, frame_rotation_error, frame_velocity, frame_angular_velocity, frame_tilt),
         *(center_of_mass, contact_force),
@@ -311,7 +311,7 @@ def made_from(model: Model, description: Any) -> OfState | OfStateAndInput:
 
 
 def _pose(model: Model, x: Any, here: FrameIndex, base: FrameIndex) -> tuple[Any, Any]:
-    """Rotation (3, 3) and origin (3,) of a frame in another one."""
+    """Return the rotation (3, 3) and origin (3,) of the frame `here` in the frame `base`."""
     if _is_symbolic(x):
         tree = _tree_of(model, PLACE)
         moving, origin = (tree.frame(x, model.plant.get_frame(i)) for i in (here, base))
@@ -322,7 +322,7 @@ def _pose(model: Model, x: Any, here: FrameIndex, base: FrameIndex) -> tuple[Any
 
 
 def _velocities(model: Model, x: Any, here: FrameIndex, point: Any) -> tuple[Any, Any]:
-    """(3,) the angular velocity of a frame and (3,) that of a point in it, in world."""
+    """Return the angular velocity (3,) of a frame and the velocity (3,) of a point fixed in the frame, in world."""
     if _is_symbolic(x):
         moving = _tree_of(model, PLACE).frame(x, model.plant.get_frame(here), speeds=True).shifted(np.eye(3), point)
         return moving.w, moving.v
@@ -334,9 +334,9 @@ def _velocities(model: Model, x: Any, here: FrameIndex, point: Any) -> tuple[Any
 
 
 def _twin_at(model: Model, depends_on: frozenset[str], x: Any, *inputs: Any) -> tuple[Twin, list[Any]]:
-    """The twin for these numbers, its state set to `x`, and x and the inputs as its scalars.
+    """Return the twin for the scalar type of the arguments, with its state set to `x`, and x and the inputs as scalars.
 
-    InputError where parameters are applied that the result would depend on.
+    Raises InputError if parameters are applied that the result depends on.
     """
     _check_parameters(model, depends_on)
     given = [np.asarray(array) for array in (x, *inputs)]
@@ -359,14 +359,14 @@ def _check_parameters(model: Model, depends_on: frozenset[str]) -> None:
 
 
 def _is_symbolic(x: Any) -> bool:
-    """Whether entries of `x` are neither numbers nor AutoDiffXd: what Drake cannot place."""
+    """Check if `x` has entries that are neither numbers nor AutoDiffXd, so that Drake cannot evaluate them."""
     array = np.asarray(x)
     known = (AutoDiffXd, int, float, np.number)
     return array.dtype == object and not all(isinstance(entry, known) for entry in array.ravel())
 
 
 def _tree_of(model: Model, depends_on: frozenset[str]) -> ForwardKinematics:
-    """What places frames for other scalars than Drake's."""
+    """Return the forward kinematics for scalar types that Drake does not support; raise ModelError if not available."""
     _check_parameters(model, depends_on)
     kinematics = forward_kinematics(model)
     if isinstance(kinematics, Refusal):
@@ -388,6 +388,6 @@ def _frame_index(model: Model, name: str) -> FrameIndex:
 
 
 def _quaternion(R: Any, scalar: Any) -> Any:
-    """(4,) w x y z, w not negative, of a rotation matrix."""
+    """Return the quaternion w x y z (4,), with w >= 0, of a rotation matrix."""
     quaternion = RotationMatrix_[scalar](R).ToQuaternion().wxyz()
     return -quaternion if quaternion[0] < 0 else quaternion

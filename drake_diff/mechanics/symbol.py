@@ -1,7 +1,7 @@
 """CasADi's scalar expressions as entries of NumPy arrays of objects, and CasADi functions in any arithmetic.
 
-A `Symbol` goes through a function as AutoDiffXd does: NumPy computes with arrays of it. It has no float() and no truth
-value, so that a function that branches on its numbers cannot pass for one that does not.
+NumPy computes with arrays of `Symbol` as it does with arrays of AutoDiffXd. A `Symbol` has no float() and no truth
+value, so that tracing a function that branches on its inputs raises an error.
 """
 
 import operator
@@ -33,7 +33,7 @@ class Symbol:
         return Symbol(ca.fabs(self.sx))
 
     def sign(self) -> "Symbol":
-        """1 where it is not negative, else -1."""
+        """Return 1 if the expression is not negative, else -1."""
         return Symbol(ca.if_else(self.sx < 0, -1.0, 1.0))
 
     def __bool__(self) -> bool:
@@ -72,12 +72,12 @@ setattr(Symbol, "arctan2", _binary(ca.atan2))  # noqa: B010  (mypy: the class ha
 
 
 def symbols(column: Any) -> Any:
-    """The entries of an SX column (n,) as an array (n,) of Symbols."""
+    """Return the entries of an SX column (n,) as an array (n,) of Symbols."""
     return np.array([Symbol(column[i]) for i in range(column.numel())], dtype=object)
 
 
 def called(function: Any, jacobian: Any, z: Any) -> Any:
-    """(m,) an SX `function` of one column at z (n,), of numbers, AutoDiffXd or Symbols; its `jacobian` is (m, n)."""
+    """Return an SX `function` (m,) at z (n,) of floats, AutoDiffXd or Symbols; its `jacobian` returns (m, n)."""
     z = np.asarray(z)
     if any(isinstance(entry, Symbol) for entry in z):
         return symbols(function(ca.vertcat(*[e.sx if isinstance(e, Symbol) else float(e) for e in z])))

@@ -1,24 +1,24 @@
-"""A tree of hinges, slides and free bodies: its dynamics and their derivatives, for many states in one call.
+"""The dynamics of a tree of hinges, slides and free bodies and their derivatives, for many states in one call.
 
     tau(q, v, a) = M(q) a + C(q, v) v - gravity - springs + D v + reflected inertia
 
-Spatial vectors are [angular; linear] in the world frame at its origin. A joint K moves its body by the columns s of
-S_K, which the body P before it carries along: a hinge, a slide, and a free body's three slides and, after them, its
-turn about world axes. With V_P and V_K the velocities before and after the joint, A_K the acceleration after it (of the
-world -g), x the motion cross product and
+Spatial vectors are [angular; linear] in the world frame at its origin. A joint K moves its body along the columns s of
+S_K, which move with the body P before the joint. A joint is a hinge, a slide, a free body's three slides, or the
+following rotation of the free body about world axes. V_P and V_K are the velocities before and after the joint, A_K is
+the acceleration after the joint (the world's is -g), x is the motion cross product, and
 
     P_s = V_K x s,   T_s = (V_P + V_K) x s,   Q_s = A_K x s + V_K x P_s
 
-the force F on all that joint K carries changes along s, and with the speed along s, by
+The derivatives of the force F on all bodies that joint K carries, with respect to motion and speed along s, are
 
     I Q_s + B P_s + s x* F,   I T_s + B s
 
-where I, F and B are sums over the bodies that K carries, of their inertia, of their force and of
-(v x*) I - I (v x) + (I v) x*. The force of joint i is S_i' times that change of what the lower of the two joints
-carries, but without s x* F where i is below, as its axes turn with it. With joints of one degree of freedom these are
-the formulas of Singh, Russell and Wensing, "Efficient analytical derivatives of rigid-body dynamics using spatial
-vector algebra" (2022). Derivatives by q are by small motion: for a free body by its turn in world and by its shift.
-The arithmetic is in `tree_kernel`.
+where I, F and B are sums over the bodies that K carries: their inertias, their forces, and
+(v x*) I - I (v x) + (I v) x*. The derivative of the force of joint i is S_i' times this derivative for the lower of
+the two joints, without s x* F if i is the lower one, as its axes turn with K. For joints of one degree of freedom these
+are the formulas of Singh, Russell and Wensing, "Efficient analytical derivatives of rigid-body dynamics using spatial
+vector algebra" (2022). Derivatives with respect to q are with respect to the tangent: for a free body, its rotation and
+translation in world. `tree_kernel` implements the arithmetic.
 """
 
 from collections.abc import Sequence
@@ -44,15 +44,15 @@ from drake_diff.model.step import set_state
 
 @dataclass(frozen=True, eq=False)
 class Moved:
-    """A tree at N states and accelerations; S is [angular; linear] in world about its origin."""
+    """The results for a tree at N states and accelerations; S is [angular; linear] in world about its origin."""
 
     poses: Array  # (N, L, 3, 4) of the links
     S: Array  # (N, nv, 6) the motion of each degree of freedom at unit speed
     mass: Array  # (N, nv, nv) M, without reflected inertia
-    slope: Array  # (N, nv, nv) d M_kk / d q_j by k and j
+    slope: Array  # (N, nv, nv) entry k, j: d M_kk / d q_j
     tau: Array  # (N, nv) M a + bias - gravity
-    by_q: Array  # (N, nv, nv) its derivative by small motion
-    by_v: Array  # (N, nv, nv)
+    by_q: Array  # (N, nv, nv) derivative of tau with respect to the tangent of q
+    by_v: Array  # (N, nv, nv) derivative of tau with respect to v
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,16 +60,16 @@ class CompiledTree:
     """A tree whose kernel is compiled."""
 
     tables: tree_kernel.Tree
-    links: dict[str, int]  # by their bodies' names
+    links: dict[str, int]  # body name -> index of the link
     nv: int
 
     @property
     def nq(self) -> int:
-        """How many positions there are: seven of a free body."""
+        """The number of positions, which is seven for a free body."""
         return self.nv + int(np.count_nonzero(self.tables.kind == tree_kernel.FREE))
 
     def __call__(self, q: Array, v: Array, a: Array, *, derivatives: bool = True) -> Moved:
-        """At q (N, nq), v and a (each (N, nv)), in Drake's coordinates; `slope`, `by_q` and `by_v` are 0 without."""
+        """Evaluate at q (N, nq), v and a (each (N, nv)); without `derivatives`, `slope`, `by_q` and `by_v` are 0."""
         N, n = len(q), self.nv
         point = own_array(q), own_array(v), own_array(a)
         poses, S, tau = np.empty((N, len(self.links), 3, 4)), np.empty((N, n, 6)), np.empty((N, n))
@@ -79,12 +79,12 @@ class CompiledTree:
 
 
 def compiled_tree(description: Description) -> CompiledTree | None:
-    """None where a free body is not joined to the world by its own frame."""
+    """Compile a description, or return None if a free body is not joined to the world by its own frame."""
     return compile_links(description.links, description.gravity, description.coordinates.nv)
 
 
 def compile_links(links: Sequence[Link], gravity: Array, nv: int) -> CompiledTree | None:
-    """Of all links, parents before their children; None as of `compiled_tree`."""
+    """Compile all links, parents before their children, or return None as `compiled_tree` does."""
     identity = RigidTransform()
     for link in links:
         has_identity = link.on_parent.IsExactlyEqualTo(identity) and link.on_child.IsExactlyEqualTo(identity)
@@ -131,14 +131,14 @@ def _whole(numbers: list[int]) -> Array:
     return np.array(numbers, dtype=np.int64)
 
 
-SAME_TREE = 1e-11  # of the largest entry: these formulas and AutoDiffXd differ by rounding
-# [rad or m] of a position, or of 1: first derivatives are known to 1e-15, so that 1e-6 of second ones is left.
+SAME_TREE = 1e-11  # tolerance relative to the largest entry: these formulas and AutoDiffXd differ by rounding
+# [rad or m] times max(1, |q|): first derivatives are accurate to 1e-15, so the second derivatives are to about 1e-6.
 SECOND_DIFFERENCE = 3e-8
 
 
 @dataclass(frozen=True, eq=False)
 class InverseDynamics:
-    """tau (N, n) and its derivatives by q, by v and by a (each (N, n, n)) at N states."""
+    """Inverse dynamics tau (N, n) and derivatives with respect to q, v and a (each (N, n, n)) at N states."""
 
     tau: Array
     by_q: Array
@@ -148,28 +148,28 @@ class InverseDynamics:
 
 @dataclass(frozen=True, eq=False)
 class TreeModel:
-    """A tree of n degrees of freedom, and what acts beside inertia and gravity, by velocity."""
+    """A tree of n degrees of freedom, with the springs, damping and reflected inertia of each."""
 
-    links: tuple[RigidLink, ...]  # with what they carry by welds, every parent before its children
-    on: dict[str, tuple[int, RigidTransform]]  # of each body the link that carries it, -1 the world, and the pose on it
+    links: tuple[RigidLink, ...]  # including the bodies welded to them, every parent before its children
+    on: dict[str, tuple[int, RigidTransform]]  # body name -> link that carries the body (-1: world), and pose on it
     compiled: CompiledTree
     gravity: Array  # (3,)
-    positions: Indices  # (n,) in q, 0 for free bodies, which have no springs
-    free: NDArray[np.bool_]  # (n,) of free bodies
+    positions: Indices  # (n,) index in q; 0 for free bodies, which have no springs
+    free: NDArray[np.bool_]  # (n,) True for the velocities of free bodies
     stiffness: Array  # (n,) of springs [N/m or N m/rad]
-    rest: Array  # (n,) [m or rad]
+    rest: Array  # (n,) rest positions of springs [m or rad]
     damping: Array  # (n,)
     reflected: Array  # (n,) rotor inertia times gear ratio squared
-    coupling: JointCoupling | None  # where q, v and a are of the independent coordinates alone, and tau is along them
+    coupling: JointCoupling | None  # if given, q, v, a and tau are in the independent coordinates
 
     @property
     def own_damping(self) -> Array:
-        """(nv,) `damping` along the independent coordinates."""
+        """The damping (nv,) in the independent coordinates."""
         coupling = self.coupling
         return self.damping if coupling is None else np.asarray(coupling.forces(coupling.ratio_v * self.damping))
 
     def __call__(self, q: Array, v: Array, a: Array) -> InverseDynamics:
-        """Inverse dynamics at q (N, nq), v and a (each (N, nv)), its derivative by q by small motion."""
+        """Compute inverse dynamics and its derivatives, in the tangent of q (N, nq), at v and a (each (N, nv))."""
         if self.coupling is None:
             return self._of_all(q, v, a)
         q, v, a = self.coupling.positions(q), self.coupling.velocities(v), self.coupling.velocities(a)
@@ -177,7 +177,7 @@ class TreeModel:
         return InverseDynamics(every.tau @ E, *(E.T @ by @ E for by in (every.by_q, every.by_v, every.mass)))
 
     def _of_all(self, q: Array, v: Array, a: Array) -> InverseDynamics:
-        """Of all n degrees of freedom."""
+        """Compute the inverse dynamics of all n degrees of freedom."""
         moved, diagonal = self.compiled(q, v, a), np.arange(len(self.stiffness))
         moved.by_q[:, diagonal, diagonal] += self.stiffness
         moved.by_v[:, diagonal, diagonal] += self.damping
@@ -189,16 +189,16 @@ class TreeModel:
 
 @dataclass(frozen=True, eq=False)
 class ForwardDynamics:
-    """Accelerations of a tree with an armature (n,) beside its inertia, in Drake's coordinates."""
+    """Forward dynamics of a tree with an armature (n,) added to its inertia, in Drake's coordinates."""
 
     tree: CompiledTree
     armature: Array
 
     def accelerate(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array, Array]:
-        """da/dq, da/dv, da/dforce (each (N, n, n)) and a (N, n) under generalized forces (N, n).
+        """Compute da/dq, da/dv, da/dforce (each (N, n, n)) and a (N, n) under generalized forces (N, n).
 
-        q (N, nq), whose quaternions may be of any norm; its derivative is by small motion. NaN where the mass matrix is
-        not positive definite.
+        The quaternions in q (N, nq) may have any norm. da/dq is with respect to the tangent. The results are NaN where
+        the mass matrix is not positive definite.
         """
         by_q, by_v, inverse = np.empty((3, *v.shape, v.shape[1]))
         a = np.empty(v.shape)
@@ -207,7 +207,7 @@ class ForwardDynamics:
         return by_q, by_v, inverse, a
 
     def accelerate_one(self, q: Array, v: Array, force: Array) -> tuple[Array, Array, Array, Array]:
-        """As `accelerate`, of one state (nq,) and (nv,); overwritten by the next call."""
+        """Compute `accelerate` for one state (nq,) and (nv,); the next call overwrites the results."""
         point, armature, (by_q, by_v, inverse, a) = self._buffers
         for buffer, values in zip(point, (q, v, force), strict=True):
             buffer[0] = values
@@ -216,17 +216,17 @@ class ForwardDynamics:
 
     @cached_property
     def _buffers(self) -> tuple[tuple[Array, Array, Array], Array, tuple[Array, Array, Array, Array]]:
-        """Of one state: q, v and the forces; the armature; the derivatives and the acceleration."""
+        """Buffers for one state: (q, v, forces), the armature, and (derivatives, acceleration)."""
         n, nq = self.tree.nv, self.tree.nq
         point = np.zeros((1, nq)), np.zeros((1, n)), np.zeros((1, n))
         results = np.empty((1, n, n)), np.empty((1, n, n)), np.empty((1, n, n)), np.empty((1, n))
         return point, own_array(self.armature), results
 
     def bend(self, q: Array, v: Array, a: Array, along: Array) -> tuple[Array, Array, Array, Array]:
-        """Second derivatives of along' tau (N, n each), tau being inverse dynamics: by q q, v q, a q and v v.
+        """Compute second derivatives of along' tau (N, n each), with tau the inverse dynamics: qq, vq, aq and vv.
 
-        Each (N, n, n); of hinges and slides alone. Those by q are differences of exact first derivatives. By v v none
-        is needed: with the Christoffel symbols it follows from how the mass matrix changes.
+        Each is (N, n, n). The tree may have hinges and slides only. The first three are differences of exact first
+        derivatives. The last follows from the derivative of the mass matrix by the Christoffel symbols.
         """
         count, n = v.shape
         steps = SECOND_DIFFERENCE * np.maximum(1.0, np.abs(q))
@@ -247,7 +247,7 @@ class ForwardDynamics:
 
 
 def _links_of(model: Model, free: bool) -> list[Any] | Refusal:
-    """All links of the model; a Refusal that names what is none."""
+    """Return all links of the model, or a Refusal that names the unsupported element."""
     plant = model.plant
     if model.forces:
         return Refusal("forces are added to Drake's")
@@ -262,9 +262,9 @@ def _links_of(model: Model, free: bool) -> list[Any] | Refusal:
 
 
 def tree_of(model: Model, *, free: bool = False) -> TreeModel | Refusal:
-    """The tree of a model as it is read, not yet compared with Drake; a Refusal that names what in it is no tree.
+    """Read the tree of a model without comparing it with Drake, or return a Refusal that names the unsupported element.
 
-    Of hinges and slides, and of `free` bodies where they are asked for.
+    The tree may have hinges and slides, and with `free` also free bodies.
     """
     every = _links_of(model, free)
     if isinstance(every, Refusal):
@@ -289,9 +289,9 @@ def tree_of(model: Model, *, free: bool = False) -> TreeModel | Refusal:
 
 
 def tree_for(model: Model) -> TreeModel | None:
-    """The model's tree where it gives at two states what AutoDiffXd through Drake gives; None where it has no such.
+    """Return the model's tree if it agrees with AutoDiffXd through Drake at two states, else None.
 
-    It is that of the model's own parameters: while others are applied there is none.
+    The tree uses the model's own parameters. The result is None while other parameters are applied.
     """
     if model.has_other_parameters:
         return None

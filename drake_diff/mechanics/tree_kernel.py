@@ -1,7 +1,7 @@
-"""A tree's places, motions, inertia and inverse dynamics with their derivatives, state by state: compiled.
+"""Compiled kernels for a tree's poses, motions, inertia and inverse dynamics with derivatives, state by state.
 
-The formulas are in `mechanics.tree`: spatial vectors are [angular; linear] in world
-about its origin. Each loop goes along a joint's own ancestors only. Kept apart as Numba compiles what is in here.
+The formulas are in `mechanics.tree`. Spatial vectors are [angular; linear] in world about its origin. Each inner loop
+visits only the ancestors of a joint. The kernels have a module of their own because Numba compiles them.
 """
 
 from typing import NamedTuple
@@ -20,40 +20,40 @@ WELD, HINGE, SLIDE, FREE = 0, 1, 2, 3
 class Tree(NamedTuple):
     """L links, every parent before its children, carried by J joints of one or three degrees of freedom.
 
-    A free body is two joints: three slides, and after them three turns about world axes.
+    A free body has two joints: three slides, followed by three rotations about world axes.
     """
 
     link_parent: Whole  # (L,) -1 for the world
     kind: Whole  # (L,)
-    joint: Whole  # (L,) that carries it, -1 where none does
+    joint: Whole  # (L,) the joint that carries the link, -1 for a link fixed to the world
     q_start: Whole  # (L,)
     v_start: Whole  # (L,)
     axis: Array  # (L, 3) in the joint's frames
-    frame: Array  # (L, 3, 4) of the joint on the parent
-    back: Array  # (L, 3, 4) of the link in the joint's other frame
+    frame: Array  # (L, 3, 4) pose of the joint's frame on the parent
+    back: Array  # (L, 3, 4) pose of the link in the joint's frame on the child
     mass: Array  # (L,)
-    center: Array  # (L, 3) of mass, in the link
-    inertia: Array  # (L, 3, 3) about it
+    center: Array  # (L, 3) centre of mass in the link's frame
+    inertia: Array  # (L, 3, 3) about the centre of mass
     parent: Whole  # (J,) -1 for the world; every parent before its children
-    first: Whole  # (J,) in v
-    size: Whole  # (J,) degrees of freedom
+    first: Whole  # (J,) index of the first velocity
+    size: Whole  # (J,) number of degrees of freedom
     gravity: Array  # (3,)
 
 
 class Forces(NamedTuple):
-    """What acts beside the tree's own inertia and gravity, by its nv velocities."""
+    """Joint forces and input forces added to the tree's inertia and gravity, in the order of its nv velocities."""
 
     time_step: float
     armature: Array  # (nv,)
     stiffness: Array  # (nv,)
     damping: Array  # (nv,)
-    rest: Array  # (nv,)
+    rest: Array  # (nv,) constant force due to the rest positions
     actuation: Array  # (nv, nu)
-    limit: Array  # (nu,) of inputs that are clipped
+    limit: Array  # (nu,) effort limits, to which the inputs are clipped
 
 
 class SaturationBounds(NamedTuple):
-    """(nu,) each: from `lowest` down an input is on its lower bound, from `highest` up on its upper one."""
+    """Bounds (nu,) of inputs: an input <= `lowest` is set to `lower`, and an input >= `highest` is set to `upper`."""
 
     lowest: Array
     highest: Array
@@ -63,7 +63,7 @@ class SaturationBounds(NamedTuple):
 
 @compiled
 def _compose(R: Array, p: Array, X: Array, R_out: Array, p_out: Array) -> None:
-    """(R_out, p_out) = (R, p) X."""
+    """Compute (R_out, p_out) = (R, p) X."""
     for i in range(3):
         total = p[i]
         for j in range(3):
@@ -74,7 +74,7 @@ def _compose(R: Array, p: Array, X: Array, R_out: Array, p_out: Array) -> None:
 
 @compiled
 def _turned(R: Array, axis: Array, angle: float, out: Array) -> None:
-    """out = R exp(angle axis^)."""
+    """Compute out = R exp(angle axis^)."""
     c, s = np.cos(angle), np.sin(angle)
     x, y, z, d = axis[0], axis[1], axis[2], 1.0 - c
     for i in range(3):
@@ -87,7 +87,7 @@ def _turned(R: Array, axis: Array, angle: float, out: Array) -> None:
 
 @compiled
 def _orientation(q: Array, start: int, out: Array) -> None:
-    """Of a quaternion (w, x, y, z) of any norm that begins at q[start]."""
+    """Compute the rotation matrix of the quaternion (w, x, y, z), of any norm, that begins at q[start]."""
     w, x, y, z = q[start], q[start + 1], q[start + 2], q[start + 3]
     d = 2.0 / (w * w + x * x + y * y + z * z)
     out[0, 0], out[0, 1], out[0, 2] = 1 - d * (y * y + z * z), d * (x * y - w * z), d * (x * z + w * y)
@@ -97,7 +97,7 @@ def _orientation(q: Array, start: int, out: Array) -> None:
 
 @compiled
 def _axis_through(S: Array, i: int, axis: Array, p: Array) -> None:
-    """S[i] is the turn about an axis through p."""
+    """Set S[i] to the rotation about an axis through p."""
     S[i, 0], S[i, 1], S[i, 2] = axis[0], axis[1], axis[2]
     S[i, 3] = p[1] * axis[2] - p[2] * axis[1]
     S[i, 4] = p[2] * axis[0] - p[0] * axis[2]
@@ -108,7 +108,7 @@ def _axis_through(S: Array, i: int, axis: Array, p: Array) -> None:
 def _through_joint(
     kind: int, local: Array, q: Array, start: int, R: Array, p: Array, R_child: Array, p_child: Array, S: Array, v: int
 ) -> None:
-    """The frame after a joint with the axis `local` (3,), (R, p) being that before it, and its motions from S[v] on."""
+    """Compute the frame after a joint with the axis `local` (3,) in the frame (R, p), and its motions from S[v] on."""
     for a in range(3):
         p_child[a] = p[a]
         for b in range(3):
@@ -138,9 +138,9 @@ def _through_joint(
 
 @compiled
 def _add_inertia(m: float, center: Array, inertia: Array, X: Array, out: Array) -> None:
-    """Add a link's inertia where its pose is X (3, 4) to out (10,).
+    """Add the inertia of a link with the pose X (3, 4) to out (10,).
 
-    That is mass, moment of mass (3) and xx yy zz xy xz yz about the world's origin.
+    The entries are mass, moment of mass (3), and xx yy zz xy xz yz about the world's origin.
     """
     c, squared = np.empty(3), 0.0
     for a in range(3):
@@ -157,7 +157,7 @@ def _add_inertia(m: float, center: Array, inertia: Array, X: Array, out: Array) 
 
 @compiled
 def _forward_kinematics(t: Tree, q: Array, poses: Array, S: Array, inertias: Array) -> None:
-    """The links' poses (L, 3, 4), the motions S (nv, 6), and the inertia (J, 10) that each joint carries itself."""
+    """Compute the links' poses (L, 3, 4), the motions S (nv, 6), and each joint's own inertia (J, 10)."""
     R, p, R_child, p_child = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
     R_world, p_world = np.eye(3), np.zeros(3)
     S[:], inertias[:] = 0.0, 0.0
@@ -176,17 +176,17 @@ def _forward_kinematics(t: Tree, q: Array, poses: Array, S: Array, inertias: Arr
 
 @compiled
 def _rotated(X: Array, inertia: Array, a: int, b: int) -> float:
-    """Entry (a, b) of R inertia R'."""
+    """Return entry (a, b) of R inertia R'."""
     total = 0.0
     for i in range(3):
         total += X[a, i] * (inertia[i, 0] * X[b, 0] + inertia[i, 1] * X[b, 1] + inertia[i, 2] * X[b, 2])
     return total
 
 
-# Of rows of matrices, and not of vectors: a view of a row costs more than what is done with it.
+# These functions take matrices and row indices, as a view of a row costs more than the arithmetic on the row.
 @compiled
 def _times(I: Array, i: int, S: Array, s: int, out: Array, o: int) -> None:  # noqa: E741
-    """out[o] = I[i] S[s]: the momentum [about the origin; linear] of an inertia (10,) that moves at S[s] (6,)."""
+    """Compute out[o] = I[i] S[s]: the momentum [about the origin; linear] of an inertia (10,) moving at S[s] (6,)."""
     m, x, y, z = I[i, 0], I[i, 1], I[i, 2], I[i, 3]
     w0, w1, w2, l0, l1, l2 = S[s, 0], S[s, 1], S[s, 2], S[s, 3], S[s, 4], S[s, 5]
     out[o, 0] = I[i, 4] * w0 + I[i, 7] * w1 + I[i, 8] * w2 + y * l2 - z * l1
@@ -199,7 +199,7 @@ def _times(I: Array, i: int, S: Array, s: int, out: Array, o: int) -> None:  # n
 
 @compiled
 def _add_cross(M: Array, m: int, S: Array, s: int, out: Array, o: int) -> None:
-    """out[o] += M[m] x S[s] of motions (6,)."""
+    """Compute out[o] += M[m] x S[s] for motions (6,)."""
     a0, a1, a2, b0, b1, b2 = M[m, 0], M[m, 1], M[m, 2], M[m, 3], M[m, 4], M[m, 5]
     w0, w1, w2, l0, l1, l2 = S[s, 0], S[s, 1], S[s, 2], S[s, 3], S[s, 4], S[s, 5]
     out[o, 0] += a1 * w2 - a2 * w1
@@ -212,7 +212,7 @@ def _add_cross(M: Array, m: int, S: Array, s: int, out: Array, o: int) -> None:
 
 @compiled
 def _add_cross_force(M: Array, m: int, F: Array, f: int, out: Array, o: int) -> None:
-    """out[o] += M[m] x* F[f] of a motion and a force (6,)."""
+    """Compute out[o] += M[m] x* F[f] for a motion and a force (6,)."""
     a0, a1, a2, b0, b1, b2 = M[m, 0], M[m, 1], M[m, 2], M[m, 3], M[m, 4], M[m, 5]
     n0, n1, n2, f0, f1, f2 = F[f, 0], F[f, 1], F[f, 2], F[f, 3], F[f, 4], F[f, 5]
     out[o, 0] += a1 * n2 - a2 * n1 + b1 * f2 - b2 * f1
@@ -233,7 +233,7 @@ def _dot(A: Array, a: int, B: Array, b: int) -> float:
 
 @compiled
 def _force_rates(I: Array, j: int, V: Array, momentum: Array, B: Array, work: Array) -> None:  # noqa: E741
-    """B[j] (6, 6) = (V x*) I - I (V x) + (I V) x* of the inertia I[j] that moves at V[j] with `momentum` (1, 6)."""
+    """Compute B[j] (6, 6) = (V x*) I - I (V x) + (I V) x* for the inertia I[j] at V[j] with `momentum` (1, 6)."""
     for k in range(6):
         for r in range(3):
             for i in range(6):
@@ -263,10 +263,10 @@ def differentiate_tree(
     by_q: Array,
     by_v: Array,
 ) -> None:
-    """At N states: the links' poses (N, L, 3, 4), S (N, nv, 6), M and d M_kk / d q_j (N, nv, nv) by k and j.
+    """Compute, at N states, the links' poses (N, L, 3, 4), S (N, nv, 6), M, and d M_kk / d q_j at entry k, j.
 
-    And the inverse dynamics (N, nv) at the accelerations a (N, nv), with its derivatives by small motion and by v where
-    these are asked for.
+    Also compute the inverse dynamics (N, nv) at the accelerations a (N, nv) and, with `derivatives`, its derivatives
+    with respect to the tangent of q and to v. `slope` is only computed with `derivatives`.
     """
     nv, J = v.shape[1], len(t.parent)
     parent, first, size = t.parent, t.first, t.size
@@ -274,7 +274,7 @@ def differentiate_tree(
     V, A, F, B = np.empty((J + 1, 6)), np.empty((J + 1, 6)), np.empty((J, 6)), np.empty((J, 6, 6))
     before, P, Q, T = np.empty((nv, 6)), np.empty((nv, 6)), np.empty((nv, 6)), np.empty((nv, 6))
     S_I, S_B, of_q, of_v = np.empty((1, 6)), np.empty(6), np.empty((1, 6)), np.empty((1, 6))
-    V[J], A[J] = 0.0, 0.0  # the world's, which -1 finds
+    V[J], A[J] = 0.0, 0.0  # of the world
     for i in range(3):
         A[J, 3 + i] = -t.gravity[i]
     for n in range(len(q)):
@@ -350,7 +350,7 @@ def differentiate_tree(
                             for i in range(6):
                                 by_q[n, s, k] += S_B[i] * P[k, i] + S_I[0, i] * Q[k, i]
                                 by_v[n, s, k] += S_B[i] * S[k, i] + S_I[0, i] * T[k, i]
-                        if turns:  # turning what is carried is turning back the motion before it
+                        if turns:  # rotating the carried bodies is equivalent to rotating the motions before them back
                             for i in range(6):
                                 work[0, i] = 0.0
                             _add_cross(S, s, S, k, work, 0)
@@ -361,7 +361,7 @@ def differentiate_tree(
 
 @compiled
 def _factor(M: Array) -> bool:
-    """L D L' = M in the lower half of M, D on the diagonal; False if it is not positive definite."""
+    """Factor M = L D L' in place, L in the lower half and D on the diagonal; return False if not positive definite."""
     n = len(M)
     for i in range(n):
         for j in range(i):
@@ -382,7 +382,7 @@ def _factor(M: Array) -> bool:
 
 @compiled
 def substitute(M: Array, B: Array) -> None:
-    """B (n, m) = (L D L')^-1 B of what `_factor` left in M, row by row as they lie in memory."""
+    """Solve B (n, m) = (L D L')^-1 B in place with the factors of `_factor` in M, in the memory order of rows."""
     n, m = B.shape
     for i in range(n):
         for k in range(i):
@@ -401,7 +401,7 @@ def substitute(M: Array, B: Array) -> None:
 
 @compiled
 def assemble_step(h: float, free: Whole, single: Whole, q: Array, v_next: Array, by: Array, out: Array) -> None:
-    """out (nx, nx + nu + np) from the derivative (nv, 2 nv + nu + np) of v' by small motion, v, u and parameters."""
+    """Compute `out` (nx, nx + nu + np) from dv' / d(tangent of q, v, u, parameters), `by` (nv, 2 nv + nu + np)."""
     nq, nv, width = len(q), len(v_next), by.shape[1]
     shift = nq - nv
     out[:] = 0.0
@@ -458,7 +458,7 @@ def assemble_step(h: float, free: Whole, single: Whole, q: Array, v_next: Array,
 
 @compiled
 def assemble_steps(h: float, free: Whole, single: Whole, q: Array, v_next: Array, by: Array, out: Array) -> None:
-    """`assemble_step` of N steps."""
+    """Compute `assemble_step` for N steps."""
     for k in range(len(q)):
         assemble_step(h, free, single, q[k], v_next[k], by[k], out[k])
 
@@ -475,10 +475,10 @@ def differentiate_acceleration(
     inverse: Array,
     acceleration: Array,
 ) -> None:
-    """At N states the accelerations a (N, nv) under generalized forces (N, nv), and their derivatives (N, nv, nv) each.
+    """Compute accelerations (N, nv) under generalized forces (N, nv), and derivatives (N, nv, nv each), at N states.
 
-    By small motion, by v, and by the forces, which is the inverse of the mass matrix with the `armature` (nv,). All are
-    NaN where that is not positive definite.
+    The derivatives are with respect to the tangent of q, v, and the forces. The last is the inverse of the mass matrix
+    plus `armature` (nv,). All results are NaN where this matrix is not positive definite.
     """
     n, L = v.shape[1], len(t.kind)
     poses, S, tau = np.empty((1, L, 3, 4)), np.empty((1, n, 6)), np.empty((1, n))
@@ -525,7 +525,7 @@ def roll(
 ) -> bool:
     """Fill us (N, nu) = wanted + gains (N, nu, nx) (xs - old), within bounds, and xs (N+1, nx) from xs[0] on.
 
-    Each step leads to what it leaves less its gap (N, nx). False where a mass matrix is not positive definite.
+    The gap (N, nx) of each step is subtracted from its next state. False if a mass matrix is not positive definite.
     """
     count, nu = us.shape
     nx = xs.shape[1]
@@ -534,7 +534,7 @@ def roll(
     poses, S, inertias = np.empty((len(tree.kind), 3, 4)), np.empty((n, 6)), np.empty((J, 10))
     V, A, F, momentum = np.empty((J + 1, 6)), np.empty((J + 1, 6)), np.empty((J, 6)), np.empty((1, 6))
     M, a = np.zeros((n, n)), np.empty((n, 1))
-    V[J], A[J] = 0.0, 0.0  # the world's
+    V[J], A[J] = 0.0, 0.0  # of the world
     for i in range(3):
         A[J, 3 + i] = -tree.gravity[i]
     for k in range(count):

@@ -1,4 +1,4 @@
-"""Many steps: rollouts, policies, the gradient back through them, and smoothing."""
+"""Rollouts of many steps, policies, gradients of rollouts by reverse accumulation, and smoothing."""
 
 from drake_diff._base import attach_stub as _attach_stub
 

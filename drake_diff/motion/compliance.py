@@ -1,14 +1,14 @@
-"""The law of compliant point contact in continuous time, in ordinary arithmetic: for floats and for CasADi's symbols.
+"""The law of compliant point contact in continuous time, in ordinary arithmetic, for floats and CasADi's symbols.
 
     f (n - mu step5(|v_t| / v_s) v_t / |v_t|)
 
-with a normal force f at depth x and its rate x',
+with a normal force f that depends on the depth x and its rate x',
 
     `sap`:                 k (x + tau x')+      (Kelvin and Voigt)
     `similar`, `lagged`:   k x (1 + d x')+      (Hunt and Crossley)
 
-step5(r) = r^3 (10 - 15 r + 6 r^2) up to 1, as in Drake's continuous plants. What is in the bracket is its `bracket`:
-a contact pushes where geometries overlap and it is above 0.
+step5(r) = r^3 (10 - 15 r + 6 r^2) for r <= 1 and 1 beyond, as in Drake's continuous plants. The expression in
+parentheses is called `bracket`. The contact force acts where geometries overlap and the bracket is positive.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,16 +23,16 @@ from drake_diff.model.plant import proximity_property
 
 STICTION_SPEED = 1e-3  # v_s [m/s], Drake's default in continuous time; in Drake's steps it is 1e-4 or less
 KELVIN_VOIGT, HUNT_CROSSLEY = "Kelvin-Voigt", "Hunt-Crossley"
-DAMPING = {KELVIN_VOIGT: "relaxation_time", HUNT_CROSSLEY: "dissipation"}  # the quantity each needs beside stiffness
+DAMPING = {KELVIN_VOIGT: "relaxation_time", HUNT_CROSSLEY: "dissipation"}  # the damping parameter of each law
 
 
 def limit_law(model: Model) -> str:
-    """The law that a model's steps tend to as they become short."""
+    """Return the contact law that a model's steps converge to as the time step goes to 0."""
     return KELVIN_VOIGT if model.contract.contact.approximation == "sap" else HUNT_CROSSLEY
 
 
 def read_material(inspector: Any, pairs: Sequence[tuple[Any, Any]], law: str) -> Material:
-    """What pairs of geometries have in the context, applied parameters included; ModelError where a value misses."""
+    """Read the material of pairs of geometries with applied parameters; raise ModelError if a value is missing."""
     sides = []
     for geometry in (i for pair in pairs for i in pair):
         values = {name: proximity_property(inspector, geometry, name) for name in QUANTITIES}
@@ -46,16 +46,16 @@ def read_material(inspector: Any, pairs: Sequence[tuple[Any, Any]], law: str) ->
 
 
 def bracket(law: str, depth: Any, rate: Any, damping: Any) -> Any:
-    """x + tau x' [m] or 1 + d x'."""
+    """Return the bracket, x + tau x' [m] or 1 + d x'."""
     return (depth if law == KELVIN_VOIGT else 1.0) + damping * rate
 
 
 def normal_force(law: str, stiffness: Any, depth: Any, bracket: Any) -> Any:
-    """[N] where the contact pushes."""
+    """Return the normal force [N] of an active contact."""
     return stiffness * bracket if law == KELVIN_VOIGT else stiffness * depth * bracket
 
 
 def drag(friction: Any, speed: Any, least: Callable[[Any, Any], Any]) -> Any:
-    """[s/m] the friction force by the normal force and the slip, at a `speed` above 0 of it; `least` is a minimum."""
+    """Return friction force / (normal force * slip) [s/m] at a slip `speed` above 0; `least` is a minimum function."""
     r = least(speed / STICTION_SPEED, 1.0)
     return friction * r**3 * (10 - 15 * r + 6 * r**2) / speed

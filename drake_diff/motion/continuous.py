@@ -1,10 +1,10 @@
-"""The motion in continuous time that a model's discrete steps stand for, integrated with error control.
+"""The motion in continuous time that a model's discrete steps approximate, integrated with error control.
 
     M(q) dv/dt = B u + forces(q, v) - C(q, v) v + sum over contacts J' (the force of `compliance`)
 
-with the law of the model's own contact approximation and Drake's rules for the two sides of a contact. Of Drake it
-takes the mass matrix, the forces without contact and where geometries overlap, and nothing of a discrete step. It
-shares no equation with the flow that plans in continuous time are made by, so that they are replayed by it.
+with the law of the model's own contact approximation and Drake's rules to combine the two materials of a contact. The
+mass matrix, the forces without contact, and the overlaps of geometries come from Drake. Discrete steps are not used.
+It shares no equations with the flow used to plan in continuous time, so that replaying a plan is a cross-check.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -25,44 +25,44 @@ from drake_diff.motion import compliance
 from drake_diff.motion.integrate import TOLERANCE, Flags, Integrator, Pairs, Step, System, deepest_contacts
 from drake_diff.motion.rollout import Policy, Rollout, continuous_rollout
 
-NUDGE = 1e-9  # of a state's entries, which the slopes of the rates are differences over: a millionth of v_s
-LOOK, LOOKS = 1e-3, 8  # [s] how often a step in the air is looked at for what touches, and how many times at most
+NUDGE = 1e-9  # relative finite-difference step of the state for the Jacobian of the rates: a millionth of v_s
+LOOK, LOOKS = 1e-3, 8  # [s] interval of contact checks within a step without contact, and their maximum number
 Chooser = Callable[[Array, int], Array]  # the state (nx,) and the number of the step -> the input (nu,)
 Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class _Touch:
-    """What two geometries are when they touch: mu, k [N/m], d [s/m] or tau [s], the part of A's point in it."""
+    """The contact parameters of two geometries A and B."""
 
     friction: float
-    stiffness: float
-    damping: float
-    share: float
-    bodies: tuple[tuple[float, int, Any], ...]  # +1 for A and -1 for B, its index, itself; the world left out
+    stiffness: float  # [N/m]
+    damping: float  # d [s/m] or tau [s]
+    share: float  # weight of A's witness point in the contact point
+    bodies: tuple[tuple[float, int, Any], ...]  # (+1 for A or -1 for B, body index, body), without the world
 
 
 @dataclass(frozen=True, slots=True)
 class _Contact:
-    """Two geometries A and B that overlap; A's point moves at `relative` to B's, and the `normal` is out of B."""
+    """Two overlapping geometries A and B; `relative` is A's velocity relative to B, and `normal` points out of B."""
 
     pair: int
     ids: tuple[Any, Any]
     touch: _Touch
     depth: float  # [m]
-    point: Vector  # where the force acts, in world
+    point: Vector  # the contact point in world
     normal: Vector
     relative: Vector
     force: Vector  # [N] on A
-    push: float  # [N] of it along the normal
+    push: float  # [N] normal component of the force
 
 
 class ContinuousMotion(System):
-    """The continuous motion of a model, as it is now: parameters that are applied act.
+    """The continuous motion of a model with its currently applied parameters.
 
-    `law` is that of contact, the model's own where it is not given. With `works`, three more states are the work of
-    inputs, what damping took and the work of contact [J]. Raises ModelError, which says why, where the model has no
-    such motion: contact that is no point contact, PD controllers, constraints.
+    `law` is the contact law, by default the model's own. With `works`, three more states are the work of the inputs,
+    the energy dissipated by damping, and the work of contact [J]. Raises ModelError if the model has contact other than
+    point contact, PD controllers, or constraints.
     """
 
     contact_is_stiff = True
@@ -84,26 +84,26 @@ class ContinuousMotion(System):
         candidates = model.double.inspector.GetCollisionCandidates() if contact.collision_pairs else ()
         self.numbers = {ids: i for i, pair in enumerate(sorted(candidates)) for ids in (pair, pair[::-1])}
         self.num_pairs = len(self.numbers) // 2
-        self.touched = False  # whether anything touched in the last call of `roll`
+        self.touched = False  # whether any contact was active in the last call of `roll`
         self._touches: dict[int, _Touch] = {}
         self.set_input(np.zeros(model.nu))
 
     def set_input(self, u: Array) -> None:
-        """Hold the input `u` (nu,) from now on."""
+        """Set the constant input `u` (nu,)."""
         self.twin.set_input(u)
         self.force = self.model.actuation @ np.clip(u, -self.limits, self.limits)
 
     def states(self, x0: Array, us: Array) -> Array:
-        """(N+1, nx) at the ends of the model's steps, over which us (N, nu) is held; raises as `roll`."""
+        """Return the states (N+1, nx) at the ends of the model's steps under constant us (N, nu); raise as `roll`."""
         return self.roll(x0, lambda x, k: us[k], len(us))[0]
 
     def roll(
         self, x0: Array, choose: Chooser, count: int, *, tolerance: float = TOLERANCE, deadline: float = np.inf
     ) -> tuple[Array, Array]:
-        """xs (N+1, nx) at the ends of the model's steps, and us (N, nu), each chosen at the start of one and held.
+        """Return xs (N+1, nx) at the ends of the model's steps, and us (N, nu), each chosen at the start of its step.
 
-        SimulationError where it has no end: it reaches a joint limit, or is too stiff. TimeoutError where this thread
-        has worked (`time.thread_time`) until `deadline` [s].
+        Raises SimulationError if the motion reaches a joint limit or is too stiff, and TimeoutError if this thread's
+        CPU time (`time.thread_time`) exceeds `deadline` [s].
         """
         xs, us = np.empty((count + 1, len(x0))), np.empty((count, self.model.nu))
         xs[0], self.touched = x0, False
@@ -115,7 +115,7 @@ class ContinuousMotion(System):
     def intervals(
         self, x0: Array, choose: Chooser, count: int, tolerance: float = TOLERANCE, deadline: float = np.inf
     ) -> Iterator[tuple[Array, list[Step]]]:
-        """The input (nu,) and the steps of each of the model's own steps from the state `x0`."""
+        """Yield the input (nu,) and the integrator's steps for each of the model's own steps from the state `x0`."""
         integrator, x = Integrator(self, tolerance, deadline), x0
         for k in range(count):
             u = choose(x[: self.model.nx], k)
@@ -127,7 +127,7 @@ class ContinuousMotion(System):
             yield u, steps
 
     def rates(self, x: Array) -> Array:
-        """dx/dt at `x` under the input, where no other pairs push than those that do in this step."""
+        """Return dx/dt at `x` under the input, with forces only from the pairs `pushing` of this step."""
         self.used += 1
         twin, v = self.twin, x[self.model.nq : self.model.nx]
         set_state(twin, x[: self.model.nx])
@@ -146,7 +146,7 @@ class ContinuousMotion(System):
         return slopes
 
     def watch(self, x: Array, rates: Array) -> tuple[Array, Array]:
-        """1 of each pair that pushes, else -1: of what does not overlap Drake tells nothing."""
+        """Return 1 for each pair with a contact force, else -1; Drake gives no distances of separated geometries."""
         values = np.full(self.num_pairs, -1.0)
         if self.num_pairs:
             set_state(self.twin, x[: self.model.nx])
@@ -166,7 +166,7 @@ class ContinuousMotion(System):
             raise SimulationError("it reaches a joint limit, which is not supported in continuous time")
 
     def contact_force(self, pairs: Pairs | None = None) -> Array:
-        """(nv,) of all contacts in the context's state, or of some `pairs`."""
+        """Return the generalized force (nv,) of all contacts at the context's state, or of some `pairs`."""
         plant, context = self.twin.plant, self.twin.context
         wrenches: dict[int, Array] = {}  # on each body about the world's origin
         for contact in self._contacts(pairs):
@@ -181,7 +181,7 @@ class ContinuousMotion(System):
         return np.asarray(self.twin.own_force(plant.CalcGeneralizedForces(context, self.forces)))
 
     def touches_at(self, x: Array) -> Iterator[tuple[str, float, float, Array]]:
-        """(names, k [N/m], d [s/m] or tau [s], the inverse mass (3, 3) at the contact) of each that overlaps at `x`."""
+        """Yield (names, k [N/m], d [s/m] or tau [s], inverse mass (3, 3) at the contact) for each overlap at `x`."""
         if not self.num_pairs:
             return
         set_state(self.twin, x)
@@ -204,7 +204,7 @@ class ContinuousMotion(System):
         for contact in self._contacts(pairs):
             if contact.push > 0:
                 (a, b), sign = (body_of(self.model, geometry) for geometry in contact.ids), 1.0
-                if self.twin.plant.IsAnchored(a):  # the force is the one on what can move
+                if self.twin.plant.IsAnchored(a):  # report the force on the movable body
                     a, b, sign = b, a, -1.0
                 normal, relative = np.array(contact.normal), np.array(contact.relative)
                 slip = float(np.linalg.norm(relative - (relative @ normal) * normal))
@@ -212,14 +212,14 @@ class ContinuousMotion(System):
                 yield contact.pair, ContactPoint(a.name(), b.name(), *where, contact.depth, slip)
 
     def _contacts(self, pairs: Pairs | None = None) -> "Iterator[_Contact]":
-        """The pairs that overlap in the context's state, or some of them."""
+        """Yield the overlaps at the context's state, of all pairs or of `pairs`."""
         plant, context = self.twin.plant, self.twin.context
         query = plant.get_geometry_query_input_port().Eval(context)
         try:
             overlaps = query.ComputePointPairPenetration()
         except RuntimeError as error:
             raise SimulationError(f"Drake cannot tell how deep geometries overlap: {error}") from error
-        twists: dict[int, tuple[Vector, Vector]] = {}  # how each body turns, and how its point at the origin moves
+        twists: dict[int, tuple[Vector, Vector]] = {}  # angular velocity, and velocity of the point at world's origin
         for overlap in overlaps:
             ids = overlap.id_A, overlap.id_B
             number = self.numbers[ids]
@@ -241,7 +241,7 @@ class ContinuousMotion(System):
             yield _Contact(number, ids, touch, float(overlap.depth), point, normal, relative, force, push)
 
     def _force(self, touch: _Touch, depth: float, normal: Vector, relative: Vector) -> tuple[Vector, float]:
-        """[N] on A, and how much of it is along the normal."""
+        """Return the force on A [N] and its normal component."""
         rate = -_dot(normal, relative)
         bracket = compliance.bracket(self.law, depth, rate, touch.damping)
         push = max(0.0, compliance.normal_force(self.law, touch.stiffness, depth, bracket))
@@ -258,7 +258,7 @@ class ContinuousMotion(System):
             if body.index() != plant.world_body().index():
                 bodies.append((sign, int(body.index()), body))
         damped = material.time if self.law == compliance.KELVIN_VOIGT else material.dissipation
-        # The force acts where Drake's steps have it, or, as in its continuous plants, in the middle.
+        # The contact point is that of Drake's steps, or the midpoint as in Drake's continuous plants.
         share = 1 - float(material.other_part[0]) if self.law == compliance.limit_law(self.model) else 0.5
         friction, stiffness, damping = (float(a[0]) for a in (material.friction, material.stiffness, damped))
         self._touches[number] = _Touch(friction, stiffness, damping, share, tuple(bodies))
@@ -290,11 +290,11 @@ def replayed(
     evaluations: int | None = None,
     sizes: Array | None = None,
 ) -> Rollout:
-    """The motion over `count` of the model's steps under us (N, nu) or a policy; raises what `ContinuousMotion` does.
+    """Return the motion over `count` of the model's steps under us (N, nu) or a policy; raise as `ContinuousMotion`.
 
-    It is too stiff where it takes more than `evaluations` of the equations of motion to the `tolerance` of each step.
+    The motion is too stiff if it needs more than `evaluations` of the equations of motion at the given `tolerance`.
     """
-    all_sizes = 1.0 if sizes is None else np.append(sizes, np.ones(3))  # of works 1 J
+    all_sizes = 1.0 if sizes is None else np.append(sizes, np.ones(3))  # 1 J for the work states
     motion, nx = ContinuousMotion(model, works=True, sizes=all_sizes), model.nx
     motion.most = evaluations or motion.most
 

@@ -1,22 +1,22 @@
-"""The flow over a model's intervals: its ends, their derivatives, and contacts and work along its steps.
+"""The flow over a model's intervals: its end states, their derivatives, and the contacts and work along its steps.
 
-Within a step the motion is taken to be the polynomial of degree 5 that has the states at its ends, their rates and how
-these change.
+Within a step the motion is interpolated by the polynomial of degree 5 that matches the states, their rates and the time
+derivatives of the rates at both ends.
 
-In a step the change Phi of the motion follows Phi' = A(t) Phi + B(t), A and B being the slopes of the rates on the way,
-by the collocation method of three points of order 5 (Radau IIA; Hairer and Wanner, "Solving Ordinary Differential
-Equations II", 1996, IV.5). It is stable at any length of step: a motion that rests does not show how stiff the friction
-is that holds it, and small changes of it do.
+The sensitivity Phi within a step solves Phi' = A(t) Phi + B(t), where A and B are the derivatives of the rates along
+the motion. It is integrated by the three-point collocation method of order 5 (Radau IIA; Hairer and Wanner, "Solving
+Ordinary Differential Equations II", 1996, IV.5). This method is stable for any step length: a resting motion allows
+long steps, but the stiff friction that keeps it at rest makes its sensitivity stiff.
 
-Where a switch turns at an event that the motion meets under way, the time of the event moves with the state, and where
-the rates jump there from f- to f+,
+If a switch changes sign at an event within the motion, the time of the event changes with the state. If the rates jump
+at the event from f- to f+,
 
     dx+ = (1 + (f+ - f-) g' / (g' f-)) dx-,
 
-g' being the slope of the switch: the saltation matrix (Leine and Nijmeijer, "Dynamics and Bifurcations of Non-Smooth
-Mechanical Systems", 2004). The step before it ends at the event, so that its own length does not count.
+where g' is the gradient of the switch. This is the saltation matrix (Leine and Nijmeijer, "Dynamics and Bifurcations of
+Non-Smooth Mechanical Systems", 2004). The step before ends at the event, so the derivative of its length is not needed.
 
-Work is the power at three points of each step by Gauss' quadrature of order 6.
+Work is integrated from the power at three points of each step by Gauss quadrature of order 6.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,12 +37,12 @@ from drake_diff.motion.flow_plant import FlowPlant, flow_plant, material_of, num
 from drake_diff.motion.integrate import TOLERANCE, Flags, Integrator, Pairs, Step, System, deepest_contacts
 
 METHOD = "continuous"
-EDGE = 1e-9  # [m] a body that moves along an edge passes it all the time by less
+EDGE = 1e-9  # [m] slack of edge switches: a body that moves along an edge crosses it repeatedly by less
 Chooser = Callable[[Array, int], Array]  # the state (nx,) and the number of the interval -> the input (nu,)
 
 
 class FlowSystem(System):
-    """A `FlowPlant` with contacts of given materials (4 P,), under the input `u` (nu,), on arrays that stay."""
+    """A `FlowPlant` with the contact materials (4 P,) and the input `u` (nu,), evaluated in preallocated arrays."""
 
     per_pair = 2
     most = 10_000_000
@@ -89,7 +89,7 @@ class FlowSystem(System):
         return self.all_slopes(x)[1][:, : len(x)]
 
     def all_slopes(self, x: Array) -> tuple[Array, Array]:
-        """(nx,) the rates and (nx, nx + nu) their slopes by state and input."""
+        """Return the rates (nx,) and their derivatives (nx, nx + nu) with respect to state and input."""
         self._x[:] = x
         self._run_slopes()
         return self._rates.copy(), self._slopes.T.copy()
@@ -110,7 +110,7 @@ class FlowSystem(System):
         return tuple(np.flatnonzero(on[:count:2] & on[1:count:2]).tolist())
 
     def relevant(self, on: Flags) -> Flags:
-        """A bracket where its pair overlaps, and an edge where its pair pushes."""
+        """Select the brackets of overlapping pairs and the edges of pairs with a contact force."""
         relevant, count = np.ones(len(on), dtype=bool), 2 * self.num_pairs
         relevant[1:count:2] = on[:count:2]
         relevant[count:] = (on[:count:2] & on[1:count:2])[self.plant.edge_pairs]
@@ -124,7 +124,7 @@ class FlowSystem(System):
         self.plant.check(x)
 
     def contacts(self, x: Array) -> Array:
-        """(P, 4, 3) of each pair where it acts, its normal, its force, and its depth and speed of slip."""
+        """Return, for each pair (P, 4, 3), the contact point, the normal, the force, and (depth, slip speed, 0)."""
         self._x[:] = x
         self._run_contacts()
         return self._contacts.copy()
@@ -134,7 +134,7 @@ class FlowSystem(System):
         for i in pairs:
             point, normal, force, (depth, speed, _) = values[i]
             a, b = (plant.pairs.bodies[side[i]] for side in (plant.pairs.sphere_body, plant.pairs.other_body))
-            if plant.model.plant.IsAnchored(a):  # the force is the one on what can move
+            if plant.model.plant.IsAnchored(a):  # report the force on the movable body
                 a, b, normal, force = b, a, -normal, -force
             where = frozen(point), frozen(normal), frozen(force)
             points.append((i, ContactPoint(a.name(), b.name(), *where, float(depth), float(speed))))
@@ -142,7 +142,7 @@ class FlowSystem(System):
 
 
 def _bind(function: Any, arguments: Sequence[Array], results: Sequence[Array]) -> Any:
-    """What runs a function of CasADi's on arrays that stay where they are."""
+    """Return a callable that runs a CasADi function on fixed arrays."""
     buffer, run = function.buffer()
     for i, a in enumerate(arguments):
         if a.size:
@@ -150,12 +150,12 @@ def _bind(function: Any, arguments: Sequence[Array], results: Sequence[Array]) -
     for i, a in enumerate(results):
         if a.size:
             buffer.set_res(i, a.data)
-    run.buffer = buffer  # which has to live as long
+    run.buffer = buffer  # keeps the buffer alive as long as `run`
     return run
 
 
 def _between(share: float, starts: Array, ends: Array, hs: Array, at_start: Any, at_end: Any) -> Array:
-    """(M, nx) at a `share` of steps of lengths hs (M,), from the rates and their slopes there."""
+    """Interpolate (M, nx) at the fraction `share` of steps of lengths hs (M,), from the ends' rates and Jacobians."""
     c, d, h = share, 1 - share, hs[:, None]
     (f0, A0), (f1, A1) = at_start, at_end
     j0, j1 = ((A[:, :, : f.shape[1]] @ f[:, :, None])[:, :, 0] for f, A in ((f0, A0), (f1, A1)))
@@ -167,7 +167,7 @@ def _between(share: float, starts: Array, ends: Array, hs: Array, at_start: Any,
 
 
 ROOT_6 = np.sqrt(6.0)
-NODES = (4 - ROOT_6) / 10, (4 + ROOT_6) / 10  # and the end
+NODES = (4 - ROOT_6) / 10, (4 + ROOT_6) / 10  # the third node is the end of the step
 WEIGHTS = np.array(
     [
         [(88 - 7 * ROOT_6) / 360, (296 - 169 * ROOT_6) / 1800, (-2 + 3 * ROOT_6) / 225],
@@ -175,15 +175,15 @@ WEIGHTS = np.array(
         [(16 - ROOT_6) / 36, (16 + ROOT_6) / 36, 1 / 9],
     ]
 )
-SWING = 0.5  # of a part's length times the frequency that its stiffest entry would swing at
-SAME_WAY = 0.5  # the cosine of a normal's turn within a step: a step's error keeps it near 1 where it does not jump
-ALONG = 1e-9  # of the sizes of a switch's slope and of the rates: less is no crossing
-AT_ONCE = 1_000_000  # numbers of the equations that are solved in one call
+SWING = 0.5  # maximum of a part's length times the frequency of its stiffest entry
+SAME_WAY = 0.5  # smallest cosine of a normal's rotation in a step: error control keeps it near 1 unless it jumps
+ALONG = 1e-9  # relative to the norms of a switch's gradient and of the rates: a smaller rate is not a crossing
+AT_ONCE = 1_000_000  # numbers in the equations that are solved in one call
 
 
 @dataclass(frozen=True, eq=False)
 class Flow:
-    """`intervals` are N lists of steps, which lead from xs[k] under us[k] to xs[k + 1] unless they begin elsewhere."""
+    """`intervals` are N lists of steps, from xs[k] under us[k] to xs[k + 1] unless other start states were given."""
 
     xs: Array
     us: Array
@@ -191,14 +191,14 @@ class Flow:
 
     @property
     def steps(self) -> list[tuple[Step, Array]]:
-        """Every step and its input."""
+        """All steps with their inputs."""
         return [(step, u) for steps, u in zip(self.intervals, self.us, strict=True) for step in steps]
 
 
 class FlowSteps:
-    """The `Intervals` of a model in continuous time, to which a vector of contact parameters is applied.
+    """The `Intervals` in continuous time of a model to which a vector of contact parameters is applied.
 
-    ModelError where it has none.
+    Raises ModelError if continuous time does not support the model or a parameter.
     """
 
     def __init__(self, model: Model, vector: ParameterVector, tolerance: float = TOLERANCE):
@@ -213,7 +213,7 @@ class FlowSteps:
         self.integrator = Integrator(self.system, tolerance)
 
     def roll(self, x0: Array, choose: Chooser, count: int) -> Flow:
-        """The motion from `x0` (nx,) over `count` (N) intervals."""
+        """Integrate the motion from `x0` (nx,) over `count` (N) intervals."""
         xs, us, intervals = np.empty((count + 1, self.model.nx)), np.empty((count, self.model.nu)), []
         xs[0] = x0
         for k in range(count):
@@ -223,7 +223,7 @@ class FlowSteps:
         return Flow(xs, us, intervals)
 
     def _advance(self, u: Array, start: Array | None = None) -> list[Step]:
-        """The steps of an interval from `start` (nx,), or from where the last led."""
+        """Integrate an interval from `start` (nx,), or from the end of the last interval, and return its steps."""
         stepped()
         self.system.u[:] = u
         if start is not None:
@@ -250,7 +250,7 @@ class FlowSteps:
         return tuple((a, b) for a, b in names)
 
     def differentiate(self, flow: Flow) -> list[StepDerivatives]:
-        """Of the intervals of a flow."""
+        """Return the derivatives of a flow's intervals."""
         nx, nu, names = self.model.nx, self.model.nu, self.vector.names
         by_parameters = np.zeros((4 * self.plant.num_pairs, len(names)))
         if names:
@@ -269,7 +269,7 @@ class FlowSteps:
         return derivatives
 
     def _changes(self, flow: Flow, by_parameters: Array) -> Array:
-        """(M, nx, nx + nu + n) of all steps by state, input and parameters, jumps at events included."""
+        """Return all steps' derivatives (M, nx, nx + nu + n) with respect to (x, u, parameters), events included."""
         steps, nx = flow.steps, self.model.nx
         changes = np.empty((len(steps), nx, nx + self.model.nu + by_parameters.shape[1]))
         at_once = max(1, AT_ONCE // (9 * nx * changes.shape[2]))
@@ -284,7 +284,7 @@ class FlowSteps:
         return changes
 
     def _check_normals(self, step: Step) -> None:
-        """GradientError where the normal of a pair that pushes jumps within a step."""
+        """Raise GradientError if the normal of a pair with a contact force jumps within a step."""
         if not step.pushing:
             return
         pairs = list(step.pushing)
@@ -298,7 +298,7 @@ class FlowSteps:
             )
 
     def _jump(self, step: Step, u: Array, by_parameters: Array, change: Array) -> None:
-        """Put the jumps at the events that ended a step onto its derivative, one after the other."""
+        """Apply the saltation matrices of the events that ended a step to its derivative, one after the other."""
         (nx, nu), x, pushing = (self.model.nx, self.model.nu), step.ahead, step.pushing
         for event in step.events:
             before, after = (self._rates(pairs, x, u) for pairs in (pushing, event.pushing))
@@ -316,7 +316,7 @@ class FlowSteps:
 
 
 class _Slopes:
-    """Rates along some steps, and their slopes by state, input and n parameters (4 P, n) of the materials."""
+    """Rates along some steps, and their derivatives with respect to state, input and n parameters."""
 
     def __init__(self, system: FlowSystem, steps: Sequence[tuple[Step, Array]], by_parameters: Array):
         self.system, self.steps, self.by_parameters = system, steps, by_parameters
@@ -326,7 +326,7 @@ class _Slopes:
         self.at_start, self.at_end = self(self.starts, every), self(self.ends, every)
 
     def __call__(self, xs: Array, rows: Any) -> tuple[Array, Array]:
-        """(M, nx) the rates at xs (M, nx) of the steps `rows`, and (M, nx, nx + nu + n) their slopes."""
+        """Return the rates (M, nx) at xs (M, nx) in the steps `rows`, and their derivatives (M, nx, nx + nu + n)."""
         system, n = self.system, self.by_parameters.shape[1]
         (count, nx), nu = xs.shape, len(system.u)
         rates, slopes = np.empty((count, nx)), np.empty((count, nx, nx + nu + n))
@@ -342,15 +342,15 @@ class _Slopes:
         return rates, slopes
 
     def between(self, share: float, rows: Any) -> Array:
-        """(M, nx) the states at a `share` of the steps `rows`."""
+        """Return the states (M, nx) at the fraction `share` of the steps `rows`."""
         at_ends = ((rates[rows], slopes[rows]) for rates, slopes in (self.at_start, self.at_end))
         return _between(share, self.starts[rows], self.ends[rows], self.hs[rows], *at_ends)
 
     def integrate(self, changes: Array) -> None:
-        """Fill `changes` (M, nx, nx + nu + n).
+        """Fill `changes` (M, nx, nx + nu + n) with the sensitivities of the steps.
 
-        A motion that rests does not show how fast it would swing either: steps that are long for that are taken in
-        parts.
+        A resting motion does not show the frequency of oscillations around it. Steps that are long relative to this
+        frequency are divided into parts.
         """
         nx, nq = self.starts.shape[1], self.system.plant.model.nq
         stiffness = np.max(np.abs(self.at_start[1][:, nq:, :nq]), axis=(1, 2), initial=0.0)
@@ -370,7 +370,7 @@ class _Slopes:
 
 
 def _collocated(slopes: Array, hs: Array) -> Array:
-    """(M, nx, width) from the slopes (M, 3, nx, width) at the three points of steps of lengths hs (M,)."""
+    """Solve for sensitivities (M, nx, width) of steps with lengths hs (M,); `slopes` (M, 3, nx, width) at 3 points."""
     count, _, nx, _ = slopes.shape
     parts = hs[:, None, None, None, None] * WEIGHTS[None, :, :, None, None] * slopes[:, None]
     left = -parts[..., :nx].transpose(0, 1, 3, 2, 4).reshape(count, 3 * nx, 3 * nx)
@@ -388,7 +388,7 @@ GAUSS_WEIGHTS = 5 / 18, 8 / 18, 5 / 18
 def measured_flow(
     model: Model, vector: ParameterVector, x0: Array, choose: Chooser, count: int
 ) -> tuple[Array, Array, Array, Array, list[tuple[ContactPoint, ...]]]:
-    """The flow of a model, to which the vector is applied, over `count` of its intervals: see `continuous_rollout`."""
+    """Compute the arguments of `continuous_rollout` for a model with `vector` applied, over `count` intervals."""
     steps = FlowSteps(model, vector)
     flow = steps.roll(x0, choose, count)
     limits, ends = steps.plant.description.effort_limits, np.cumsum([0, *map(len, flow.intervals)])
@@ -397,7 +397,7 @@ def measured_flow(
 
 
 def _work(system: FlowSystem, steps: Sequence[tuple[Step, Array]]) -> Array:
-    """(M+1, 3) [J] what actuators did, what damping took and what contact did since the start."""
+    """Return the work of actuators, dissipation by damping and work of contact (M+1, 3) [J] since the start."""
     slopes, rows = _Slopes(system, steps, np.zeros((4 * system.num_pairs, 0))), np.arange(len(steps))
     done = np.zeros((len(steps) + 1, 3))
     for share, weight in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True):

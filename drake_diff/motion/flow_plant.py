@@ -1,10 +1,10 @@
-"""The equations of motion in continuous time of a tree that touches, as CasADi functions: compliant point contact.
+"""The continuous-time equations of motion of a tree with compliant point contact, as CasADi functions.
 
     M(q) dv/dt = B u - C(q, v) v + gravity + springs - D v + sum over contacts J' (the force of `compliance`)
 
-Each contact has two switches: whether the shapes overlap, and whether the bracket of its law is above 0. A contact
-pushes where both are on; the equations of a given set of contacts that push are smooth. Bodies are moved by spatial
-vectors [angular; linear] in world about its origin (Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 5, 6).
+Each contact has two switches: one is on if the shapes overlap, the other if the bracket of the contact law is positive.
+A contact is active if both are on. The equations for a given set of active contacts are smooth. Spatial vectors are
+[angular; linear] in world about its origin (Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 5, 6).
 """
 
 from dataclasses import dataclass
@@ -31,9 +31,9 @@ TINY_LENGTH = 1e-30  # [m^2] keeps the distance from a point or an axis differen
 
 
 def distance_of(pairs: ContactPairs, i: int, local: Any) -> tuple[Any, Any]:
-    """Of `local` (3,), in the frame of the other shape of pair `i`, from that shape: (distance, its gradient)."""
+    """Return the distance, with gradient, of `local` (3,) from pair `i`'s other shape, in the frame of this shape."""
     lower, upper = pairs.lower[i], pairs.upper[i]
-    if np.isinf(lower).any():  # a half space, below 0
+    if np.isinf(lower).any():  # a half space below a plane of constant z
         return local[2] - float(upper[2]), ca.DM([0, 0, 1])
     if pairs.is_round[i]:
         distance, gradient = _from_cylinder(local, float(upper[0]), float(upper[2]))
@@ -46,9 +46,9 @@ def distance_of(pairs: ContactPairs, i: int, local: Any) -> tuple[Any, Any]:
 
 
 def edges_of(pairs: ContactPairs, i: int, local: Any) -> list[Any]:
-    """Where the nearest point of the other shape goes from one of its faces to the next, how the normal turns jumps.
+    """Return switches for the edges of the other shape, where the derivative of the contact normal jumps.
 
-    Each is above 0 beyond a face, at `local` (3,) as in `distance_of`.
+    Each switch is positive if `local` (3,), as in `distance_of`, is beyond a face.
     """
     lower, upper = pairs.lower[i], pairs.upper[i]
     if np.isinf(lower).any():
@@ -67,7 +67,7 @@ def _from_box(local: Any, lower: Array, upper: Array) -> tuple[Any, Any]:
 
 
 def _from_cylinder(local: Any, radius: float, half: float) -> tuple[Any, Any]:
-    """Its axis is z."""
+    """Return the distance, with gradient, of `local` (3,) from a cylinder with axis z."""
     away = ca.sqrt(ca.sumsqr(local[:2]) + TINY_LENGTH)
     beside = ca.if_else(away > radius, 1 - radius / away, 0.0)
     outside = ca.vertcat(beside * local[:2], local[2] - ca.fmin(ca.fmax(local[2], -half), half))
@@ -77,7 +77,7 @@ def _from_cylinder(local: Any, radius: float, half: float) -> tuple[Any, Any]:
 
 
 def _from_faces(outside: Any, ways: Any, normals: Any) -> tuple[Any, Any]:
-    """By the way from the shape's nearest point, `outside` (3,), or within it by the shortest of the ways out."""
+    """Return the distance, with gradient, from the offset `outside` (3,), or inside from the nearest of the faces."""
     square = ca.sumsqr(outside)
     beyond = square > 0
     length = ca.sqrt(ca.if_else(beyond, square, 1.0))
@@ -90,27 +90,27 @@ def _from_faces(outside: Any, ways: Any, normals: Any) -> tuple[Any, Any]:
     return ca.if_else(beyond, length, -least), ca.if_else(beyond, outside / length, face)
 
 
-MOST_PARTS = 200  # sets of contacts whose equations are kept
+MOST_PARTS = 200  # number of sets of active contacts whose equations are cached
 TINY_SLIP = 1e-24  # [m^2/s^2] keeps the length of a slip of 0 differentiable
 
 
 @dataclass(frozen=True, eq=False)
 class FlowPart:
-    """Functions of x (nx,), u (nu,) and the materials (4 P,) where a given set of contacts pushes."""
+    """Functions of x (nx,), u (nu,) and the materials (4 P,) for a given set of active contacts."""
 
     rates: Any  # -> (nx,)
-    slopes: Any  # -> (nx,) the rates and (nx, nx + nu) their slopes by x and u
-    material_slopes: Any  # -> (nx, 4 pairs) by the materials of the pairs that push
-    step: Any  # and of a length h -> (nx,) a step ahead, (nx,) the rates there, (2,) its error, the rate of its stages
+    slopes: Any  # -> rates (nx,), and their Jacobian (nx, nx + nu) with respect to x and u
+    material_slopes: Any  # -> (nx, 4 pairs) derivative with respect to the materials of the active pairs
+    step: Any  # and the length h -> end state (nx,), rates at the end (nx,), (2,) the error and the rate of its stages
 
 
 class FlowPlant:
-    """A model's motion in continuous time; ModelError, which says why, where it has none.
+    """A model's equations of motion in continuous time; the constructor raises ModelError if there are none.
 
-    `watched` (x, u, materials, x') -> the switches, which are of each of P pairs -phi, above 0 where it overlaps, and
-    the bracket; edges of the shapes of `edge_pairs`; and the rates of all. `part(pushing)` are the equations where
-    these pairs push and no others, `powers(pushing)` (x, u, materials) -> (3,) [W] of actuators, damping and contact,
-    `switch_slope(i)` (x, u, materials) -> (1, nx + nu + 4 P) of a switch.
+    `watched` (x, u, materials, x') -> the switches and their rates. The switches are -phi (positive for an overlap) and
+    the bracket for each of P pairs, then edges of the shapes of `edge_pairs`. `part(pushing)` are the equations with
+    only these pairs active. `powers(pushing)` (x, u, materials) -> (3,) [W] of actuators, damping and contact.
+    `switch_slope(i)` (x, u, materials) -> the gradient of a switch (1, nx + nu + 4 P).
     """
 
     def __init__(self, model: Model):
@@ -119,7 +119,7 @@ class FlowPlant:
             raise ModelError(f"{contact.model} contact is not supported in continuous time: use point contact")
         self.model, self.pairs, self.law = model, read_pairs(model, cylinders=True), compliance.limit_law(model)
         count = len(self.pairs.ids)
-        self.is_whole = count == contact.collision_pairs  # whether all that may touch are pairs here
+        self.is_whole = count == contact.collision_pairs  # whether all collision candidates are in `pairs`
         self.x, self.u, self.materials = (
             ca.SX.sym(name, size) for name, size in (("x", model.nx), ("u", model.nu), ("materials", 4 * count))
         )
@@ -133,7 +133,7 @@ class FlowPlant:
         self._factors = ca.ldl(self.tree.mass())
         acceleration = ca.SX.sym("a", model.nv)
         needed = ca.vertsplit(self.tree.residual(acceleration)) if model.nv else []
-        by_x = ca.vertcat(*[-ca.gradient(row, self.x).T for row in needed])  # backwards, row by row, is shortest
+        by_x = ca.vertcat(*[-ca.gradient(row, self.x).T for row in needed])  # reverse mode row by row is shortest
         self._force_slopes = ca.Function("force_slopes", [self.x, acceleration], [by_x])
         self._by_u = ca.jacobian(self._force, self.u)
         self._position_slopes = ca.jacobian(self.tree.position_rates, ca.vertcat(self.x, self.u))
@@ -149,7 +149,7 @@ class FlowPlant:
         self.part, self.powers, self.switch_slope = keep(self._part), keep(self._powers), keep(self._switch_slope)
 
     def _touch(self, i: int, material: Any) -> "_Touch":
-        """Pair `i`, of `material` (4,)."""
+        """Make the expressions for the contact of pair `i` with `material` (4,)."""
         pairs, tree, names = self.pairs, self.tree, names_of(self.model.plant)[0]
         mu, k, damping, other_share = (material[j] for j in range(4))
         R, p, moves_sphere = tree.body(names[pairs.bodies[pairs.sphere_body[i]].index()])
@@ -183,7 +183,7 @@ class FlowPlant:
 
     @cached_property
     def contacts(self) -> Any:
-        """(x, materials) -> (3, 4 P): of each pair where it acts, its normal, its force and (depth, speed of slip)."""
+        """(x, materials) -> (3, 4 P): for each pair the contact point, normal, force, and (depth, slip speed, 0)."""
         columns = [ca.horzcat(t.point, t.normal, t.push, ca.vertcat(t.depth, t.speed, 0)) for t in self.touches]
         return ca.Function("contacts", [self.x, self.materials], [ca.densify(ca.horzcat(*columns))])
 
@@ -194,7 +194,7 @@ class FlowPlant:
         return self._function("powers", ca.vertcat(ca.dot(v, driven), ca.dot(damping * v, v), ca.dot(v, push)))
 
     def check(self, x: Array) -> None:
-        """SimulationError where shapes overlap at `x` (nx,) that are no pair here."""
+        """Raise SimulationError if shapes overlap at `x` (nx,) that are not in `pairs`."""
         if self.is_whole:
             return
         twin = self.model.double
@@ -214,7 +214,7 @@ class FlowPlant:
                 )
 
     def _part(self, pushing: tuple[int, ...]) -> FlowPart:
-        """dv/dt = M^-1 F(q, v, dv/dt = 0), and M d(dv/dt) = dF at that dv/dt."""
+        """Make the equations dv/dt = M^-1 F(q, v, dv/dt = 0), and M d(dv/dt) = dF at this dv/dt."""
         nq, force, push = self.model.nq, self._force, ca.SX.zeros(self.model.nv)
         by_x = ca.SX(self.model.nv, self.model.nx)
         by_materials = [ca.SX(self.model.nv, 0)]
@@ -237,7 +237,7 @@ class FlowPlant:
         )
 
     def _solve(self, right: Any) -> Any:
-        """M^-1 of (nv, n)."""
+        """Return M^-1 right (nv, n)."""
         return ca.ldl_solve(right, *self._factors) if right.numel() else right
 
     def _function(self, name: str, *values: Any) -> Any:
@@ -245,19 +245,19 @@ class FlowPlant:
 
 
 def flow_plant(model: Model) -> FlowPlant:
-    """That of a model, made once: contact's parameters are not in it, which are its functions' arguments."""
+    """Return the FlowPlant of a model, cached. Contact parameters are arguments of its functions."""
     if model.other_quantities <= set(QUANTITIES):
         return model.cache("flow plant", lambda: FlowPlant(model), of_structure=True)
     return FlowPlant(model)
 
 
 def material_of(plant: FlowPlant) -> Material:
-    """What the pairs have in the context, parameters that are applied included."""
+    """Read the materials of the pairs in the context, including applied parameters."""
     return compliance.read_material(plant.model.double.inspector, plant.pairs.ids, plant.law)
 
 
 def numbers_of(plant: FlowPlant, material: Material) -> Array:
-    """(4 P, ...) a material, or its change, as the functions take it."""
+    """Convert a material, or its derivative, to the array (4 P, ...) that the functions take."""
     damping = material.time if plant.law == compliance.KELVIN_VOIGT else material.dissipation
     columns = np.stack([material.friction, material.stiffness, damping, material.other_part], axis=1)
     return columns.reshape(4 * plant.num_pairs, *columns.shape[2:])
@@ -267,16 +267,16 @@ def numbers_of(plant: FlowPlant, material: Material) -> Array:
 class _Touch:
     depth: Any  # -phi [m]
     bracket: Any  # 1 + d x', or x + tau x' [m]
-    force: Any  # (nv,) where it pushes
-    point: Any  # (3,) [m] in world, where it acts
+    force: Any  # (nv,) generalized force of the active contact
+    point: Any  # (3,) [m] contact point in world
     normal: Any  # (3,) from the other shape to the sphere
-    push: Any  # (3,) [N] on the sphere where it pushes
-    speed: Any  # [m/s] of the slip
-    edges: list[Any]  # [m] where the nearest face of the other shape becomes another one
+    push: Any  # (3,) [N] force on the sphere of the active contact
+    speed: Any  # [m/s] slip speed
+    edges: list[Any]  # [m] switches where the nearest face of the other shape changes
 
 
 def _step_function(rates: Any) -> Any:
-    """(x, u, materials, h) -> the state after a step, the rates there, and its error and the rate of its stages."""
+    """Make (x, u, materials, h) -> the end state of a step, the rates there, and (error, rate of the stages)."""
     h = ca.SX.sym("h")
     x, u, materials = (ca.SX.sym(name, *rates.size_in(i)) for i, name in enumerate("xum"))
     slopes = [rates(x, u, materials)]

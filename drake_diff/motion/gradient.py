@@ -1,4 +1,4 @@
-"""The gradient of a scalar back through the steps of a rollout, with its norm at every step."""
+"""The gradient of a scalar loss through the steps of a rollout, with its norm at every step."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from drake_diff.motion.rollout import Policy, check_inputs
 if TYPE_CHECKING:
     from drake_diff.motion.undefined import Undefined
 
-CONTINUOUS = "continuous"  # the method that takes no steps of Drake's
-FINER = 1e-3  # of its tolerance: of a motion whose derivative is not the slope that there is
-NAMED = 3  # columns of which a warning tells the numbers
+CONTINUOUS = "continuous"  # the method that does not use Drake's steps
+FINER = 1e-3  # factor on the tolerance if the derivative differs from the converged slope
+NAMED = 3  # maximum number of columns listed in a warning
 
 
 @dataclass(frozen=True, eq=False)
 class RolloutGradient(ShowsItsRepr):
-    """A loss of a rollout and its gradient; `differentiate_rollout` makes one. Arrays are read-only.
+    """The loss of a rollout and its gradient, returned by `differentiate_rollout`. Arrays are read-only.
 
-    Under a policy `us` is what the policy chose, and all gradients go through the closed loop.
+    Under a policy, `us` are the inputs that the policy returned, and all gradients are those of the closed loop.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -49,17 +49,17 @@ class RolloutGradient(ShowsItsRepr):
     by_x0: Array  # (nx,)
     by_us: Array  # (N, nu)
     by_parameters: Array  # (np,)
-    by_policy: Array  # (n,) by the policy's own parameters
+    by_policy: Array  # (n,) with respect to the policy's own parameters
     parameter_names: tuple[str, ...]
-    parameter_sources: tuple[str, ...]  # where each column came from
-    # (N+1,) |d loss / d x_k|, the later steps being functions of x_k: where it grows without bound going back the
-    # gradient explodes, where it dies out the early inputs cannot be learned.
+    parameter_sources: tuple[str, ...]  # the derivative method of each parameter
+    # (N+1,) |d loss / d x_k|, with the later steps as functions of x_k. If it grows without bound for decreasing k, the
+    # gradient explodes. If it vanishes, the early inputs cannot be learned.
     state_gradient_norms: Array
-    xs: Array  # (N+1, nx) the motion
-    us: Array  # (N, nu) the inputs that were applied
-    methods: tuple[str, ...]  # where the step Jacobians came from: one name, or more where a fallback was taken
-    loss_method: str  # what differentiated the loss by the motion: "autograd", or "autodiff" where that cannot
-    # Of method="continuous": the columns in which the loss has no slope, the derivative being that of a point alone.
+    xs: Array  # (N+1, nx) the trajectory
+    us: Array  # (N, nu) the applied inputs
+    methods: tuple[str, ...]  # the methods of the step Jacobians: one name, or more if a fallback was used
+    loss_method: str  # the method that differentiated the loss: "autograd", or "autodiff" if autograd cannot
+    # For method="continuous": the columns in which the loss has no slope. Their derivative is valid at the point only.
     undefined: tuple[Undefined, ...] = ()
 
     def __repr__(self) -> str:
@@ -78,9 +78,9 @@ class RolloutGradient(ShowsItsRepr):
 
     @property
     def growth_rate(self) -> float:
-        """By which factor |d loss / d x_k| grows per step back in time: its geometric mean, 1 for a neutral motion.
+        """The factor by which |d loss / d x_k| grows per step back in time, as a geometric mean; 1 is neutral.
 
-        NaN where either end is zero: a gradient that does not depend on a state has no rate.
+        NaN if the norm is zero at either end.
         """
         first, last = self.state_gradient_norms[0], self.state_gradient_norms[-1]
         if first == 0 or last == 0:
@@ -99,35 +99,35 @@ def differentiate_rollout(
     num_steps: int | None = None,
     method: str = "auto",
 ) -> RolloutGradient:
-    """The gradient of a loss along a rollout, by reverse accumulation through the Jacobians of its steps.
+    """Compute the gradient of a loss along a rollout, by reverse accumulation through the Jacobians of its steps.
 
-    With l_N = dloss/dx_N, g_k = dloss/du_k + B_k' l_(k+1) and l_k = dloss/dx_k + A_k' l_(k+1) + K_k' g_k, K and P being
-    the policy's derivatives by the state and by its own parameters, the gradient is l_0 by x0, g_k by u_k,
-    sum_k C_k' l_(k+1) by the model's parameters and sum_k P_k' g_k by the policy's.
+    Let l_N = dloss/dx_N, g_k = dloss/du_k + B_k' l_(k+1) and l_k = dloss/dx_k + A_k' l_(k+1) + K_k' g_k, where K and P
+    are the policy's derivatives with respect to the state and to its own parameters. The gradient is l_0 for x0, g_k
+    for u_k, sum_k C_k' l_(k+1) for the model's parameters and sum_k P_k' g_k for the policy's parameters.
 
     Args:
         model: The discrete model.
-        x0: (nx,) the first state.
-        us: (N, nu) the inputs [N or N m]; None under a policy, and where the model has no actuators.
-        loss: `loss(xs, us)` of the motion (N+1, nx) and its inputs, or `loss(x_final)` where it takes one argument: a
-            scalar written with ordinary arithmetic and NumPy functions, so that AutoDiffXd flows through it.
+        x0: (nx,) the initial state.
+        us: (N, nu) the inputs [N or N m]; None with a policy, or if the model has no actuators.
+        loss: `loss(xs, us)` of the states (N+1, nx) and the inputs, or `loss(x_final)` if it takes one argument. It
+            returns a scalar and is written with ordinary arithmetic and NumPy functions that AutoDiffXd supports.
         policy: u = policy(x, t), written likewise (see `drake_diff.motion.policy`), in place of `us`.
-        parameters: Names of the model's parameters to differentiate by, or a mapping of the names to values.
-        num_steps: N, where `us` does not say it.
-        method: Where the step Jacobians come from, see `differentiate_step`; or "continuous": the motion in continuous
-            time that the steps stand for, contact included, integrated with error control, and its own derivative by
-            the state, the inputs, the policy and contact's parameters. Columns in which the loss has no slope, after
-            many bounces or where a body barely touches, are in `undefined`, and a `GradientWarning` names them: what
-            the gradient has there is the derivative of that point alone (`drake_diff.motion.undefined` says when).
+        parameters: Names of the model's parameters for the gradient, or a mapping of the names to values.
+        num_steps: N, if `us` is not given.
+        method: The method for the step Jacobians, see `differentiate_step`. With "continuous", the motion in continuous
+            time that the steps approximate is integrated with error control, contact included. It is differentiated
+            with respect to the state, the inputs, the policy and contact parameters. Columns in which the loss has no
+            slope, after many bounces or near grazing contact, are in `undefined`, and a `GradientWarning` names them.
+            Their derivative is valid only at the point itself (see `drake_diff.motion.undefined`).
 
     Returns:
-        The loss; `by_x0` (nx,), `by_us` (N, nu), `by_parameters` (np,), `by_policy` (n,); the motion, and the norm of
-        the gradient by every state on the way.
+        The loss, `by_x0` (nx,), `by_us` (N, nu), `by_parameters` (np,), `by_policy` (n,), the trajectory, and the norm
+        of the gradient with respect to every state.
 
     Raises:
-        GradientError: The loss, the policy or a step carries no gradient, or one that is not finite.
-        InputError: Both `us` and `policy` are given, or neither, or the loss is no scalar.
-        SimulationError: Drake cannot take a step.
+        GradientError: The loss, the policy or a step has no gradient, or a gradient that is not finite.
+        InputError: Both or neither of `us` and `policy` are given, or the loss is not a scalar.
+        SimulationError: Drake cannot compute a step.
 
     Example:
         >>> model = dd.load_model("models/cart_pole.urdf", time_step=0.01)
@@ -162,7 +162,7 @@ def _collected(
     inputs: Array,
     linearization: Sequence[StepDerivatives],
 ) -> RolloutGradient:
-    """What the steps of a motion make of its loss."""
+    """Make the RolloutGradient from the loss, its total gradients and the linearized steps."""
     return RolloutGradient(
         loss=value,
         by_x0=frozen(totals.states[0]),
@@ -188,7 +188,7 @@ def _in_continuous_time(
     vector: ParameterVector,
     num_steps: int | None,
 ) -> RolloutGradient:
-    """The gradient along the flow, and a warning where the loss has no slope: see `drake_diff.motion.undefined`."""
+    """Compute the gradient along the flow; warn if the loss has no slope. See `drake_diff.motion.undefined`."""
     from drake_diff.motion.flow import FlowSteps  # loads CasADi
     from drake_diff.motion.undefined import Beside, undefined_columns
 
@@ -218,7 +218,7 @@ def _in_continuous_time(
 def _close_the_loop(
     model: Model, x0: Array, policy: Policy, count: int, vector: ParameterVector, method: str
 ) -> tuple[list[StepDerivatives], list[Feedback], Array]:
-    """The motion first, then the derivatives of all its steps at once."""
+    """Roll out under the policy, then compute the derivatives of all steps at once."""
     feedback = list[Feedback]()
     choose = recording_choice(policy, model, feedback)
     x, xs, inputs = x0, np.empty((count, model.nx)), np.empty((count, model.nu))

@@ -1,14 +1,14 @@
-"""Error-controlled integration of motions whose equations change where a contact begins or stops to push.
+"""Error-controlled integration of motions whose equations change when a contact becomes active or inactive.
 
-A `System` has switches, values that are above 0 where they are on. Between two events the switches stay and the
-equations are smooth, so that a method keeps its order, and so does the derivative of what it does: a step ends where a
-switch turns. One that turns twice within a step has turned at neither end of it. Where it comes nearer to 0 at the
-start and goes away from it at the end, what is between them is looked at; a system that does not know how its
-switches change names the parts of a step at which to look.
+A `System` has switches, which are on where their values are positive. A step ends where a switch changes sign, so the
+switches are constant and the equations are smooth within a step. The method and the derivative of its result then keep
+their orders. A switch that changes sign twice within a step shows no change at the ends of the step. If its value moves
+towards 0 at the start and away from 0 at the end, the interior of the step is searched. A system that does not know the
+rates of its switches names the fractions of a step at which to check them.
 
-Friction that holds is a damper of rate up to 15/8 mu f / (v_s m), which keeps explicit steps short long after the
-motion itself has become slow. Where the explicit steps of Dormand and Prince come near the end of their stability,
-those of Rodas5P take over, until explicit ones would be as long.
+Static friction acts as a damper of rate up to 15/8 mu f / (v_s m), which requires short explicit steps long after the
+motion itself has become slow. Near the limit of stability of the explicit method (Dormand and Prince), the integrator
+changes to Rodas5P, until explicit steps could be as long.
 """
 
 import time
@@ -32,70 +32,70 @@ from drake_diff.motion.tableaus import (
     factor,
 )
 
-TOLERANCE = 1e-9  # of each step, relative to max(sizes, |x|)
-SHORTEST = 1e-14  # [s] a step that is shorter does not move time
-ROOT = 1e-13  # of a step: how near to its event it ends
-SHALLOW = 1e-13  # [m] overlap that begins and ends within a step and is not looked for
-STABLE = 1.0  # of a step's length times the rate at which its stages move apart; the explicit method is stable to 3.3
-HITS = 5  # explicit steps in a row over it before implicit ones take over
-LOOK = 8  # implicit steps between looks at the largest rate
-Pairs = tuple[int, ...]  # those that push
+TOLERANCE = 1e-9  # error of each step, relative to max(sizes, |x|)
+SHORTEST = 1e-14  # [s] minimum length of a step
+ROOT = 1e-13  # tolerance of an event's time, relative to the step
+SHALLOW = 1e-13  # [m] smaller overlaps that begin and end within a step are ignored
+STABLE = 1.0  # threshold of step length times the rate of the stages; the explicit method is stable up to 3.3
+HITS = 5  # consecutive explicit steps over STABLE before the change to implicit steps
+LOOK = 8  # implicit steps between evaluations of the largest rate
+Pairs = tuple[int, ...]  # active pairs
 Flags = NDArray[np.bool_]
 
 
 class System:
-    """Rates x' of a state (n,) where a given set of pairs pushes, `pushing`, and the switches of all pairs.
+    """Rates x' of a state (n,) for a given set of active pairs, `pushing`, and the switches of all pairs.
 
-    The first switches are `per_pair` of each pair; more may follow, at which steps end and rates do not jump.
+    The first switches are `per_pair` for each pair. More may follow, at which steps end but rates do not jump.
     """
 
-    time_step: float  # [s] the length of step to begin with
+    time_step: float  # [s] the initial step length
     num_pairs: int
     per_pair = 1
-    slack: Any = 0.0  # (switches,) by how much the wrong sign is none
+    slack: Any = 0.0  # (switches,) a wrong sign by less than this is ignored
     pushing: Pairs = ()
-    contact_is_stiff = False  # whether steps are implicit wherever a pair pushes
-    used = 0  # evaluations of the rates
-    most = 1_000_000  # of these
-    sizes: Any = 1.0  # (n,) of the states: errors are relative to these at least
+    contact_is_stiff = False  # whether steps are implicit while a pair is active
+    used = 0  # number of evaluations of the rates
+    most = 1_000_000  # maximum of `used`
+    sizes: Any = 1.0  # (n,) minimum scales of the states for relative errors
 
     def push(self, pairs: Pairs) -> None:
-        """Take the equations where `pairs` push."""
+        """Set the active pairs."""
         self.pushing = pairs
 
     def rates(self, x: Array) -> Array:
-        """(n,)"""
+        """Return the rates (n,) at `x`."""
         raise NotImplementedError
 
     def slopes(self, x: Array, rates: Array) -> Array:
-        """(n, n) of the rates at `x`, where they are `rates` (n,)."""
+        """Return the Jacobian (n, n) of the rates at `x`, where the rates are `rates` (n,)."""
         raise NotImplementedError
 
     def watch(self, x: Array, rates: Array) -> tuple[Array, Array]:
-        """The switches' values, and how these change where the state changes by `rates`; 0 where it is not known."""
+        """Return the switches' values, and their rates if the state changes at `rates`, or 0 for unknown rates."""
         raise NotImplementedError
 
     def pushing_where(self, on: Flags) -> Pairs:
-        """The pairs that push where these switches are on."""
+        """Return the active pairs if the switches `on` are on."""
         raise NotImplementedError
 
     def relevant(self, on: Flags) -> Flags:
-        """The switches that change something when they turn, where these are on."""
+        """Return the switches whose change of sign affects the equations, if the switches `on` are on."""
         return np.ones(len(on), dtype=bool)
 
     def parts(self, h: float) -> Sequence[float]:
-        """The parts of a step of length `h` [s] at which to look for switches that have turned."""
+        """Return the fractions of a step of length `h` [s] at which to check for switches that have changed."""
         return ()
 
     def check(self, x: Array) -> None:
-        """SimulationError where the motion has no state `x`."""
+        """Raise SimulationError if the equations do not support the state `x`."""
 
     def points_at(self, x: Array, pairs: Pairs) -> Iterable[tuple[int, ContactPoint]]:
-        """Of each of `pairs` that pushes at `x`."""
+        """Return the contact points at `x` of those of `pairs` that have a contact force."""
         return ()
 
     def explicit(self, x: Array, rates: Array, h: float) -> tuple[Array, Array, float, float]:
-        """Where a step of `h` [s] leads, the rates there, its error, and the rate at which its stages move apart."""
+        """Take a step of `h` [s]; return the end state, the rates there, the error, and the rate of the stages."""
         slopes, state, before = [rates], x, x
         for weights in STAGES:
             before, state = state, x + h * (np.array(weights) @ np.array(slopes))
@@ -108,7 +108,7 @@ class System:
 
 @dataclass(frozen=True)
 class SwitchEvent:
-    """The number of a switch that turned, and the pairs that push from then on."""
+    """The index of a switch that changed sign, and the active pairs after the event."""
 
     switch: int
     pushing: Pairs
@@ -127,27 +127,27 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class _Reach:
-    """Where a step of length `h` leads."""
+    """The end point of a step of length `h`."""
 
     h: float
     x: Array
     rates: Array
     stiffness: float
     values: Array  # of the switches
-    slopes: Array
+    slopes: Array  # rates of the switches
 
 
 class Integrator:
-    """The motion of a system from a state."""
+    """An integrator for the motion of a system from a state."""
 
     def __init__(self, system: System, tolerance: float = TOLERANCE, deadline: float = np.inf):
         self.system, self.tolerance, self.deadline = system, tolerance, deadline
         self._here: _Reach
         self._jacobian: Array | None
-        self._is_stiff, self._hits, self._left = False, 0, 0  # explicit steps over STABLE, implicit ones to the LOOK
+        self._is_stiff, self._hits, self._left = False, 0, 0  # hits: steps over STABLE; left: steps until the LOOK
 
     def start(self, x: Array) -> None:
-        """Stand at `x` (n,)."""
+        """Start the integration at `x` (n,)."""
         system, x = self.system, np.array(x, dtype=float)
         system.used, self._length = 0, system.time_step
         self._set(system.watch(x, np.zeros(len(x)))[0] > 0)
@@ -155,10 +155,10 @@ class Integrator:
         self._stand(x)
 
     def advance(self, duration: float) -> list[Step]:
-        """The steps of the next `duration` [s] under the system's input.
+        """Integrate over the next `duration` [s] under the system's input and return the steps.
 
-        SimulationError where the motion has no end: its rates are not finite, or it is too stiff. TimeoutError where
-        this thread has worked (`time.thread_time`) until the deadline [s].
+        Raises SimulationError if the rates are not finite or the motion is too stiff, and TimeoutError if this thread's
+        CPU time (`time.thread_time`) exceeds the deadline [s].
         """
         self._stand(self._here.x)
         steps, left = list[Step](), duration
@@ -182,12 +182,12 @@ class Integrator:
             if length < SHORTEST:
                 raise SimulationError("the integration cannot continue: the rates are not finite, or jump")
         next_length = length * factor(error / self.tolerance)
-        self._length = max(self._length, next_length) if is_cut else next_length  # a step that is cut says nothing
+        self._length = max(self._length, next_length) if is_cut else next_length  # a cut step must not reduce it
         end = self._until_change(_Reach(length, x, rates, stiffness, *self.system.watch(x, rates)))
         return self._accept(end)
 
     def _take(self, h: float) -> tuple[Array, Array, float, float]:
-        """Where a step leads, the rates there, its error, and the rate at which its stages move apart."""
+        """Take a step; return the end state, the rates there, the error, and the rate of the stages."""
         here = self._here
         reach = (*self._implicit(h), 0.0) if self._is_stiff else self.system.explicit(here.x, here.rates, h)
         return reach if np.isfinite(reach[2]) and np.isfinite(np.sum(reach[0])) else (*reach[:2], np.inf, 0.0)
@@ -215,12 +215,12 @@ class Integrator:
         return _Reach(h, x, rates, stiffness, *self.system.watch(x, rates))
 
     def _margin(self, values: Array) -> float:
-        """Below 0 where a switch has another sign than at the start of the step."""
+        """Return a value below 0 if a relevant switch has changed sign since the start of the step."""
         signed = np.where(self._on, values, -values) + self.system.slack
         return float(np.min(signed, where=self._relevant, initial=np.inf))
 
     def _until_change(self, reach: _Reach) -> _Reach:
-        """The end of the step, or of what is before the first switch that turns in it, just past that."""
+        """Return the end of the step, shortened to just after the first change of a switch within it."""
         while True:
             if self._margin(reach.values) < 0:
                 reach = self._locate(reach.h)
@@ -243,9 +243,9 @@ class Integrator:
             near *= 2
 
     def _look_inside(self, reach: _Reach) -> _Reach | None:
-        """What leads to where a switch has turned that is back at the end of the step."""
+        """Return a shorter step to where a switch differs that has the same sign at both ends, or None."""
         here, h = self._here, reach.h
-        for s in self.system.parts(h):  # by the cubic of both ends' slopes
+        for s in self.system.parts(h):  # cubic Hermite interpolation
             ends = (1 + 2 * s) * (1 - s) ** 2 * here.x + s * s * (3 - 2 * s) * reach.x
             state = ends + h * s * (1 - s) * ((1 - s) * here.rates - s * reach.rates)
             if self._margin(self.system.watch(state, here.rates)[0]) < 0:
@@ -258,12 +258,12 @@ class Integrator:
         return next((dip for dip in dips if dip is not None), None)
 
     def _search_dip(self, i: int, first: _Reach, last: _Reach) -> _Reach | None:
-        """Where a switch has turned between two states, at the second of which it is back: it is taken as convex."""
+        """Find where a switch, assumed to be convex in time, differs between two states at which it is unchanged."""
         side = 1.0 if self._on[i] else -1.0
         while last.h - first.h > SHORTEST:
             a, b, ra, rb = (side * values[i] for values in (first.values, last.values, first.slopes, last.slopes))
             width = last.h - first.h
-            meeting = min(max((b - a - rb * width) / (ra - rb), 0.0), width)  # of the tangents
+            meeting = min(max((b - a - rb * width) / (ra - rb), 0.0), width)  # intersection of the tangents
             if min(a + ra * meeting, b) > -SHALLOW:
                 return None
             middle = self._reach(first.h + min(max(meeting, 0.01 * width), 0.99 * width))
@@ -292,7 +292,7 @@ class Integrator:
         return Step(start, end.x, end.h, pushing, self._settle(end.values > 0))
 
     def _settle(self, on: Flags) -> tuple[SwitchEvent, ...]:
-        """Take the switches as they are now; the events, pair by pair."""
+        """Set the switches to their current signs and return the events, pair by pair."""
         changed, events, between = on != self._on, list[SwitchEvent](), self._on.copy()
         if not changed.any():
             return ()
@@ -325,13 +325,13 @@ class Integrator:
 
 
 def relative(error: Array, x: Array, ahead: Array, sizes: Any = 1.0) -> float:
-    """The root mean square of an error, relative to max(sizes, |x|)."""
+    """Return the root mean square of an error relative to max(sizes, |x|)."""
     with np.errstate(over="ignore", invalid="ignore"):
         return float(np.sqrt(np.mean((error / np.maximum(sizes, np.maximum(np.abs(x), np.abs(ahead)))) ** 2)))
 
 
 def deepest_contacts(system: System, steps: Sequence[Step]) -> tuple[ContactPoint, ...]:
-    """Of each pair that pushes in an interval, where it is deepest at an end of a step."""
+    """Return, for each active pair in an interval, its contact point of largest depth at the ends of steps."""
     deepest: dict[int, ContactPoint] = {}
     for step in steps:
         for x in (step.x, step.ahead) if step.pushing else ():

@@ -1,6 +1,6 @@
-"""How a model gets from one knot to the next: by Drake's own step, or by the motion in continuous time it stands for.
+"""The map from one knot of a trajectory to the next: Drake's own step, or the continuous motion that it approximates.
 
-Either is a function of the state and the input alone, with derivatives, so that a search need not know which it is.
+Both are functions of the state and the input only, with derivatives, so that a solver can use either.
 """
 
 from typing import Protocol
@@ -19,23 +19,23 @@ BodyPair = tuple[str, str]
 
 
 class Intervals(Protocol):
-    """Those of a model to which a vector of parameters is applied, for as long as it is."""
+    """The intervals of a model with applied parameters, valid while these parameters are applied."""
 
     def end(self, x: Array, u: Array) -> Array:
-        """(nx,) where an interval leads from `x` (nx,) under `u` (nu,)."""
+        """Return the state (nx,) at the end of an interval from `x` (nx,) under `u` (nu,)."""
 
     def derivatives(self, x0: Array, us: Array, xs: Array | None = None) -> list[StepDerivatives]:
-        """Along the motion from `x0` under `us` (N, nu); given xs (N, nx), of the intervals from each of them."""
+        """Differentiate along the motion from `x0` under `us` (N, nu), or the intervals from each of xs (N, nx)."""
 
     def jacobians(self, xs: Array, us: Array, ends: Array | None = None) -> Array:
-        """(N, nx, nx + nu) of the intervals from xs (N or N+1, nx), which may be known to lead to `ends` (N, nx)."""
+        """Return the Jacobians (N, nx, nx + nu) of the intervals from xs (N or N+1, nx), with known `ends` (N, nx)."""
 
     def touching(self, x: Array, u: Array) -> tuple[BodyPair, ...]:
-        """The bodies that push each other in the interval from `x` under `u`."""
+        """Return the pairs of bodies in contact in the interval from `x` under `u`."""
 
 
 def intervals_of(model: Model, vector: ParameterVector, motion: str) -> Intervals:
-    """By the name of the motion; ModelError where the model has none in continuous time."""
+    """Return the intervals of a `motion`; raise ModelError if continuous time does not support the model."""
     if motion == CONTINUOUS:
         from drake_diff.motion.flow import FlowSteps  # loads CasADi
 
@@ -44,7 +44,7 @@ def intervals_of(model: Model, vector: ParameterVector, motion: str) -> Interval
 
 
 def roll(intervals: Intervals, x0: Array, us: Array) -> Array:
-    """(N+1, nx) the states at the ends of the intervals from `x0` (nx,) under `us` (N, nu)."""
+    """Return the states (N+1, nx) at the ends of the intervals from `x0` (nx,) under `us` (N, nu)."""
     xs = np.empty((len(us) + 1, len(x0)))
     xs[0] = x0
     for k, u in enumerate(us):

@@ -1,4 +1,4 @@
-"""A loss of a motion, and its gradient back through the derivatives of the steps."""
+"""The loss of a trajectory, and its gradient by reverse accumulation through the derivatives of the steps."""
 
 import inspect
 from collections.abc import Callable, Sequence
@@ -19,12 +19,12 @@ AUTOGRAD, AUTODIFF = "autograd", "autodiff"  # the methods that differentiate a 
 
 @dataclass(frozen=True, eq=False)
 class Totals:
-    """A loss's total gradients: by states (N+1, nx), inputs (N, nu), parameters (np,), policy parameters (n,)."""
+    """Total gradients of a loss with respect to states, inputs and parameters."""
 
-    states: Array
-    inputs: Array
-    parameters: Array
-    policy: Array
+    states: Array  # (N+1, nx)
+    inputs: Array  # (N, nu)
+    parameters: Array  # (np,) of the model
+    policy: Array  # (n,) of the policy
     loss_method: str = ""  # see `differentiate_loss`
 
 
@@ -35,7 +35,7 @@ def accumulate(
     feedback: Sequence[Feedback] = (),
     num_policy_parameters: int = 0,
 ) -> Totals:
-    """From a loss's partial gradients by xs (N+1, nx) and us (N, nu) to its total ones."""
+    """Compute the total gradients of a loss from its partial gradients `by_xs` (N+1, nx) and `by_us` (N, nu)."""
     state, inputs = np.array(by_xs), np.array(by_us)
     parameters = np.zeros(linearization[0].C.shape[1])
     policy = np.zeros(num_policy_parameters)
@@ -60,7 +60,7 @@ def total_gradients(
     linearization: Sequence[StepDerivatives],
     feedback: Sequence[Feedback],
 ) -> tuple[float, Totals]:
-    """The value of a loss of the steps from `x0` (nx,) under `us` (N, nu), and its total gradients."""
+    """Return the value of a loss of the steps from `x0` (nx,) under `us` (N, nu), and its total gradients."""
     xs = np.vstack([x0, [d.x_next for d in linearization]])
     value, by_xs, by_us, method = differentiate_loss(loss, xs, us)
     totals = accumulate(linearization, by_xs, by_us, feedback, len(policy_parameters(policy)))
@@ -68,26 +68,26 @@ def total_gradients(
 
 
 def evaluate_loss(loss: Loss, xs: Array, us: Array) -> float:
-    """`loss` at a rollout of plain numbers."""
+    """Evaluate `loss` at a rollout of floats."""
     arguments = (xs[-1],) if takes_one_argument(loss) else (xs, us)
     return float(called("loss", loss, *arguments, shape=()))
 
 
 def differentiate_loss(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, Array, str]:
-    """(value, gradient by xs (N+1, nx), gradient by us (N, nu), method) of `loss` on its own, the steps apart.
+    """Return the value of `loss`, its partial gradients with respect to xs (N+1, nx) and us (N, nu), and the method.
 
-    The method is "autograd"; "autodiff", whose time grows with the square of the motion's length, for what autograd
-    cannot follow, and for a loss of the final state alone.
+    The method is "autograd", or "autodiff" for a function that autograd does not support and for a loss of the final
+    state only. The time of "autodiff" grows with the square of the trajectory's length.
     """
     with np.errstate(all="ignore"):
-        evaluate_loss(loss, xs, us)  # which names what is wrong with it
+        evaluate_loss(loss, xs, us)  # raises a descriptive error if the loss is invalid
     if takes_one_argument(loss):
         value, gradient = gradient_of(user_function("loss", loss), xs[-1])
         return value, np.vstack([np.zeros_like(xs[:-1]), gradient]), np.zeros_like(us), AUTODIFF
     try:
-        with np.errstate(all="ignore"):  # what is not finite is refused below, whole
+        with np.errstate(all="ignore"):  # values that are not finite are refused below
             value, (by_xs, by_us) = traced_gradient(loss, (xs, us))
-    except Exception:  # autograd cannot follow it, or it is wrong itself, which AutoDiffXd shows
+    except Exception:  # not supported by autograd, or an error in the loss, which AutoDiffXd then reports
         return *_by_autodiff(loss, xs, us), AUTODIFF
     if not (np.isfinite(value) and np.all(np.isfinite(by_xs)) and np.all(np.isfinite(by_us))):
         raise GradientError(f"the loss or its gradient is not finite, as that of a norm at zero: value {value}")
@@ -95,7 +95,7 @@ def differentiate_loss(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, 
 
 
 def _by_autodiff(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, Array]:
-    """`differentiate_loss` in a time that grows with the square of the motion's length."""
+    """Differentiate as `differentiate_loss`, in a time that grows with the square of the trajectory's length."""
     split = xs.size
 
     def flat(z: Any) -> Any:
@@ -106,7 +106,7 @@ def _by_autodiff(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, Array]
 
 
 def takes_one_argument(loss: Loss) -> bool:
-    """Whether `loss` is a function of the final state alone."""
+    """Check if `loss` is a function of the final state only."""
     arguments = [p for p in inspect.signature(loss).parameters.values() if p.default is p.empty]
     required = [p for p in arguments if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     if len(required) not in (1, 2):

@@ -1,12 +1,12 @@
-"""Feedback inside a rollout: policies u = policy(x, t), and their derivatives by the state and by their parameters.
+"""Policies u = policy(x, t) for rollouts, and their derivatives with respect to the state and their parameters.
 
-A policy is any function of x (nx,) and t [s] that returns u (nu,). One that can be trained has `parameters` (n,), and
-takes others as a third argument; one of whose parameters only some act at a time says which by `active(t)`, a slice.
+A policy is any function of x (nx,) and t [s] that returns u (nu,). A trainable policy has `parameters` (n,) and takes
+other values as a third argument. If only some parameters act at time t, its method `active(t)` returns their slice.
 
-A policy is written with ordinary arithmetic, so that AutoDiffXd flows through it. Of NumPy these take AutoDiffXd:
-tanh, sin, cos, tan, arcsin, arccos, arctan, arctan2, sinh, cosh, exp, log, sqrt, square, power, abs, maximum,
-minimum, clip, where, sum, mean, dot, @, outer, einsum, concatenate, linalg.norm; these do not: expm1, log1p,
-logaddexp, hypot, interp, heaviside, var, std, and every function of the module `math`.
+A policy is written with ordinary arithmetic that AutoDiffXd supports. These NumPy functions support AutoDiffXd: tanh,
+sin, cos, tan, arcsin, arccos, arctan, arctan2, sinh, cosh, exp, log, sqrt, square, power, abs, maximum, minimum, clip,
+where, sum, mean, dot, @, outer, einsum, concatenate, linalg.norm. These do not: expm1, log1p, logaddexp, hypot, interp,
+heaviside, var, std, and every function of the module `math`.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ from drake_diff.model.plant import actuators
 from drake_diff.model.tangent import tangent_space
 
 FIXED_POINT_TOLERANCE = 1e-6
-# How far x and the parameters are moved to see whether a plain number that a policy returns is a constant.
+# Perturbation of x and the parameters to check that a float returned by a policy is a constant.
 NUDGE = 1e-6
-# A policy's derivatives (nu, nx) by the state and (nu, n) by those of its parameters that act, and which they are.
+# A policy's derivatives with respect to the state (nu, nx) and the active parameters (nu, n), and these parameters.
 Feedback = tuple[Array, Array, slice]
 
 
 @dataclass(frozen=True, eq=False)
 class ParametricPolicy:
-    """u = function(x, t, parameters) of any function, such as a neural network, and its parameters.
+    """The policy u = function(x, t, parameters) for any function, such as a neural network.
 
-    Another policy is such a function: ParametricPolicy(pd, better) is the PD law `pd` with other gains.
+    The function may be another policy: ParametricPolicy(pd, better) is the PD law `pd` with other gains.
 
     Args:
-        function: Of x (nx,), t [s] and the parameters; returns u (nu,).
-        parameters: (n,) all weights in one row.
+        function: A function of x (nx,), t [s] and the parameters that returns u (nu,).
+        parameters: (n,) all weights as a vector.
 
     Example:
         >>> from drake_diff.motion import ParametricPolicy
@@ -67,7 +67,7 @@ class ParametricPolicy:
         return self.function(x, t, self.parameters if parameters is None else parameters)
 
     def active(self, t: float) -> slice:
-        """The parameters that act at time t [s]: the function's own answer where it is a TVLQR, else all."""
+        """Return the parameters that act at time t [s]: those of the function's own `active(t)`, if any, else all."""
         active = getattr(self.function, "active", None)
         return active(t) if active else slice(0, len(self.parameters))
 
@@ -75,14 +75,14 @@ class ParametricPolicy:
 class PD:
     """The policy u_i = kp_i (q_ref - q) + kd_i (v_ref - v) at the joint of actuator i. Angles are not wrapped.
 
-    u is the effort at the joint [N or N m], as `Model.actuation` applies it, without gear ratio; Drake
-    actuates joints of one degree of freedom only. `parameters` is [kp; kd] (2 nu,).
+    u is the effort at the joint [N or N m], as `Model.actuation` applies it, without gear ratio. Drake actuates only
+    joints of one degree of freedom. `parameters` is [kp; kd] (2 nu,).
 
     Args:
         model: A model with actuators.
         kp: [N/m or N m/rad] a number, or (nu,).
         kd: [N s/m or N m s/rad] a number, or (nu,).
-        x_ref: (nx,) what is held; the model's default state where left out.
+        x_ref: (nx,) the reference state, by default the model's default state.
 
     Raises:
         InputError: The model has no actuators, or an argument does not fit.
@@ -131,21 +131,21 @@ class PD:
 
 
 class LQR:
-    """u = u_ref - K minus(x, x_ref): the discrete-time LQR of the model's own step at a fixed point x_ref, u_ref.
+    """The policy u = u_ref - K minus(x, x_ref): discrete-time LQR of the model's step at a fixed point x_ref, u_ref.
 
-    K minimizes sum_k d_k' Q d_k + e_k' R e_k (no time step in it), with d = minus(x, x_ref) in the tangent space of
-    the state (nt,; nx less one for each quaternion) and e = u - u_ref. `gain` is K (nu, nt), `cost_to_go` P (nt, nt)
+    K minimizes sum_k d_k' Q d_k + e_k' R e_k (without the time step), with d = minus(x, x_ref) in the tangent space of
+    the state (nt,; nx minus one for each quaternion) and e = u - u_ref. `gain` is K (nu, nt), `cost_to_go` P (nt, nt)
     with the cost d' P d, `parameters` K row by row (nu * nt,).
 
     Args:
         model: The discrete model.
         x_ref: (nx,) the fixed point.
-        u_ref: (nu,) the input that holds it [N or N m].
+        u_ref: (nu,) the input at the fixed point [N or N m].
         Q: (nt, nt) symmetric and positive semidefinite.
         R: (nu, nu) symmetric and positive definite.
 
     Raises:
-        InputError: step(x_ref, u_ref) is not x_ref within 1e-6, no gain stabilizes it, or a weight is not as said.
+        InputError: step(x_ref, u_ref) differs from x_ref by over 1e-6, no gain stabilizes it, or a weight is invalid.
 
     Example:
         >>> model = dd.load_model("models/cart_pole.urdf", time_step=0.01)
@@ -165,7 +165,7 @@ class LQR:
         A, B = np.hsplit(self._space.jacobian(self.x_ref, self.x_ref, d.A, d.B), [self._space.size])
         try:
             gain, cost_to_go = DiscreteTimeLinearQuadraticRegulator(A=A, B=B, Q=Q, R=R)
-        except (RuntimeError, SystemExit) as error:  # pydrake makes a failed demand of Drake's a SystemExit
+        except (RuntimeError, SystemExit) as error:  # pydrake raises SystemExit for a failed DRAKE_DEMAND
             expected = "a fixed point that the inputs can stabilize, and Q that weights all unstable directions"
             raise InputError("LQR", got=str(error), expected=expected) from error
         self.gain, self.cost_to_go = frozen(gain), frozen(cost_to_go)
@@ -180,14 +180,14 @@ class LQR:
 
 
 class TVLQR:
-    """u = us[k] - K_k minus(x, xs[k]) - l_k, k = round(t / time_step) within 0..N-1: LQR along a trajectory.
+    """LQR along a trajectory: u = us[k] - K_k minus(x, xs[k]) - l_k, with k = round(t / time_step) within 0..N-1.
 
-    With A_k, B_k the step's Jacobians there in the tangent space (nt,), from P_N = Qf and p_N = 0 backward
+    With the step's Jacobians A_k, B_k in the tangent space (nt,), backward from P_N = Qf and p_N = 0,
         K_k = (R + B' P B)^-1 B' P A,  P_k = Q + A' P (A - B K_k)   with P = P_(k+1),
-        l_k = (R + B' P B)^-1 B' r,    p_k = (A - B K_k)' r         with r = P c_k + p_(k+1),
-    which minimizes sum_k d_k' Q d_k + e_k' R e_k + d_N' Qf d_N (no time step in it) of the linearized motion. Its
-    `defects` c_k are how far a step from xs[k] under us[k] leads from xs[k + 1]: l_k is 0 along the model's own motion.
-    `gains` (N, nu, nt), `cost_to_go` (N+1, nt, nt), `parameters` the gains flattened (N * nu * nt,).
+        l_k = (R + B' P B)^-1 B' r,    p_k = (A - B K_k)' r         with r = P c_k + p_(k+1).
+    This minimizes sum_k d_k' Q d_k + e_k' R e_k + d_N' Qf d_N (without the time step) for the linearized motion. The
+    `defects` c_k are the differences of the step from xs[k] under us[k] and xs[k + 1]. Along the model's own
+    trajectory, l_k is 0. `gains` (N, nu, nt), `cost_to_go` (N+1, nt, nt), `parameters` the gains as (N * nu * nt,).
 
     Args:
         model: The discrete model.
@@ -195,12 +195,12 @@ class TVLQR:
         us: (N, nu) its inputs [N or N m].
         Q: (nt, nt) symmetric and positive semidefinite.
         R: (nu, nu) symmetric and positive definite.
-        Qf: (nt, nt) the weight of the end; Q where left out.
-        jacobians: (N, nx, nx + nu) of what leads from state to state where these are no steps of the model.
-        defects: (N, nt) the c_k; 0 where left out.
+        Qf: (nt, nt) the weight of the final state, by default Q.
+        jacobians: (N, nx, nx + nu) of the map from state to state, if it is not the step of the model.
+        defects: (N, nt) the c_k, by default 0.
 
     Raises:
-        InputError: The arrays do not fit one another or the model, or a weight is not as said.
+        InputError: The shapes of the arrays do not match each other or the model, or a weight is invalid.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -261,7 +261,7 @@ class TVLQR:
         return self.us[k] - gain @ self._space.minus(x, self.xs[k]) - self.offsets[k]
 
     def active(self, t: float) -> slice:
-        """The parameters that act at time t [s]; the derivative by all others is zero."""
+        """Return the parameters that act at time t [s]. Derivatives with respect to all others are zero."""
         k, size = self._index(t), self.gains[0].size
         return slice(k * size, (k + 1) * size)
 
@@ -278,21 +278,21 @@ def _range(values: Array) -> str:
 
 
 def policy_parameters(policy: Any) -> Array:
-    """(n,) the parameters of a policy; none where it is a plain function."""
+    """Return the parameters (n,) of a policy, or an empty array for a plain function."""
     return finite_array("policy.parameters", getattr(policy, "parameters", ()), ("n",))
 
 
 def active_parameters(policy: Any, t: float) -> slice:
-    """Which of the policy's parameters act at time t [s]: all, but where it has a method `active(t)` that says."""
+    """Return the policy's parameters that act at time t [s]: those of its method `active(t)`, if any, else all."""
     return policy.active(t) if hasattr(policy, "active") else slice(0, len(policy_parameters(policy)))
 
 
 def differentiate_policy(policy: Any, x: Array, t: float, nu: int) -> tuple[Array, Array, Array]:
-    """(u (nu,), du/dx (nu, nx), du/dparameters (nu, n)) of `policy` at state `x` (nx,) and time `t` [s].
+    """Return (u (nu,), du/dx (nu, nx), du/dparameters (nu, n)) of `policy` at state `x` (nx,) and time `t` [s].
 
-    By AutoDiffXd; of a policy with a method `active(t)`, such as TVLQR, by those parameters alone, the others being
-    zero. A constant is a legal output. Raises ShapeError where u is not (nu,), and GradientError where the
-    derivatives were lost (float() was taken), u is another at the same point, or a derivative is not finite.
+    AutoDiffXd computes the derivatives. If the policy has a method `active(t)`, as TVLQR has, the columns of other
+    parameters are zero. Constant outputs are allowed. Raises ShapeError if u is not (nu,), and GradientError if the
+    derivatives were lost (by float()), u is not reproducible, or a derivative is not finite.
     """
     parameters = policy_parameters(policy)
     u = finite_array("policy(x, t)", _call(policy, x.copy(), t, parameters, nu), (nu,))
@@ -300,10 +300,10 @@ def differentiate_policy(policy: Any, x: Array, t: float, nu: int) -> tuple[Arra
     variables = InitializeAutoDiff(np.concatenate([x, parameters[active]])).ravel()
     moved = parameters.astype(object)
     moved[active] = variables[len(x) :]
-    with np.errstate(all="ignore"):  # what is not finite is refused by _check, whole
+    with np.errstate(all="ignore"):  # _check refuses values that are not finite
         result = np.asarray(_call(policy, variables[: len(x)], t, moved), dtype=object)
     plain = np.array([not isinstance(entry, AutoDiffXd) for entry in result], dtype=bool)
-    if plain.any():  # which must be a constant: else its derivatives were thrown away
+    if plain.any():  # these entries must be constants, else their derivatives were lost
         near = finite_array("policy(x, t)", _call(policy, x + NUDGE, t, parameters + NUDGE, nu), (nu,))
         changed = np.flatnonzero(plain & (near != u))
         if len(changed):
@@ -320,7 +320,7 @@ def differentiate_policy(policy: Any, x: Array, t: float, nu: int) -> tuple[Arra
 
 
 def recording_choice(policy: Any, model: Model, feedback: list[Feedback]) -> Callable[[Array, int], Array]:
-    """What chooses u (nu,) at the state x (nx,) and the step k, and adds the policy's derivatives to `feedback`."""
+    """Return a function (x (nx,), step k) -> u (nu,) that appends the policy's derivatives to `feedback`."""
 
     def choose(x: Array, k: int) -> Array:
         t = k * model.time_step
@@ -333,7 +333,7 @@ def recording_choice(policy: Any, model: Model, feedback: list[Feedback]) -> Cal
 
 
 def _call(policy: Any, x: Any, t: float, parameters: Any, nu: int | None = None) -> Any:
-    """What it gives for AutoDiffXd, or where `nu` is given for plain numbers."""
+    """Call the policy with AutoDiffXd, or with floats if `nu` is given."""
     arguments = (x, t, parameters) if hasattr(policy, "parameters") else (x, t)
     if nu is None:
         return carrying("policy", policy, *arguments)
@@ -341,7 +341,7 @@ def _call(policy: Any, x: Any, t: float, parameters: Any, nu: int | None = None)
 
 
 def _check(numbers: Any, rows: Array, u: Array) -> None:
-    """Refuse derivatives of another value than the rollout's, and those that are not finite."""
+    """Raise GradientError if the values differ from the rollout's, or a derivative is not finite."""
     values = ExtractValue(numbers.reshape(-1, 1)).ravel() if len(u) else u
     if not np.all(np.abs(values - u) <= PARITY_TOLERANCE * np.maximum(1.0, np.abs(u))):
         raise GradientError(

@@ -1,4 +1,4 @@
-"""Many steps; energy, contact, penetration and constraint violation along them."""
+"""Rollouts of many steps, with energy, contact, penetration and constraint violation along them."""
 
 from __future__ import annotations
 
@@ -22,19 +22,18 @@ from drake_diff.model.step import advance, set_state
 from drake_diff.model.tangent import tangent_space
 
 Policy = Callable[[Array, float], ArrayLike]
-STEPS, CONTINUOUS = MOTIONS = "steps", "continuous"  # of Drake's, or in the continuous time that they stand for
+STEPS, CONTINUOUS = MOTIONS = "steps", "continuous"  # Drake's steps, or the continuous motion that they approximate
 
 
 @dataclass(frozen=True, eq=False)
 class Rollout(ShowsItsRepr):
-    """N steps of the double plant and what was measured along them; `rollout` makes one. Arrays are read-only.
+    """N steps of the double plant and the quantities measured along them, returned by `rollout`. Arrays are read-only.
 
-    With method="continuous" it is the motion in continuous time at the ends of N intervals.
+    With method="continuous", these are states and measurements of the continuous motion at the ends of N intervals.
 
     The energy balance of the discrete plant is `energy_error` = energy - energy[0] - work + dissipation
-    - contact_work - limit_work: the work of a force f in a step is h f (v + v') / 2, which is exact where M is
-    constant, so that what remains is the error of the time stepping, and what constraints (couplers, balls, welds)
-    took or gave.
+    - contact_work - limit_work. The work of a force f in a step is h f (v + v') / 2, which is exact if M is constant.
+    The remaining energy error is the error of the time stepping and the work of constraints (couplers, balls, welds).
 
     Example:
         >>> dd.rollout(dd.load_model("models/pendulum.urdf", time_step=0.01), [0.5, 0], np.zeros((100, 1)))
@@ -49,12 +48,12 @@ class Rollout(ShowsItsRepr):
     kinetic_energy: Array  # (N+1,) [J]
     potential_energy: Array  # (N+1,) [J], gravity and springs
     work: Array  # (N+1,) [J], done by actuators, body forces and a diagram's systems since the start
-    dissipation: Array  # (N+1,) [J], taken by joint damping since the start
+    dissipation: Array  # (N+1,) [J], dissipated by joint damping since the start
     contact_work: Array  # (N+1,) [J], done by contact, normal forces and friction, since the start
     limit_work: Array  # (N+1,) [J], done by joint limits since the start
     penetration: Array  # (N+1,) [m], the largest overlap of two geometries
-    # (N+1,) beyond joint limits [m or rad], or of a quaternion's unit norm [1]; inf for a plant with constraints
-    # (couplers, balls, welds, distances), whose violation pydrake does not tell.
+    # (N+1,) violation of joint limits [m or rad], or of a quaternion's unit norm [1]; inf for a plant with constraints
+    # (couplers, balls, welds, distances), whose violation pydrake does not expose.
     constraint_violation: Array
     contacts: tuple[tuple[ContactPoint, ...], ...]  # N tuples: the contacts of each step
 
@@ -69,29 +68,29 @@ class Rollout(ShowsItsRepr):
 
     @property
     def energy(self) -> Array:
-        """(N+1,) [J]: kinetic plus potential energy."""
+        """Kinetic plus potential energy (N+1,) [J]."""
         return frozen(self.kinetic_energy + self.potential_energy)
 
     @property
     def energy_error(self) -> Array:
-        """(N+1,) [J]: energy that neither inputs and systems nor damping, contact or limits account for."""
+        """Energy (N+1,) [J] not accounted for by inputs, systems, damping, contact or limits."""
         given = self.work - self.dissipation + self.contact_work + self.limit_work
         return frozen(self.energy - self.energy[0] - given)
 
     @property
     def energy_drift(self) -> float:
-        """[J]: the lasting part of `energy_error`, its oscillation averaged out (see `drift`)."""
+        """The drift of `energy_error` [J] without its oscillation (see `drift`)."""
         return drift(self.energy_error)
 
     @property
     def energy_exchanged(self) -> float:
-        """[J]: the ranges of kinetic and potential energy, and of what actuators, damping, contact and limits did."""
+        """The sum of the ranges [J] of kinetic and potential energy and of the work of each type of force."""
         flows = (self.work, self.dissipation, self.contact_work, self.limit_work)
         return sum(float(np.ptp(flow)) for flow in (self.kinetic_energy, self.potential_energy, *flows))
 
     @property
     def energy_oscillation(self) -> float:
-        """[J]: the largest distance of `energy_error` from its drift line."""
+        """The largest distance [J] of `energy_error` from its drift line."""
         error = self.energy_error
         line = self.energy_drift * np.linspace(-0.5, 0.5, len(error))
         return float(np.abs(error - smooth_mean(error) - line).max())
@@ -107,27 +106,27 @@ def rollout(
     parameters: Mapping[str, Any] | None = None,
     method: str = STEPS,
 ) -> Rollout:
-    """Many steps of the double plant, with energy, contact, penetration and constraint violation along them.
+    """Take many steps of the double plant; measure energy, contact, penetration and constraint violation.
 
     Args:
         model: The discrete model.
-        x0: (nx,) the first state.
-        us: (N, nu) the inputs [N or N m]; may be left out where the model has no actuators.
+        x0: (nx,) the initial state.
+        us: (N, nu) the inputs [N or N m]; may be omitted if the model has no actuators.
         policy: `policy(x, t)` (nu,) of the state and the time [s], in place of `us`.
-        num_steps: N, where `us` does not say it.
+        num_steps: N, if `us` is not given.
         parameters: Names (see `list_parameters`) and values that replace the model's own.
-        method: "steps", or "continuous": the motion in continuous time that the steps stand for, contact included,
-            integrated with error control, at the ends of the same intervals (of parameters it takes contact's). Then
-            work is integrated along the motion, `penetration` is the largest since the end before, and `contacts` are
-            those of each interval where they are deepest.
+        method: "steps", or "continuous". With "continuous", the motion in continuous time that the steps approximate
+            is integrated with error control, contact included. The results are those at the ends of the same intervals.
+            Only contact parameters are supported. Work is integrated along the motion, `penetration` is the largest
+            since the previous end, and `contacts` are those of largest depth in each interval.
 
     Returns:
-        The states `xs` (N+1, nx), and what was measured at each.
+        The states `xs` (N+1, nx), and the quantities measured at each state.
 
     Raises:
-        ShapeError, NonFiniteError, InputError: Of what was given, or of what the policy returned.
-        ModelError: The model has no motion in continuous time here.
-        SimulationError: Drake cannot take a step, or the motion in continuous time has no end.
+        ShapeError, NonFiniteError, InputError: An argument or an output of the policy is invalid.
+        ModelError: Continuous time does not support the model.
+        SimulationError: Drake cannot compute a step, or the integration in continuous time fails.
 
     Example:
         >>> model = dd.load_model("models/projectile.sdf", time_step=0.01)
@@ -164,7 +163,7 @@ def rollout(
 def _in_continuous_time(
     model: Model, vector: ParameterVector, x0: Array, inputs: Array | Policy, count: int
 ) -> Rollout:
-    """`rollout` of a model, to which the vector is applied, by its flow."""
+    """Roll out a model, to which `vector` is applied, by its flow."""
     from drake_diff.motion.flow import measured_flow  # loads CasADi
 
     def choose(x: Array, k: int) -> Array:
@@ -176,10 +175,10 @@ def _in_continuous_time(
 def continuous_rollout(
     model: Model, xs: Array, us: Array, efforts: Array, work: Array, contacts: Sequence[tuple[ContactPoint, ...]]
 ) -> Rollout:
-    """A motion in continuous time at the ends of N intervals.
+    """Make the Rollout of a motion in continuous time from its states at the ends of N intervals.
 
-    `work` (N+1, 3) [J] is that of actuators, damping and contact since the start; `contacts` are those of each interval
-    where they are deepest.
+    `work` (N+1, 3) [J] is the work of actuators, damping and contact since the start. `contacts` are the contact points
+    of largest depth in each interval.
     """
     meter = Meter(model)
     for x in xs:
@@ -198,7 +197,7 @@ def continuous_rollout(
         work=frozen(work[:, 0]),
         dissipation=frozen(work[:, 1]),
         contact_work=frozen(work[:, 2]),
-        limit_work=frozen(np.zeros(len(xs))),  # a motion that reaches one is refused
+        limit_work=frozen(np.zeros(len(xs))),  # a motion that reaches a limit is refused
         penetration=frozen(deepest),
         constraint_violation=frozen(meter.violations(xs[:, : model.nq])),
         contacts=tuple(contacts),
@@ -206,7 +205,7 @@ def continuous_rollout(
 
 
 def _asked(policy: Policy, x: Array, t: float, nu: int) -> Array:
-    """(nu,) what `policy` answers; most answers are as they should be, which costs a tenth to see."""
+    """Return the policy's input (nu,), validated; the fast check of the common case takes a tenth of the time."""
     u = called("policy", policy, x, t, shape=(nu,))
     if type(u) is np.ndarray and u.dtype == float and u.shape == (nu,) and math.isfinite(u.dot(u)):
         return u
@@ -214,7 +213,7 @@ def _asked(policy: Policy, x: Array, t: float, nu: int) -> Array:
 
 
 def check_inputs(model: Model, us: ArrayLike | None, num_steps: int | None = None) -> Array:
-    """`us` as a finite (N, nu) array; for a model without actuators `num_steps` alone will do."""
+    """Return `us` as a finite (N, nu) array. A model without actuators needs only `num_steps`."""
     if us is None and model.nu == 0:
         us = np.zeros((number_of_steps(num_steps), 0))
     checked = finite_array("us", us, ("N", model.nu))
@@ -226,7 +225,7 @@ def check_inputs(model: Model, us: ArrayLike | None, num_steps: int | None = Non
 
 
 def roll_states(model: Model, x0: Array, us: Array) -> Array:
-    """(N+1, nx): the states alone, nothing measured; sizes are the caller's business."""
+    """Return the states (N+1, nx) of a rollout without measurements; shapes are not checked."""
     xs = np.empty((len(us) + 1, model.nx))
     xs[0] = x0
     for k, u in enumerate(us):
@@ -235,7 +234,7 @@ def roll_states(model: Model, x0: Array, us: Array) -> Array:
 
 
 class Meter:
-    """Reads energies, efforts and contacts from the double context, state by state, as `advance` leaves it."""
+    """Measurement of energies, efforts and contacts in the double context after each `advance`."""
 
     def __init__(self, model: Model):
         self.model, self.plant, self.context = model, model.plant, model.double.context
@@ -248,17 +247,17 @@ class Meter:
         self.states: list[tuple[Array, float, float, float]] = []
         self.ends: list[Array] = []
         self.efforts: list[Array] = []
-        self.applied: list[Array] = []  # (nv,) by body forces and the diagram's systems
-        self.pushes: list[tuple[Array, Array]] = []  # of contact and of joint limits, (nv,) each
+        self.applied: list[Array] = []  # (nv,) generalized forces of body forces and the diagram's systems
+        self.pushes: list[tuple[Array, Array]] = []  # forces of contact and of joint limits, (nv,) each
         lower, upper = model.position_limits
-        # Of the joints with limits their places in q and v, and the limits.
+        # Indices in q and v of the joints with limits, and the limits.
         limited = [(i, j) for i, j in _single(model) if np.isfinite(lower[i]) or np.isfinite(upper[i])]
         self.limited = np.array(limited, dtype=np.intp).reshape(-1, 2).T
         self.limits = lower[self.limited[0]], upper[self.limited[0]]
         self.contacts: list[tuple[ContactPoint, ...]] = []
 
     def measure_state(self, x: Array) -> None:
-        """Of the state `x` (nx,) in the context."""
+        """Measure the state `x` (nx,), which the context has."""
         kinetic = self.plant.CalcKineticEnergy(self.context)
         potential = self.plant.CalcPotentialEnergy(self.context)
         if self.forces:
@@ -266,7 +265,7 @@ class Meter:
         self.states.append((x, kinetic, potential, penetration(self.model) if self.can_touch else 0.0))
 
     def measure_step(self, x: Array, x_next: Array) -> None:
-        """Of the step from `x` to `x_next` (nx,) that was taken last, and of the state `x`."""
+        """Measure the last step, from `x` to `x_next` (nx,), and the state `x`."""
         self.measure_state(x)
         self.ends.append(x_next)
         self.efforts.append(np.array(self.net_actuation.Eval(self.context))[: self.actuation.shape[1]])
@@ -276,36 +275,36 @@ class Meter:
         self.pushes.append((contact, self._limit_force(x, x_next, contact)))
 
     def _contact_force(self) -> Array:
-        """(nv,) the generalized force of all contacts in the last step."""
+        """Return the generalized force (nv,) of all contacts in the last step."""
         force_of_contact = np.zeros(self.plant.num_velocities())
         for i in instances(self.plant):
             if self.plant.num_velocities(i):
                 force = self.plant.get_generalized_contact_forces_output_port(i).Eval(self.context)
-                if not np.all(np.isfinite(force)):  # Drake 1.51 ends the process on it
+                if not np.all(np.isfinite(force)):  # Drake 1.51 aborts the process in this case
                     raise SimulationError("the contact forces of the step are not finite")
                 self.plant.SetVelocitiesInArray(i, force, force_of_contact)
         return np.asarray(self.model.double.own_force(force_of_contact))
 
     def _limit_force(self, x: Array, x_next: Array, contact: Array) -> Array:
-        """(nv,) what joints near a limit needed for the step beyond all other forces: the limit alone gives it."""
+        """Return the limits' force (nv,): the force for the step at joints near a limit, minus all other forces."""
         (i, j), (lower, upper) = self.limited, self.limits
         if not len(i):
             return self.still
         nq, h, force = self.model.nq, self.model.time_step, np.zeros(self.model.nv)
         v, after = x[nq:], x_next[nq:]
-        reach = 2 * h * np.maximum(np.abs(v[j]), np.abs(after[j]))  # Drake's limits act from two steps before on
+        reach = 2 * h * np.maximum(np.abs(v[j]), np.abs(after[j]))  # Drake's limits begin to act two steps ahead
         inside = (lower <= np.minimum(x[i], x_next[i]) - reach) & (np.maximum(x[i], x_next[i]) + reach <= upper)
         near = j[~inside]
         if len(near):
             needed = self.model.double.inverse_dynamics((after - v) / h) + self.damping * (after - v)
             driven = self.actuation @ self.efforts[-1]
-            if self.model.inputs.fed_actuators:  # which inverse dynamics has, too
+            if self.model.inputs.fed_actuators:  # inverse dynamics already includes these forces
                 driven += self.applied[-1] - self.model.double.systems_force()
             force[near] = (needed - driven - contact)[near]
         return force
 
     def result(self, xs: Array, us: Array) -> Rollout:
-        """The rollout with states xs (N+1, nx) and us (N, nu)."""
+        """Return the rollout with states xs (N+1, nx) and inputs us (N, nu)."""
         states, kinetic, potential, deepest = (np.array(column) for column in zip(*self.states, strict=True))
         nq, h = self.model.nq, self.model.time_step
         efforts = np.array(self.efforts).reshape(len(us), self.actuation.shape[1])
@@ -333,9 +332,9 @@ class Meter:
         )
 
     def violations(self, qs: Array) -> Array:
-        """(N+1,) at the positions qs (N+1, nq)."""
+        """Return the constraint violations (N+1,) at the positions qs (N+1, nq)."""
         if self.model.num_constraints:
-            return np.full(len(qs), np.inf)  # pydrake does not tell where a coupler, ball, weld or distance should be
+            return np.full(len(qs), np.inf)  # pydrake does not expose the violation of constraints
         lower, upper = self.model.position_limits
         violation = np.maximum(lower - qs, qs - upper).max(axis=1, initial=0.0)
         for start in tangent_space(self.model).quaternions:
@@ -344,16 +343,16 @@ class Meter:
 
 
 def _single(model: Model) -> list[tuple[int, int]]:
-    """The places in q and v of each joint of one degree of freedom."""
+    """Return the indices in q and v of each joint with one degree of freedom."""
     places = [model.places(joint) for joint in joints(model.plant)]
     return [(q.start, v.start) for q, v in places if len(q) == len(v) == 1]
 
 
 def smooth_mean(series: Array) -> float:
-    """The mean of `series` (n,) under the weight exp(-1 / (s (1 - s))), s from 0 to 1 along it.
+    """Return the mean of `series` (n,) with the weight exp(-1 / (s (1 - s))), s from 0 to 1 along the series.
 
-    The weight vanishes with all its derivatives at both ends, so an oscillation of more than a few periods
-    contributes next to nothing (Das, Saiki, Sander and Yorke, "Quantitative quasiperiodicity", 2017).
+    The weight vanishes with all its derivatives at both ends, so the contribution of an oscillation of more than a few
+    periods is negligible (Das, Saiki, Sander and Yorke, "Quantitative quasiperiodicity", 2017).
     """
     s = (np.arange(len(series)) + 0.5) / len(series)
     weight = np.exp(-1 / (s * (1 - s)))
@@ -361,11 +360,10 @@ def smooth_mean(series: Array) -> float:
 
 
 def drift(series: Array) -> float:
-    """How far `series` (n,) wanders from its start to its end, oscillation averaged out.
+    """Return the change of `series` (n,) from its start to its end without its oscillation.
 
-    Twice the difference between the smooth means of its second and its first half: exactly the rise of a
-    straight line, next to nothing for an oscillation of many periods. Of fewer than four values, the last minus
-    the first.
+    This is twice the difference between the smooth means of the second and the first half. It is exact for a straight
+    line and negligible for an oscillation of many periods. For fewer than four values, it is the last minus the first.
     """
     if len(series) < 4:
         return float(series[-1] - series[0])

@@ -1,8 +1,8 @@
-"""A smooth plant moved under feedback by its own equation, compiled: what a search tries motions with.
+"""A compiled rollout of a smooth plant under feedback, used for candidate trajectories of a solver.
 
-It is of trees of hinges and slides that cannot touch anything, and of steps in which no joint is at its limit. Each
-step is Drake's but for rounding, of which the certificate of the model's smooth derivative sees three; what is told of
-a search in the end is rolled out by Drake itself.
+It supports trees of hinges and slides without collision candidates, and steps in which no joint reaches its limit. Each
+step equals Drake's except for rounding. The certificate of the model's smooth derivative checks this at three steps.
+The final trajectory of a solver is rolled out by Drake itself.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from drake_diff.model.step import stepped
 
 @dataclass(frozen=True, eq=False)
 class SmoothRoll:
-    """What does not change from motion to motion."""
+    """The compiled rollout, with the data that does not change between trajectories."""
 
     smooth: SmoothStep
     tree: tree_kernel.Tree
@@ -29,10 +29,10 @@ class SmoothRoll:
     def __call__(
         self, x0: Array, old: Array, gaps: Array, wanted: Array, gains: Array, bounds: tuple[Array, ...]
     ) -> tuple[Array, Array] | None:
-        """(xs (N+1, nx), us (N, nu)), us = wanted + gains (xs - old) within bounds, each step less its gap (N, nx).
+        """Return (xs (N+1, nx), us (N, nu)), with us = wanted + gains (xs - old) within bounds, and with gaps (N, nx).
 
-        `gains` (N, nu, nx), `bounds` a `tree_kernel.SaturationBounds`. None where a joint comes to its limit, or
-        anything is not finite.
+        Each gap is subtracted from the end of its step. `gains` are (N, nu, nx), `bounds` those of `SaturationBounds`.
+        Returns None if a joint reaches its limit or a value is not finite.
         """
         (count, nu), nx = wanted.shape, len(x0)
         xs, us = np.empty((count + 1, nx)), np.empty((count, nu))
@@ -50,7 +50,7 @@ class SmoothRoll:
 
 
 def smooth_roll_of(model: Model) -> SmoothRoll | None:
-    """None where the plant is another, or its steps are not certified."""
+    """Return the compiled rollout, or None if it does not support the plant or its steps are not certified."""
     if model.has_other_parameters:
         return None
     return model.cache("smooth roll", lambda: _make(model))

@@ -1,20 +1,20 @@
 """Randomized smoothing: F(x) = E[f(x + w)] and its Jacobian, from samples of f and of its derivative.
 
 Suh et al. 2022, "Do differentiable simulators give better policy gradients?", with w of density p:
-    first order   mean of df/dx(x + w)                         misses what f jumps by: its mean is then biased
-    zeroth order  mean of (f(x + w) - f(x)) s(w)^T,            unbiased for any f, of a larger variance as a rule;
-                  s = -d log p / d w                           f(x) changes no mean, for E[s] = 0, but the variance
+    first order   mean of df/dx(x + w)                         does not include jumps of f: its mean is then biased
+    zeroth order  mean of (f(x + w) - f(x)) s(w)^T,            unbiased for any f, usually with larger variance;
+                  s = -d log p / d w                           f(x) changes the variance but not the mean (E[s] = 0)
     blend         a * first + (1 - a) * rest, entry by entry:
-                  rest  zeroth, or zeroth less (df/dx(x) w) s(w)^T - df/dx(x), which is 0 but for chance: the one that
-                        varies less. Both are unbiased; the second is nearly exact where f is nearly linear
-                  a     the weight that makes the squared error smallest that can be vouched for,
+                  rest  zeroth, or zeroth minus [(df/dx(x) w) s(w)^T - df/dx(x)], whose mean is 0: the estimator with
+                        the smaller variance. Both are unbiased; the second is nearly exact if f is nearly linear
+                  a     the weight that minimizes a bound on the squared error,
                         (variance of the blend) + a^2 (b^2 + e^2),  b = first - rest, e its standard error
-The second term is what first order's bias may add: the samples say that it is b to within e, and never that it is 0,
-however little first order itself varies (that of a jump does not vary at all). So it counts in the blend's `variance`,
-and three of its standard errors cover the truth. With v0, v1 and c the variances of rest and first and their
-covariance, a = (v0 - c) / (2 e^2 + b^2), which shrinks like 1 / samples where there is a bias. (Suh et al. choose a by
-a bound on a |b| for an accuracy that is given.) Of few samples the rare and large ones are missing as a rule, so the
-variances of a blend count the farthest sample three times. No estimate knows of a jump that no sample crosses.
+The second term is the possible contribution of first order's bias. The samples estimate this bias as b with standard
+error e and cannot show that it is 0, even if first order has no variance (as for a jump). So this term is part of the
+blend's `variance`, and three of its standard errors cover the true value. With v0, v1 and c the variances of rest and
+first and their covariance, a = (v0 - c) / (2 e^2 + b^2), which decreases like 1 / samples if there is a bias. (Suh et
+al. choose a by a bound on a |b| for a given accuracy.) Few samples usually miss rare large values, so the variances of
+a blend count the farthest sample three times. No estimate can detect a jump that no sample crosses.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ from drake_diff.model.tangent import tangent_space
 
 Flags = NDArray[np.bool_]
 METHODS = ("first", "zeroth", "blend")
-# Standard errors beyond which a difference is no chance: 0.3 % of the entries of an unbiased f exceed it.
+# Number of standard errors for a significant difference: 0.3 % of the entries of an unbiased f exceed it.
 CONFIDENCE = 3.0
 ROUNDING = 1e-12
-FARTHEST = 2.0  # how often the farthest sample counts once more in what a blend vouches for
+FARTHEST = 2.0  # additional copies of the farthest sample in the variances of a blend
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +56,11 @@ class Gaussian:
     """Independent normal noise.
 
     Args:
-        sigma: The standard deviation in the units of x: a number above 0, or (n,) numbers of at least 0 of which one
-            is above 0. Noise does not move a coordinate of 0.
+        sigma: The standard deviation in the units of x: a positive number, or (n,) nonnegative numbers that are not all
+            0. A coordinate with sigma 0 has no noise.
 
     Raises:
-        InputError: sigma is none of these.
+        InputError: sigma is not of this form.
 
     Example:
         >>> from drake_diff.motion import Gaussian
@@ -74,11 +74,11 @@ class Gaussian:
         object.__setattr__(self, "sigma", _scale("Gaussian.sigma", self.sigma))
 
     def sample(self, random: np.random.Generator, shape: tuple[int, ...]) -> Array:
-        """Noise of `shape` (..., n)."""
+        """Return noise of `shape` (..., n)."""
         return np.asarray(np.asarray(self.sigma) * random.standard_normal(shape))
 
     def score(self, w: ArrayLike) -> Array:
-        """(..., n): -d log p / d w = w / sigma^2 at `w` (..., n); 0 where sigma is 0."""
+        """Return -d log p / d w = w / sigma^2 (..., n) at `w` (..., n); 0 where sigma is 0."""
         return _ratio(w, np.square(np.asarray(self.sigma)))
 
 
@@ -86,17 +86,17 @@ class Gaussian:
 class Barrier:
     """Independent noise of density c (w^2 + c)^(-3/2) / 2, `c` in the squared units of x.
 
-    This is sqrt(c / 2) times Student's t of 2 degrees of freedom. It smooths max(u, 0) to what a log barrier
-    makes of it, (u + sqrt(u^2 + c)) / 2 (Pang et al., arXiv 2206.10787). Its variance is infinite and its score
-    bounded: for an f that grows linearly F and both orders exist, and both orders have a variance, but F's own
-    estimate has none (`value_variance` then does not settle); an f that grows like |x|^2 has no F.
+    This is sqrt(c / 2) times Student's t of 2 degrees of freedom. It smooths max(u, 0) to the result of a log
+    barrier, (u + sqrt(u^2 + c)) / 2 (Pang et al., arXiv 2206.10787). Its variance is infinite and its score is
+    bounded. If f grows linearly, F and both orders exist, and both orders have a variance, but the estimate of F
+    has none (`value_variance` then does not converge). If f grows like |x|^2, F does not exist.
 
     Args:
-        c: In the squared units of x: a number above 0, or (n,) numbers of at least 0 of which one is above 0. Noise
-            does not move a coordinate of 0.
+        c: In the squared units of x: a positive number, or (n,) nonnegative numbers that are not all 0. A coordinate
+            with c = 0 has no noise.
 
     Raises:
-        InputError: c is none of these.
+        InputError: c is not of this form.
 
     Example:
         >>> from drake_diff.motion import Barrier
@@ -110,11 +110,11 @@ class Barrier:
         object.__setattr__(self, "c", _scale("Barrier.c", self.c))
 
     def sample(self, random: np.random.Generator, shape: tuple[int, ...]) -> Array:
-        """Noise of `shape` (..., n)."""
+        """Return noise of `shape` (..., n)."""
         return np.asarray(np.sqrt(np.asarray(self.c) / 2) * random.standard_t(2, shape))
 
     def score(self, w: ArrayLike) -> Array:
-        """(..., n): -d log p / d w = 3 w / (w^2 + c) at `w` (..., n); 0 where c is 0."""
+        """Return -d log p / d w = 3 w / (w^2 + c) (..., n) at `w` (..., n); 0 where c is 0."""
         w, c = np.asarray(w, dtype=float), np.asarray(self.c)
         return np.where(c > 0, _ratio(3 * w, w * w + c), 0.0)
 
@@ -124,16 +124,16 @@ Noise = Gaussian | Barrier
 
 @dataclass(frozen=True, eq=False)
 class Smoothed(ShowsItsRepr):
-    """F(x) and dF/dx from `samples` samples; `smooth` makes one. All variances are of the means, not of one sample.
+    """F(x) and dF/dx from `samples` samples, returned by `smooth`. All variances are those of means, not of samples.
 
-    `value` (m,) with `value_variance` (m,); `jacobian` (m, n) with `variance` (m, n) is what `method` chose:
-    `weight` (m, n) of `first`, the rest of `zeroth` (a blend corrects it, see the top of this module), each with its
-    variance. `bias` (m, n), first order less that rest, is the estimated bias of first order, `bias_error` its standard
-    error, and `biased` whether |bias| > 3 bias_error: True is a bias (or a wrong derivative) to 0.3 %, but False only
-    means that these samples do not show one. A blend's `variance` counts `bias_square` (m, n), what that bias may add
-    to its squared error; the other orders count none, and it is 0. `first`, `first_variance`, `bias`, `bias_error` and
-    `biased` are None where there was no derivative. A column that noise does not move has no zeroth order: first order
-    stands in `zeroth` there, with weight 1 and bias 0.
+    `value` (m,) has the variance `value_variance` (m,), and `jacobian` (m, n) has the variance `variance` (m, n). The
+    Jacobian is `weight` (m, n) times `first` plus the rest of `zeroth` (corrected in a blend, see the module's
+    docstring), each with its variance. `bias` (m, n), first order minus that rest, is the estimated bias of first
+    order, `bias_error` its standard error, and `biased` is |bias| > 3 bias_error. True means a bias (or a wrong
+    derivative) with 0.3 % error probability; False only means that the samples show no bias. A blend's `variance`
+    includes `bias_square` (m, n), the possible contribution of the bias to the squared error; for other methods it is
+    0. `first`, `first_variance`, `bias`, `bias_error` and `biased` are None if no derivative was given. A column
+    without noise has no zeroth order. Its `zeroth` is the first order, with weight 1 and bias 0.
 
     Example:
         >>> from drake_diff.motion import Gaussian
@@ -185,27 +185,27 @@ def smooth(
     seed: int = 0,
     method: str = "blend",
 ) -> Smoothed:
-    """F(x) = E[f(x + w)] and dF/dx of any function f, with what first and zeroth order are worth there.
+    """Estimate F(x) = E[f(x + w)] and dF/dx of any function f, with the variances of first and zeroth order.
 
-    Calls f `samples` + 1 times and `jacobian` `samples` times, once more for a blend; keeps sums, not samples.
+    f is called `samples` + 1 times, and `jacobian` `samples` times, once more for a blend. Samples are not stored.
 
     Args:
         f: (n,) -> (m,), or a number (m = 1).
-        x: (n,) where.
-        jacobian: (n,) -> (m, n), or (n,) where m = 1, the derivative of f. Only "zeroth" does without, and only where
-            noise moves all coordinates; where one is given all three orders are estimated.
+        x: (n,) the point.
+        jacobian: The derivative of f, (n,) -> (m, n), or (n,) if m = 1. It is optional only for "zeroth" with noise on
+            all coordinates. If it is given, all three orders are estimated.
         noise: A `Gaussian` or a `Barrier`.
-        samples: How many, at least 2.
-        seed: The same gives the same bytes.
-        method: "first", "zeroth" or "blend", see the top of this module.
+        samples: The number of samples, at least 2.
+        seed: The seed of the random numbers; results are bitwise reproducible.
+        method: "first", "zeroth" or "blend", see the module's docstring.
 
     Returns:
         The value (m,) and Jacobian (m, n) of F, with their variances.
 
     Raises:
-        UnknownNameError: There is no such method.
-        InputError: Shapes that do not fit, fewer than 2 samples, or a missing `jacobian`.
-        GradientError: f, `jacobian` or what comes of them is not finite.
+        UnknownNameError: The method does not exist.
+        InputError: Shapes do not match, there are fewer than 2 samples, or `jacobian` is missing.
+        GradientError: f, `jacobian` or their statistics are not finite.
 
     Example:
         >>> from drake_diff.motion import Gaussian
@@ -267,25 +267,25 @@ def smooth_step(
     seed: int = 0,
     method: str = "blend",
 ) -> Smoothed:
-    """`smooth` of one step of a model over z = [x; u], by the Jacobians of `differentiate_step`.
+    """Apply `smooth` to one step of a model over z = [x; u], with the Jacobians of `differentiate_step`.
 
     Args:
-        model: A discrete model without quaternions, to which no noise can be added.
+        model: A discrete model without quaternions, to which noise cannot be added.
         x: (nx,) the state.
-        u: (nu,) the input [N or N m]; may be left out where the model has no actuators.
-        noise: In the units of z, which differ from entry to entry: (nx + nu,) numbers say more than one. A
-            coordinate whose number is 0 is not smoothed; its columns of `zeroth` hold the first order.
-        samples: How many, at least 2.
-        seed: The same gives the same bytes.
+        u: (nu,) the input [N or N m]; may be omitted if the model has no actuators.
+        noise: In the units of z, which differ between entries, so that (nx + nu,) numbers are recommended. A
+            coordinate with the number 0 is not smoothed, and its columns of `zeroth` are the first order.
+        samples: The number of samples, at least 2.
+        seed: The seed of the random numbers; results are bitwise reproducible.
         method: "first", "zeroth" or "blend".
 
     Returns:
         The value (nx,) and Jacobian (nx, nx + nu) of the smoothed step, with their variances.
 
     Raises:
-        InputError: The model has a quaternion, or what `smooth` raises.
-        SimulationError: Drake cannot take a step.
-        GradientError: As by `differentiate_step`.
+        InputError: The model has a quaternion, or an argument is invalid for `smooth`.
+        SimulationError: Drake cannot compute a step.
+        GradientError: See `differentiate_step`.
 
     Example:
         >>> from drake_diff.motion import Gaussian
@@ -329,13 +329,13 @@ def _words(noise: Noise) -> str:
 
 
 def _ratio(a: ArrayLike, b: ArrayLike) -> Array:
-    """a / b, and 0 where b is 0."""
+    """Return a / b, and 0 where b is 0."""
     a, b = np.broadcast_arrays(np.asarray(a, dtype=float), np.asarray(b, dtype=float))
     return np.divide(a, b, out=np.zeros(a.shape), where=b > 0)
 
 
 def _moved(noise: Noise, size: int) -> Flags:
-    """(size,): which coordinates the noise moves."""
+    """Return which coordinates have noise (size,)."""
     if not isinstance(noise, (Gaussian, Barrier)):
         raise InputError("noise", got=repr(noise)[:80], expected="a Gaussian or a Barrier")
     scale = np.asarray(noise.sigma if isinstance(noise, Gaussian) else noise.c)
@@ -346,25 +346,25 @@ def _moved(noise: Noise, size: int) -> Flags:
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """The mean of samples, the variance of that mean, and the same if the farthest sample had come three times."""
+    """The mean of samples, the variance of the mean, and this variance with the farthest sample counted three times."""
 
     mean: Array
     variance: Array
     cautious: Array
 
     def where(self, chosen: Flags, other: Sums) -> Sums:
-        """`other` in the entries that are not `chosen`."""
+        """Return these sums with the entries that are not `chosen` replaced by those of `other`."""
         return Sums(*(np.where(chosen, getattr(self, name), getattr(other, name)) for name in vars(self)))
 
 
 def _blend(sums: dict[str, Sums], moved: Flags) -> tuple[Array, Array, Array, Array, Sums]:
-    """The blend, its variance, what of that is for the bias, the weight of first order, and the bias."""
+    """Return the blend, its variance, the part of the variance due to bias, the weight of first order, and the bias."""
     first, plain = sums["first"], sums["zeroth"].variance <= sums["corrected"].variance
     rest = sums["zeroth"].where(plain, sums["corrected"])
     bias = sums["bias"].where(plain, sums["corrected bias"])
     v0, v1, spread = rest.cautious, first.cautious, bias.cautious
     covariance = (v0 + v1 - spread) / 2
-    possible = bias.mean**2 + spread  # the mean square of a bias of which these samples say b +- e
+    possible = bias.mean**2 + spread  # the mean square of a bias estimated as b +- e
     loss = spread + possible
     weight = np.clip(np.divide(v0 - covariance, loss, out=np.ones_like(loss), where=loss > 0), 0.0, 1.0)
     weight[:, ~moved] = 1.0
@@ -385,7 +385,7 @@ def _moments(
     *,
     corrects: bool,
 ) -> dict[str, Sums]:
-    """Of value (m,), zeroth and, with a jacobian, first and bias (m, n), and those corrected; Welford's sums."""
+    """Compute sums of value (m,), zeroth, first, bias (m, n) and the corrected ones by Welford's algorithm."""
     centre = _evaluate("f", f, x.copy(), ("m",))
     rows, size = len(centre), len(x)
     if not (rows and size):
@@ -395,7 +395,7 @@ def _moments(
     for n, w in enumerate(noise.sample(np.random.default_rng(seed), (samples, size)), start=1):
         value, score = _evaluate("f", f, x + w, (rows,)), noise.score(w)
         first = None if jacobian is None else _evaluate("jacobian", jacobian, x + w, (rows, size))
-        with np.errstate(over="ignore", invalid="ignore"):  # refused below
+        with np.errstate(over="ignore", invalid="ignore"):  # checked below
             zeroth = np.outer(value - centre, score)
             parts = [value, zeroth.ravel()]
             if first is not None:
@@ -422,8 +422,8 @@ def _moments(
 
 
 def _evaluate(subject: str, function: Callable[[Array], Any], point: Array, shape: tuple[int | str, ...]) -> Array:
-    """`function` at `point` as numbers of `shape`; missing leading dimensions are 1."""
-    given = point.copy()  # the function may change what it is given
+    """Evaluate `function` at `point` as numbers of `shape`; missing leading dimensions are 1."""
+    given = point.copy()  # the function may modify its argument
     result = function(point)
     try:
         result = np.array(result, ndmin=len(shape))

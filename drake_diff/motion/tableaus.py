@@ -1,7 +1,7 @@
-"""The coefficients of the integrators of motions in continuous time, and how their steps change length.
+"""The coefficients of the integrators of motions in continuous time, and their step-size control.
 
-Dormand and Prince's pair of orders 5 and 4 ("A family of embedded Runge-Kutta formulae", 1980); within a step by
-Shampine ("Some practical Runge-Kutta formulas", 1986).
+Dormand and Prince's pair of orders 5 and 4 ("A family of embedded Runge-Kutta formulae", 1980), with Shampine's dense
+output ("Some practical Runge-Kutta formulas", 1986).
 
 Rodas5P, a Rosenbrock method of orders 5 and 4 for stiff motions, L-stable (Steinebach, "Construction of
 Rosenbrock-Wanner method Rodas5P and numerical benchmarks within the Julia Differential Equations package", BIT 63,
@@ -14,7 +14,7 @@ the step ends at x + sum_j a_8j k_j + k_8, and k_8 is its error.
 
 import numpy as np
 
-SAFETY, LEAST, MOST = 0.9, 0.1, 5.0  # of the factor by which a step's length changes
+SAFETY, LEAST, MOST = 0.9, 0.1, 5.0  # safety factor, minimum and maximum of the change of a step's length
 STAGES = (
     (1 / 5,),
     (3 / 40, 9 / 40),
@@ -23,9 +23,9 @@ STAGES = (
     (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
     (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
 )
-AT = (1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0)  # of a step: where each of STAGES is, the last being its end
-ERROR = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])  # fifth less fourth
-# The weights of the slopes are DENSE @ [t, t^2, t^3, t^4] at the part t of a step, with an error of order 5.
+AT = (1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0)  # the fraction of the step of each of STAGES; the last is the step's end
+ERROR = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])  # order 5 minus order 4
+# The weights of the slopes are DENSE @ [t, t^2, t^3, t^4] at the fraction t of a step, with an error of order 5.
 DENSE = np.array(
     [
         (1, -8048581381 / 2820520608, 8663915743 / 2820520608, -12715105075 / 11282082432),
@@ -40,7 +40,7 @@ DENSE = np.array(
 
 
 def factor(error: float) -> float:
-    """By what the length of a step changes whose error is that part of what is allowed."""
+    """Return the factor by which a step's length changes, for `error` relative to the tolerance."""
     return MOST if error == 0 else min(MOST, max(LEAST, SAFETY * error**-0.2))
 
 

@@ -1,21 +1,21 @@
-"""Where the loss of a motion in continuous time has no slope: its columns, by motions a little beside it.
+"""Detect the gradient columns in which the loss of a continuous motion has no slope, by perturbed motions.
 
-The derivative along a motion that touches is that of a point. A body that barely touches or tumbles ends elsewhere a
-little away, and then it is no slope of anything that can be measured or descended. A column has a slope where
+The derivative along a motion with contact is valid at a point. If a body has grazing contact or tumbles, a small
+perturbation may lead to a very different motion, and the derivative is not a slope that can be measured or used for
+descent. "Slope over +-w" denotes the central difference quotient of width w. A column has a slope if
 
     1. the slopes over +-1e-3 and +-1e-4 of its unit agree to 0.1 %, and the derivative is within 1 % of them;
-    2. the slope over +-1e-2 agrees with them to 0.1 % too, or differs from them as a smooth curve does: by the square
-       of the width, which the slope over +-5e-3 shows,
+    2. the slope over +-1e-2 agrees with them to 0.1 % too, or differs from them as for a smooth curve, by the square
+       of the width, which is checked with the slope over +-5e-3,
 
-all of it but for what the integration's own error makes of a slope. It is `Undefined` otherwise. A graze within 1e-2
-is undefined so, also where the derivative at the point is right over a thousandth of that; a curve is not. Where
-nothing touches, here or beside, a hundredth of these widths will do: a double pendulum is smooth, and yet bent.
+up to the integration error. Otherwise the column is `Undefined`. So a column with grazing contact within 1e-2 is
+undefined, even if the derivative is correct within a thousandth of this width. A smooth curve is not undefined. Without
+contact in all motions, a hundredth of these widths is used, as a double pendulum is smooth but strongly curved.
 
-Rollouts are spared where all is well. Columns are moved together in three groups, those with the largest derivatives
-first, each by 1e-2 and all so that the loss rises. Where the loss follows the sum of their derivatives to 1 % of the
-largest, or bends away from it as a smooth curve does, they have slopes; else, and where a group is but one column, it
-is asked of each on its own whether the loss follows to 1 %, and of those that fail the narrower widths, unless they are
-off by a half already. Slopes over 1e-2 need no more than a tolerance of 1e-7.
+To save rollouts, columns are first moved together in three groups, largest derivatives first, each by 1e-2 in the
+direction of increasing loss. They have slopes if the loss agrees with the sum of their derivatives to 1 % of the
+largest, or deviates as a smooth curve does. Otherwise, and for groups of one column, each column is checked to 1 %, and
+on failure with the narrower widths, unless the error exceeds one half. Slopes over 1e-2 need a tolerance of only 1e-7.
 """
 
 from collections.abc import Iterator, Sequence
@@ -38,31 +38,31 @@ from drake_diff.motion.loss import Loss, Totals, evaluate_loss, total_gradients
 from drake_diff.motion.policy import Feedback, ParametricPolicy, policy_parameters, recording_choice
 from drake_diff.motion.smoothing import Gaussian, Smoothed, smooth
 
-WIDE, BETWEEN, MIDDLE, NARROW = 1e-2, 5e-3, 1e-3, 1e-4  # of a column's unit, to both sides
-CURVE = (WIDE**2 - MIDDLE**2) / (BETWEEN**2 - MIDDLE**2)  # how slopes over these differ on a smooth curve
+WIDE, BETWEEN, MIDDLE, NARROW = 1e-2, 5e-3, 1e-3, 1e-4  # half widths in a column's unit
+CURVE = (WIDE**2 - MIDDLE**2) / (BETWEEN**2 - MIDDLE**2)  # ratio of the differences from the MIDDLE slope on a curve
 QUARTER = (WIDE / BETWEEN) ** 2
-SMOOTH = 1e-2  # part of the widths where nothing touches
-COARSE = 1e-7  # the tolerance of what moves by 1e-2
-SETTLED, RIGHT = 1e-3, 1e-2
-FAR = 0.5  # a derivative that is so far off over +-1e-2 is no slope, whatever there is over less
-BENT = 0.1  # of a curve's difference: what its fourth derivative may add
-BENDS = 0.1  # of the largest: by so much columns that are moved together may, 0.1 % over a tenth of the width
-NEGLIGIBLE = 1e-2  # of the largest column: what is smaller is judged as if it were that large
-FORGOTTEN = 2e-3  # of the loss's own derivative by the last state: likewise, of a start that the motion forgets
-NOISE = 0.1  # of the tolerance, times how much of an error comes through to the loss: its change between two motions
+SMOOTH = 1e-2  # factor on the widths without contact
+COARSE = 1e-7  # integration tolerance for displacements of 1e-2
+SETTLED, RIGHT = 1e-3, 1e-2  # relative tolerances of slopes with each other, and of slopes with the derivative
+FAR = 0.5  # a larger relative error over +-1e-2 means no slope, without a check of narrower widths
+BENT = 0.1  # allowed relative deviation from the quadratic difference, due to the fourth derivative
+BENDS = 0.1  # allowed curvature of a group, relative to its largest column: 0.1 % over a tenth of the width
+NEGLIGIBLE = 1e-2  # relative to the largest column: smaller columns are judged as if they were this large
+FORGOTTEN = 2e-3  # likewise, relative to the gradient at the last state, for motions that do not depend on the start
+NOISE = 0.1  # change of the loss between two motions due to errors, relative to tolerance times error amplification
 GROUPS = 3
-TURN = 1e-5  # of a displacement: the start is linear in it but for a turn
-MANY = 24  # parameters of a policy: more are one column, along their own gradient
-SMOOTHED = tuple(float(f"{width:.2g}") for width in 10 ** np.arange(-3.0, 0.25, 0.5))  # widths that are tried
-KNOWN = 0.2  # of a smoothed slope: its standard error at most
+TURN = 1e-5  # finite-difference step: the start is linear in the displacement except for rotations
+MANY = 24  # more policy parameters than this are one column, along their own gradient
+SMOOTHED = tuple(float(f"{width:.2g}") for width in 10 ** np.arange(-3.0, 0.25, 0.5))  # candidate widths
+KNOWN = 0.2  # maximum relative standard error of a smoothed slope
 
 
 @dataclass(frozen=True, eq=False)
 class Undefined(ShowsItsRepr):
-    """A column of a gradient in which the loss has no slope: the derivative at the point is that of the point alone.
+    """A column of a gradient in which the loss has no slope, so that the derivative is valid at the point only.
 
-    `slopes` are measured over `widths` to both sides, in the column's unit; they may be fewer than the widths that
-    `differentiate_rollout` names, for it stops where the answer is clear. `reason` says what is not as it should be.
+    `slopes` are measured over `widths` to both sides, in the column's unit. There may be fewer slopes than widths in
+    `drake_diff.motion.undefined`, as the search stops when the result is clear. `reason` names the failed condition.
 
     Example:
         >>> import warnings
@@ -87,29 +87,29 @@ class Undefined(ShowsItsRepr):
 
     @property
     def missed(self) -> bool:
-        """Whether there is a slope, and the derivative is not it."""
+        """Whether the slopes converge to a value other than the derivative."""
         return self.reason == MISSED
 
     def smooth(self, samples: int = 100, seed: int = 0) -> Smoothed:
-        """The slope of the loss's mean under normal noise in this column, of the smallest width that has one.
+        """Estimate the slope of the loss's mean under normal noise in this column, for the smallest adequate width.
 
-        Widths (standard deviations) go from 1e-3 to 1 of the column's unit by factors of 3. The first is taken at which
-        half of `samples` say that all of them will know the blend of first and zeroth order (see `drake_diff.smooth`)
-        to 20 %, by its standard error; then they are drawn afresh, so that the choice does not bend the answer. A
-        sample is a rollout with its derivative.
+        Widths (standard deviations) range from 1e-3 to 1 of the column's unit by factors of 3. A width is adequate if
+        half of `samples` predict that all of them determine the blend of first and zeroth order (see
+        `drake_diff.smooth`) to 20 %, by its standard error. Then new samples are drawn, so that the choice of the width
+        does not bias the estimate. A sample is a rollout with its derivative.
 
         Args:
-            samples: How many; half as many at each width that is tried.
-            seed: The same gives the same.
+            samples: The number of samples; half as many are used at each candidate width.
+            seed: The seed of the random numbers; results are reproducible.
 
         Returns:
-            Value and Jacobian (1, 1) with their variance, `noise` with the width in the column's unit, and `bias`: by
-            how much the mean of the derivatives alone would be wrong, with its error.
+            Value and Jacobian (1, 1) with their variance, `noise` with the width in the column's unit, and `bias`, the
+            error of the mean of the derivatives, with its standard error.
 
         Raises:
-            GradientError: No width up to 1 has a slope that so many samples show.
+            GradientError: No width up to 1 has a slope that is significant with this number of samples.
             InputError: Fewer than 4 samples.
-            SimulationError: A motion beside this one has no end.
+            SimulationError: The integration of a perturbed motion fails.
         """
         if positive_int("samples", samples) < 4:
             raise InputError("samples", got=samples, expected="at least 4")
@@ -138,19 +138,19 @@ MISSED = "the slopes converge, but not to the derivative"
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """Motions in continuous time beside one, by displacements (n,).
+    """Motions in continuous time, perturbed by displacements (n,).
 
-    These are of the first state on the tangent space, of the inputs (N, nu) or the policy's parameters, and of the
-    model's parameters.
+    A displacement has entries for the initial state in the tangent space, for the inputs (N, nu) or the policy's
+    parameters, and for the model's parameters.
     """
 
     model: Model
     x0: Array
-    us: Array  # (N, nu); under a policy of that length alone
+    us: Array  # (N, nu); with a policy only the length N is used
     policy: Any
     loss: Loss
     vector: ParameterVector
-    steps: FlowSteps  # of the motion itself, whose equations are made
+    steps: FlowSteps  # of the unperturbed motion, reused while the parameters are unchanged
 
     @cached_property
     def space(self) -> Any:
@@ -169,7 +169,7 @@ class Beside:
         return x0, self.us, ParametricPolicy(self.policy, values) if len(values) else self.policy, vector
 
     def _steps(self, vector: ParameterVector, tolerance: float) -> FlowSteps:
-        """Those of the motion itself, which have its materials, unless parameters are moved."""
+        """Return the steps of the unperturbed motion, or new ones if parameters are perturbed."""
         if not np.array_equal(vector.values, self.vector.values):
             with applied(vector) as model:
                 return FlowSteps(model, vector, tolerance)
@@ -177,7 +177,7 @@ class Beside:
         return self.steps
 
     def value(self, displacement: Array, tolerance: float) -> tuple[float, bool]:
-        """The loss at a displacement (n,), and whether anything touches on the way."""
+        """Return the loss at a displacement (n,), and whether the motion has contact."""
         x0, us, policy, vector = self._moved(displacement)
 
         def choose(x: Array, k: int) -> Array:
@@ -188,7 +188,7 @@ class Beside:
         return evaluate_loss(self.loss, flow.xs, flow.us), touches
 
     def linearize(self, displacement: Array, tolerance: float) -> tuple[list[StepDerivatives], list[Feedback], Array]:
-        """The derivatives of the intervals of the motion at a displacement (n,), of its policy, and its inputs."""
+        """Return derivatives of intervals and of the policy, and the inputs, for the motion at a displacement (n,)."""
         x0, us, policy, vector = self._moved(displacement)
         choose, feedback = (lambda x, k: us[k]), list[Feedback]()
         if policy is not None:
@@ -199,7 +199,7 @@ class Beside:
             return steps.differentiate(flow), feedback, flow.us
 
     def slope(self, displacement: Array, way: Array) -> tuple[float, float]:
-        """The loss at a displacement (n,), and its derivative as that moves along `way` (n,)."""
+        """Return the loss at a displacement (n,), and its directional derivative along `way` (n,)."""
         linearization, feedback, inputs = self.linearize(displacement, TOLERANCE)
         value, totals = total_gradients(
             self.loss, self._moved(displacement)[0], inputs, self.policy, linearization, feedback
@@ -208,12 +208,12 @@ class Beside:
         return value, self._flat(totals, float(totals.states[0] @ (ahead - behind)) / (2 * TURN), way)
 
     def _flat(self, totals: Totals, by_start: float, way: Array) -> float:
-        """The derivative along `way`, of which that of the start is known."""
+        """Return the derivative along `way`, given the contribution `by_start` of the initial state."""
         given = totals.inputs.ravel() if self.policy is None else totals.policy
         return by_start + float(np.concatenate([given, totals.parameters]) @ way[self.space.size :])
 
     def lines(self, totals: Totals) -> "Iterator[LossLine]":
-        """A line for each column."""
+        """Yield a line for each column."""
         size, given, (count, nu) = self.space.size, len(self.given), self.us.shape
         by_start = totals.states[0] @ self.space.derivative_of_plus(self.x0)
         eye = np.eye(size + given + len(self.vector.values))
@@ -239,43 +239,43 @@ class Beside:
 
 @dataclass(eq=False)
 class LossLine:
-    """The loss along one column; `unit` is what widths are parts of, `slope` the derivative at the point."""
+    """The loss along one column. Widths are fractions of `unit`, and `slope` is the derivative at the point."""
 
     beside: Beside
     column: str
     vector: Array  # (n,) a displacement of 1 in the column
     unit: float
     slope: float
-    touches: bool = field(default=False, init=False)  # whether anything does in a motion along it
+    touches: bool = field(default=False, init=False)  # whether a motion along the line has had contact
     _last: tuple[float, float] = field(default=(float("nan"), 0.0), init=False)
 
     @property
     def change(self) -> float:
-        """How much the loss rises over one unit, by the derivative."""
+        """The change of the loss over one unit according to the derivative."""
         return self.slope * self.unit
 
     def over(self, width: float, tolerance: float) -> float:
-        """The slope over +- so many units."""
+        """Return the slope over +- `width` units."""
         way = width * self.unit
         (ahead, touches), (behind, also) = (self.beside.value(s * way * self.vector, tolerance) for s in (1, -1))
         self.touches |= touches or also
         return (ahead - behind) / (2 * way)
 
     def value(self, z: Array) -> float:
-        """The loss at z (1,); keeps its derivative, for which it is asked next."""
+        """Return the loss at z (1,) and cache its derivative for the next call of `derivative`."""
         value, slope = self.beside.slope(z[0] * self.vector, self.vector)
         self._last = float(z[0]), slope
         return value
 
     def derivative(self, z: Array) -> Array:
-        """(1,) the derivative at z (1,)."""
+        """Return the derivative (1,) at z (1,)."""
         if self._last[0] != z[0]:
             self.value(z)
         return np.array([self._last[1]])
 
 
 def undefined_columns(beside: Beside, totals: Totals) -> tuple[Undefined, ...]:
-    """The columns of a gradient in which the loss has no slope."""
+    """Return the columns of a gradient in which the loss has no slope."""
     lines = list(beside.lines(totals))
     norms = np.linalg.norm(totals.states, axis=1)
     least = max(NEGLIGIBLE * max(abs(line.change) for line in lines), FORGOTTEN * float(norms[-1]))
@@ -291,11 +291,11 @@ def undefined_columns(beside: Beside, totals: Totals) -> tuple[Undefined, ...]:
 
 @dataclass(frozen=True)
 class _Judge:
-    least: float  # [of the loss by one unit of a column] what is smaller is judged as if it were that large
-    noise: float  # of the loss, by the tolerance
+    least: float  # [change of the loss per unit of a column] smaller columns are judged as if they were this large
+    noise: float  # error of the loss divided by the tolerance
 
     def follow(self, beside: Beside, lines: Sequence[LossLine]) -> bool:
-        """Whether the loss follows several columns that are moved together."""
+        """Check if the loss agrees with the derivatives of several columns moved together."""
         vector = sum((line.unit * (-1 if line.slope < 0 else 1) * line.vector for line in lines), np.zeros(1))
         together = LossLine(beside, "", np.asarray(vector), 1.0, sum(abs(line.change) for line in lines))
         largest = max(self.least, *(abs(line.change) for line in lines))
@@ -308,7 +308,7 @@ class _Judge:
         return abs(off) <= RIGHT * largest + self.noise * COARSE / WIDE
 
     def column(self, line: LossLine) -> Undefined | None:
-        """What is said of one column; None where it has a slope."""
+        """Check one column; return None if it has a slope."""
         slopes_by_width: dict[float, float] = {}
         try:
             reason = self._reason(line, slopes_by_width)
@@ -323,7 +323,7 @@ class _Judge:
         return Undefined(line.column, line.slope, widths, slopes, reason, line)
 
     def _reason(self, line: LossLine, slopes: dict[float, float], scale: float = 1.0) -> str:
-        """Why the column has no slope over `scale` times the widths, or nothing. Puts them into `slopes`."""
+        """Return why the column has no slope over `scale` times the widths, or ""; store the measured `slopes`."""
         widest, tolerance = scale * WIDE, COARSE if scale == 1 else TOLERANCE
 
         def same(a: float, b: float, share: float, width: float, tolerance: float = TOLERANCE) -> bool:

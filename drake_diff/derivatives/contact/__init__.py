@@ -1,1 +1,1 @@
-"""The step's own contact equation, differentiated."""
+"""Derivatives of the step's own contact equation."""

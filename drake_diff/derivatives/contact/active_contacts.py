@@ -1,18 +1,18 @@
-"""The contacts of a state: which pairs overlap, distance, normal, and how both change as the bodies move.
+"""The contacts of a state: the overlapping pairs, their distances and normals, and the derivatives of both.
 
-Drake's point contact of a sphere (centre c, radius r) with a shape has the signed distance phi = d(c) - r, d being the
-shape's own, the normal n = grad d, from the shape to the sphere, and acts at c - (r + b phi) n with
-b = k_o / (k_s + k_o), the other shape's part of the two stiffnesses. Spheres, boxes, capsules and half spaces are one
-shape: what is within R of a box, d = |e| - R where e leads from the box to c, and inside the way to the nearest face.
-Pairs without a sphere are taken as SceneGraph finds them: see `nearest_points`.
+Drake's point contact of a sphere (centre c, radius r) with a shape has the signed distance phi = d(c) - r, where d is
+the shape's distance, and the normal n = grad d from the shape to the sphere. It acts at c - (r + b phi) n with
+b = k_o / (k_s + k_o), where k_o is the stiffness of the other shape. Spheres, boxes, capsules and half spaces are
+treated as one shape, a box with rounding R: d = |e| - R, where e is the offset of c from the box, and inside the box
+the distance to the nearest face. For pairs without a sphere, the results of SceneGraph are used, see `nearest_points`.
 
-S_j = [l_j; a_j] is the motion of degree of freedom j in world about its origin, L_j = l_j + a_j x p its velocity at the
-contact p, and s_j = 1, -1 or 0 where it moves the sphere's side alone, the other side alone, or both or none. Then
+S_j = [l_j; a_j] is the motion of degree of freedom j in world about its origin, and L_j = l_j + a_j x p its velocity at
+the contact p. s_j is 1 or -1 if j moves only the sphere or only the other shape, and else 0. Then
 
     J_c = (s_j L_j)_j,   dS_k / dq_j = S_j x S_k where j moves the axis of k, else 0,
 
-dq being the small motion that a velocity makes. Drake weighs friction by w = |W| / 3 with W = J_c diag(A)^-1 J_c',
-A the mass matrix with what joint damping adds in a step.
+where dq is in the tangent space. Drake scales friction by w = |W| / 3 with W = J_c diag(A)^-1 J_c', where A is the mass
+matrix plus the contribution of joint damping in a step.
 """
 
 from dataclasses import dataclass, field
@@ -32,19 +32,19 @@ from drake_diff.model.model import Model
 
 @dataclass(frozen=True, eq=False)
 class Touches:
-    """M pairs that overlap, each in one of N states; in world."""
+    """M overlaps of pairs, each in one of N states, in world."""
 
     state: Indices  # (M,)
     pair: Indices
-    middle: Array  # (M, 3) half way between the deepest points of the two [m]
+    middle: Array  # (M, 3) midpoint of the deepest points of the two shapes [m]
     phi: Array  # (M,) the signed distance, below 0 [m]
     normal: Array  # (M, 3) from the other shape to the sphere
-    change: Array  # (M, 7, 6) of [middle; normal; phi], as moved with the other shape, by the sphere's twist in it
+    change: Array  # (M, 7, 6) d[middle; normal; phi] by the sphere's twist, both relative to the other shape
 
     def contact_points(self, other_part: Array) -> tuple[Array, Array]:
-        """Where the contacts act (M, 3), and (M, 7, 6) as `change`, of that point and by the twist there.
+        """Return the contact points (M, 3), and `change` (M, 7, 6) for these points and the twists at them.
 
-        `other_part` (M,) is the other shape's of the two stiffnesses.
+        `other_part` (M,) is b, the fraction k_o / (k_s + k_o) of the stiffness of the other shape.
         """
         n, share = self.normal, (other_part - 0.5)[:, None]
         back = share * self.phi[:, None] * n  # from the point to the middle
@@ -57,11 +57,11 @@ class Touches:
 
 @dataclass(frozen=True, eq=False)
 class ContactPairs:
-    """P pairs of a sphere and another shape; those without a sphere, or with a shape not known here, are left out."""
+    """P pairs of a sphere and another shape; pairs without a sphere or with an unsupported shape are not included."""
 
-    bodies: tuple[Any, ...]  # Drake's, of all shapes
+    bodies: tuple[Any, ...]  # Drake's bodies with these shapes
     ids: tuple[tuple[Any, Any], ...]  # of the sphere and of the other shape
-    sphere_body: Indices  # (P,) in bodies
+    sphere_body: Indices  # (P,) index in bodies
     other_body: Indices
     center: Array  # (P, 3) of the sphere, in its body [m]
     radius: Array  # (P,)
@@ -70,10 +70,10 @@ class ContactPairs:
     lower: Array  # (P, 3) the corners of the other shape's box
     upper: Array
     rounding: Array  # (P,) R
-    is_round: NDArray[np.bool_]  # (P,) whether the other shape is the cylinder along z within its box
+    is_round: NDArray[np.bool_]  # (P,) whether the other shape is a cylinder along z inscribed in its box
 
     def overlapping(self, of_pairs: Any, poses: Array) -> Any:
-        """The kernel.Touching of those that overlap where the bodies are at `poses` (N, bodies, 3, 4)."""
+        """Return the kernel.Touching of the overlaps for bodies at `poses` (N, bodies, 3, 4)."""
         N = len(poses)
         shapes = self.center, self.radius, self.rotation, self.position, self.lower, self.upper, self.rounding
         spheres, first = kernel.Spheres(*map(own_array, shapes)), np.empty(N + 1, dtype=np.int64)
@@ -86,9 +86,9 @@ class ContactPairs:
         return contacts
 
     def touching(self, poses: Array) -> Touches:
-        """The pairs that overlap where the bodies are at `poses` (N, bodies, 3, 4)."""
+        """Return the overlaps for bodies at `poses` (N, bodies, 3, 4)."""
         count, sides = len(self.ids), np.stack([self.sphere_body, self.other_body], axis=1)
-        none, halves = np.zeros(count), np.full(count, 0.5)  # half of the overlap on each side: the middle
+        none, halves = np.zeros(count), np.full(count, 0.5)  # b = 1/2, so that the contact point is the midpoint
         of_pairs = kernel.Pairs(
             sides, np.zeros((len(self.bodies), 0)), none, none, none, none, halves, np.zeros((5, count, 0))
         )
@@ -98,7 +98,7 @@ class ContactPairs:
 
 
 def read_pairs(model: Model, *, cylinders: bool = False) -> ContactPairs:
-    """The pairs of spheres of `model`, none where there are none; with cylinders, which `touching` does not know."""
+    """Read the pairs with a sphere of `model`, optionally with `cylinders`, which `touching` does not support."""
     plant, inspector = model.plant, model.double.inspector
     ids, body_numbers, radius, boxes, rounds = [], [], [], [], []
     bodies: dict[Any, tuple[int, Any]] = {}
@@ -139,7 +139,7 @@ def _box_around(shape: Cylinder) -> tuple[Array, Array, float]:
 
 
 def _rounded_box(shape: Shape) -> tuple[Array, Array, float] | None:
-    """The box's lower and upper corner and the rounding of a shape, None where it is none."""
+    """Return the lower and upper corner of a shape's box and its rounding, or None for another type of shape."""
     if isinstance(shape, Sphere):
         return np.zeros(3), np.zeros(3), shape.radius()
     if isinstance(shape, Capsule):
@@ -155,14 +155,14 @@ def _rounded_box(shape: Shape) -> tuple[Array, Array, float] | None:
 
 @dataclass(frozen=True, eq=False)
 class Topology:
-    """Which degrees of freedom of a tree move which; 1 where they do, else 0."""
+    """Incidence (0 or 1) of the degrees of freedom of a tree with axes and bodies."""
 
-    moves: Array  # (nv, nv) j the axis of k
-    bodies: dict[str, Array]  # (nv,) of each body, which move it
+    moves: Array  # (nv, nv) entry j, k: whether j moves the axis of k
+    bodies: dict[str, Array]  # body name -> (nv,) whether each degree of freedom moves the body
 
 
 def topology_of(description: Description) -> Topology:
-    """The topology of a tree of hinges, slides and free bodies; these turn about axes that only translations move."""
+    """Return the topology of a tree; only its translations move the rotation axes of a free body."""
     nv = description.coordinates.nv
     moves = np.zeros((nv, nv))
     bodies = {"world": np.zeros(nv)}
@@ -178,37 +178,37 @@ def topology_of(description: Description) -> Topology:
 
 
 def weigh(J: Array, diagonal: Array) -> Array:
-    """w (M,) of Jacobians' transposes J (M, nv, 3) and the diagonal (M, nv) of A."""
+    """Return w (M,) for transposed Jacobians J (M, nv, 3) and the diagonal (M, nv) of A."""
     W = J.swapaxes(-1, -2) @ (J / diagonal[..., None])
     return np.asarray(np.sqrt((W * W).sum(axis=(1, 2))) / 3)
 
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """M contacts, and the motions of the degrees of freedom there."""
+    """M contacts, and the motions of the degrees of freedom at the contact points."""
 
     touch: Touches
     moves: Array  # (nv, nv)
-    sphere: Array  # (M, nv) 1 where it moves the sphere
-    other: Array  # (M, nv) 1 where it moves the other shape
+    sphere: Array  # (M, nv) 1 where a degree of freedom moves the sphere
+    other: Array  # (M, nv) 1 where a degree of freedom moves the other shape
     angular: Array  # (M, nv, 3) a
     point: Array  # (M, 3) p
     at_point: Array  # (M, nv, 3) L
-    change: Array  # (M, 7, 6) of p, the normal and phi by the twist there: see `pairs.Touches`
-    unknown: dict[int, str] = field(default_factory=dict)  # the states of which that is not known
+    change: Array  # (M, 7, 6) d[p; normal; phi] / d(twist at p): see `Touches`
+    unknown: dict[int, str] = field(default_factory=dict)  # the states for which `change` is not known
 
     @property
     def side(self) -> Array:
-        """(M, nv) s."""
+        """The signs s (M, nv)."""
         return self.sphere - self.other
 
     @property
     def jacobian(self) -> Array:
-        """(M, nv, 3) the transpose of J."""
+        """The transpose of J (M, nv, 3)."""
         return np.asarray(self.side[..., None] * self.at_point)
 
     def displacement(self) -> tuple[Array, Array, Array]:
-        """How p (M, nv, 3), the normal (M, nv, 3) and phi (M, nv) move with each degree of freedom."""
+        """Differentiate p (M, nv, 3), the normal (M, nv, 3) and phi (M, nv) with respect to each degree of freedom."""
         twist = np.concatenate([self.at_point, self.angular], axis=-1)
         moved = (self.side[..., None] * twist) @ self.change.swapaxes(-1, -2)
         other = self.other[..., None]
@@ -216,51 +216,51 @@ class Contacts:
         return moved[..., :3] + other * self.at_point, normal, moved[..., 6]
 
     def velocity_change(self, v: Array, point: Array) -> Array:
-        """(M, nv, 3) the change of J v with the degrees of freedom for fixed v (M, nv); p changes by (M, nv, 3)."""
+        """Differentiate J v for constant v (M, nv) as (M, nv, 3); `point` (M, nv, 3) is the derivative of p."""
         u = v * self.side
         turned = cross(u[:, None, :] @ self.angular, point)
         after = (self.moves * u[:, None, :]) @ np.concatenate([self.at_point, self.angular], axis=-1)
         return np.asarray(turned + cross(self.angular, after[..., :3]) + cross(self.at_point, after[..., 3:]))
 
     def force_change(self, force: Array, point: Array) -> Array:
-        """(M, nv, nv) the change of J' f for fixed f (M, 3), likewise."""
+        """Differentiate J' f for constant f (M, 3) as (M, nv, nv), likewise."""
         twisted = cross(force[:, None, :], self.angular)  # f x a
         across = twisted @ self.at_point.swapaxes(-1, -2)  # (f x a_k) . L_j = -a_k . (f x L_j)
         moved = twisted @ point.swapaxes(-1, -2) + self.moves.T * (across.swapaxes(-1, -2) - across)
         return np.asarray(self.side[..., None] * moved)
 
 
-SPHERES, JOINT_LIMITS = "spheres", "joint limits"  # what acts in a step, beside pairs of other shapes
+SPHERES, JOINT_LIMITS = "spheres", "joint limits"  # kinds of impulses, in addition to pairs of other shapes
 
 
 def is_iterated(kind: str) -> bool:
-    """Whether SceneGraph comes to the point of contact of such shapes by an iteration; see `AllPairs.kinds`."""
+    """Check if SceneGraph computes the contact point of such shapes iteratively. See `AllPairs.kinds`."""
     return kind not in (SPHERES, JOINT_LIMITS) and not {"Sphere", "HalfSpace"} & set(kind.split(" and "))
 
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """N states: where the bodies are, and what SceneGraph found there."""
+    """N states with the poses of the bodies and the overlaps found by SceneGraph."""
 
     poses: Array  # (N, bodies, 3, 4)
-    state: Indices  # (M,) of what was found
+    state: Indices  # (M,) the state of each overlap
     pair: Indices  # (M,)
-    found: Array  # (M, 7) the middle, the normal and phi
-    to_one_side: set[int] = field(default_factory=set)  # the states in which how that changes is known to one side only
+    found: Array  # (M, 7) the midpoint, the normal and phi
+    to_one_side: set[int] = field(default_factory=set)  # the states with one-sided derivatives only
 
 
 @dataclass(frozen=True, eq=False)
 class AllPairs:
-    """P pairs, those of spheres first."""
+    """P pairs, beginning with the pairs of spheres."""
 
-    bodies: tuple[Any, ...]  # Drake's, of all shapes
+    bodies: tuple[Any, ...]  # Drake's bodies with these shapes
     ids: tuple[tuple[Any, Any], ...]
-    sides: Indices  # (P, 2) in bodies
+    sides: Indices  # (P, 2) indices in bodies
     spheres: ContactPairs
     others: NearestPointPairs
 
     def locate(self, steps: Steps, poses: Array) -> Placed:
-        """At the steps' states, where the bodies are at `poses` (N, bodies, 3, 4)."""
+        """Find the overlaps at the steps' states, with the bodies at `poses` (N, bodies, 3, 4)."""
         overlaps: list[tuple[int, int, Array]] = []
         for k in np.flatnonzero(steps.touching & bool(self.others.ids)).tolist():
             steps.stand_at(k)
@@ -269,9 +269,9 @@ class AllPairs:
         return Placed(poses, state, pair, np.array([overlap for *_, overlap in overlaps]).reshape(-1, 7))
 
     def kinds(self, placed: Placed, count: int) -> list[set[str]]:
-        """Of each of `count` states with contact what kinds of shapes touch: spheres, or two others by their names.
+        """Return the kinds of contact in each of `count` states with contact: spheres, or the names of both shapes.
 
-        Those whose change is known to one side only are kinds of their own.
+        Contacts with one-sided derivatives only are kinds of their own.
         """
         shapes_that_touch: list[set[str]] = [set() for _ in range(count)]
         for state, pair in zip(placed.state, placed.pair, strict=True):
@@ -281,15 +281,15 @@ class AllPairs:
         return [kinds or {SPHERES} for kinds in shapes_that_touch]
 
     def of_scene_graph(self, placed: Placed) -> Touches:
-        """What SceneGraph found."""
+        """Return the overlaps found by SceneGraph, without derivatives."""
         overlaps = placed.found
         nothing = np.full((len(overlaps), 7, 6), np.nan)
         return Touches(placed.state, placed.pair, overlaps[:, :3], overlaps[:, 6], overlaps[:, 3:6], nothing)
 
     def complete(self, touch: Touches, placed: Placed, twists: Array) -> dict[int, str]:
-        """Say of what SceneGraph found how it changes; the states of which it is not known, and why.
+        """Fill in the derivatives of SceneGraph's overlaps; return the states with unknown derivatives and the reasons.
 
-        `twists` (M, nv, 6) are those of the first shape in the second by the degrees of freedom, at the middle.
+        `twists` (M, nv, 6) are the first shape's twists relative to the second for each degree of freedom, at `middle`.
         """
         count, unknown = len(self.spheres.ids), {}
         for pair in np.unique(touch.pair[touch.pair >= count]):
@@ -306,7 +306,7 @@ class AllPairs:
 
 
 def read_all_pairs(model: Model) -> AllPairs:
-    """Those of `model`, none where nothing of it may touch."""
+    """Read all pairs of `model` that may collide; empty if there are none."""
     spheres = read_pairs(model)
     others = read_nearest_point_pairs(model, set(spheres.ids))
     bodies = {body.index(): body for body in (*spheres.bodies, *(b for both in others.bodies for b in both))}

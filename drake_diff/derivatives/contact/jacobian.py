@@ -1,14 +1,14 @@
 """The Jacobian of a step with contact or at joint limits from its own equation, without differentiating Drake's solver.
 
 Drake's step solves A (v' - v*) = sum_c J_c' g_c(J_c v'), with A = M + h D, v* the velocity without impulses and g_c the
-impulse of contact c (see `laws`), of a joint's limit or of a coupler (see `joint_impulses`). PD controllers
-within their effort limits are part of D. At Drake's own v' it is a smooth step under a known force A (v' - v*) / h,
-whose inverse dynamics are differentiated; what the impulses change is solved for:
+impulse of contact c (see `laws`), of a joint limit or of a coupler (see `joint_impulses`). PD controllers within their
+effort limits are part of D. At Drake's own v', the step is a smooth step under a known force A (v' - v*) / h. Its
+inverse dynamics are differentiated, and the effect of the impulses is computed from
 
     (A + sum_c J_c' G_c J_c) dv' = A dv'|_g + sum_c d(J_c' g_c)|_v',   G_c = -dg_c / d(J_c v').
 
-That v' solves the equation is checked, in the norm and to the tolerance of Drake's solver. What is left out here, as a
-shape that is not known, shows there. `kernel` does the arithmetic.
+The residual of the equation at v' is checked in the norm of Drake's solver and to its tolerance. Missing forces, such
+as those of an unsupported shape, are detected by this check. `kernel` implements the arithmetic.
 """
 
 from dataclasses import dataclass
@@ -31,31 +31,31 @@ from drake_diff.mechanics.tree import CompiledTree, compiled_tree
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, labelled
 
-# Of the momentum: Drake's solver ends at 1e-6 of it, in the same norm.
+# Relative to the momentum: Drake's solver stops at 1e-6, in the same norm.
 OPTIMALITY = 2e-6
 ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class ContactForm:
-    """What of a model with contact or joint limits does not change from step to step, as the kernel takes it."""
+    """The data of a model with contact or joint limits that does not change from step to step, for the kernel."""
 
     pairs: AllPairs
-    unknown: str  # why no contact of the model is known here; empty where some is
+    unknown: str  # why no contact of the model is supported; "" if some contact is
     tree: CompiledTree
-    plant: tuple[Any, ...]  # of kernel.Plant
-    sides: NDArray[np.int64]  # (P, 2) of the pairs in the bodies
+    plant: tuple[Any, ...]  # the fields of kernel.Plant
+    sides: NDArray[np.int64]  # (P, 2) body indices of the pairs
     by_body: Array  # (bodies, nv) 1 where a degree of freedom moves the body
-    carriers: NDArray[np.intp]  # (bodies,) the link of each body of the pairs, -1 of the world
+    carriers: NDArray[np.intp]  # (bodies,) the link of each body of the pairs, -1 for the world
 
     def poses(self, links: Array) -> Array:
-        """(N, bodies, 3, 4) of the bodies of the pairs, from those of the links."""
+        """Return the poses (N, bodies, 3, 4) of the bodies of the pairs, from the poses of the links."""
         poses = own_array(links[:, self.carriers])
         poses[:, self.carriers < 0] = np.eye(3, 4)
         return poses
 
     def contacts(self, of_pairs: Any, placed: Placed, S: Array, material: Material) -> tuple[Any, dict[int, str]]:
-        """The kernel.Touching of all pairs; in which states it is not known how those of SceneGraph change."""
+        """Return the kernel.Touching of all pairs, and the states with unknown derivatives of SceneGraph's contacts."""
         spheres = self.pairs.spheres.overlapping(of_pairs, placed.poses)
         if not len(placed.found):
             return spheres, {}
@@ -73,7 +73,7 @@ class ContactForm:
 
 
 def contact_form(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
-    """Read once; else why the form describes no step of the model in which impulses act."""
+    """Return the form of a model, cached, or a Refusal if it describes no step in which impulses act."""
     return model.cache("contact form", lambda: _read(model, smooth), of_structure=True)
 
 
@@ -123,14 +123,14 @@ def _read(model: Model, smooth: SmoothStep) -> ContactForm | Refusal:
 
 
 def _of_controllers(smooth: SmoothStep) -> Array:
-    """(nv,) h (kd + h kp): a controller within its effort limit is a spring and a damper that act on v'."""
+    """Return h (kd + h kp) (nv,): a controller within its effort limit acts on v' as a spring and a damper."""
     (kp, kd), h, added = smooth.form.gains(), smooth.time_step, np.zeros(smooth.coordinates.nv)
     np.add.at(added, smooth.form.velocity, h * (kd + h * kp))
     return added
 
 
 def material_of(model: Model, form: ContactForm) -> Material:
-    """The model's own, read once, or with the parameters that are applied."""
+    """Return the model's own material, cached, or the material with the applied parameters."""
     if model.has_other_parameters:
         return read_material(model.double, form.pairs)
     return model.cache("contact material", lambda: read_material(model.double, form.pairs))
@@ -139,9 +139,9 @@ def material_of(model: Model, form: ContactForm) -> Material:
 def contact_jacobians(
     form: ContactForm, smooth: SmoothStep, steps: Steps, material: Material, change: Material | None
 ) -> tuple[Array, Flags, dict[int, str], Placed]:
-    """(N, nx, nx + nu + np) of steps, which (N,) are as Drake took them, why some are not, and where the bodies are.
+    """Return the Jacobians (N, nx, nx + nu + np), which steps (N,) agree with Drake, reasons, and the bodies' places.
 
-    Where nothing is said of one that is not, its equation is not Drake's.
+    If a step that does not agree has no reason, its equation differs from Drake's.
     """
     nq, N = smooth.coordinates.nq, len(steps)
     parts = steps.xs[:, :nq], steps.xs[:, nq:], steps.x_next[:, nq:]
@@ -175,7 +175,7 @@ def contact_jacobians(
         jacobians,
         sizes,
     )
-    # What the impulses do not account for is what Drake's solver leaves, in its norm.
+    # The residual must be within the tolerance of Drake's solver, in its norm.
     missing, had, given = sizes.T
     known = missing <= OPTIMALITY * np.maximum(had, given) + ROUNDING
     known &= np.isfinite(jacobians).all(axis=(1, 2))

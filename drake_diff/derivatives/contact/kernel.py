@@ -1,6 +1,6 @@
-"""What contacts, joint limits and couplers change of a step's Jacobian, state by state: compiled.
+"""Compiled kernels for the effects of contacts, joint limits and couplers on a step's Jacobian, state by state.
 
-`jacobian` has the equation, `laws` and `joint_impulses` the impulses.
+`jacobian` documents the equation, and `laws` and `joint_impulses` document the impulses.
 """
 
 from typing import NamedTuple
@@ -18,7 +18,7 @@ Flags = NDArray[np.bool_]
 
 
 class Touching(NamedTuple):
-    """M contacts, those of state k from first[k] to first[k + 1]; see `kinematics.Contacts`."""
+    """M contacts; the contacts of state k are those from first[k] to first[k + 1]. See `active_contacts.Touches`."""
 
     first: Whole  # (N + 1,)
     pair: Whole  # (M,)
@@ -29,20 +29,20 @@ class Touching(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """P pairs; see `touching.AllPairs` and `material.Material`."""
+    """P pairs. See `active_contacts.AllPairs` and `laws.Material`."""
 
-    sides: Whole  # (P, 2) in the bodies
+    sides: Whole  # (P, 2) body indices
     by_body: Array  # (bodies, nv) 1 where a degree of freedom moves the body
     friction: Array  # (P,)
     stiffness: Array  # (P,)
     time: Array  # (P,)
     dissipation: Array  # (P,)
     other_part: Array  # (P,)
-    changes: Array  # (5, P, np) of these five by parameters
+    changes: Array  # (5, P, np) derivatives of these five with respect to parameters
 
 
 class Spheres(NamedTuple):
-    """The first K of the pairs, a sphere and another shape each; see `pairs.ContactPairs`."""
+    """The first K pairs, each of a sphere and another shape. See `active_contacts.ContactPairs`."""
 
     center: Array  # (K, 3)
     radius: Array  # (K,)
@@ -54,31 +54,31 @@ class Spheres(NamedTuple):
 
 
 class Plant(NamedTuple):
-    """What of a model does not change from step to step."""
+    """The data of a model that does not change from step to step."""
 
     time_step: float
     law: int
     near_rigid: float
     constants: tuple[float, float, float]  # SIGMA, SOFT_NORM and STICTION_TOLERANCE
     joint_constants: tuple[float, float, float]  # NEAR_RIGID, LIMIT_STIFFNESS and LIMIT_WINDOW
-    moves: Array  # (nv, nv) j the axis of k
+    moves: Array  # (nv, nv) entry j, k: whether j moves the axis of k
     armature: Array  # (nv,)
-    controlled: Array  # (nv,) what of it is of controllers
+    controlled: Array  # (nv,) the contribution of controllers to the armature
     stiffness: Array  # (nv,) of springs
     damping: Array  # (nv,)
     actuation: Array  # (nv, nu)
     limits: Array  # (2, nv)
     couplers: Array  # (K, nv)
     offsets: Array  # (K,)
-    free: Whole  # (bodies, 2) where free bodies begin in q and in v
-    single: Whole  # (joints, 2) the places of the others in q and in v
+    free: Whole  # (bodies, 2) first indices of free bodies in q and v
+    single: Whole  # (joints, 2) indices of the other joints in q and v
 
 
 @compiled
 def _center_in(
     X: Array, center: Array, Y: Array, rotation: Array, position: Array, in_world: Array, local: Array
 ) -> None:
-    """A sphere's centre in world (own) and in the other shape's frame (local), its bodies being at X and Y (3, 4)."""
+    """Compute a sphere's centre in world and in the other shape's frame (`local`), for bodies at X and Y (3, 4)."""
     d, in_body = np.empty(3), np.empty(3)
     for a in range(3):
         in_world[a] = X[a, 0] * center[0] + X[a, 1] * center[1] + X[a, 2] * center[2] + X[a, 3]
@@ -91,12 +91,12 @@ def _center_in(
 
 @compiled
 def overlapping(s: Spheres, sides: Whole, poses: Array, first: Whole, pair: Whole) -> int:
-    """Which pairs overlap where the bodies are at `poses` (N, bodies, 3, 4): how many, in `pair`, from first[k] on."""
+    """Write the pairs that overlap at `poses` (N, bodies, 3, 4) to `pair`, state k from first[k]; return the count."""
     count, R, p, d = 0, s.rotation, s.position, s.center
     for k in range(len(poses)):
         first[k] = count
         for i in range(len(s.radius)):
-            X, Y = sides[i, 0], sides[i, 1]  # as in _center_in, but without views, of which each has its cost
+            X, Y = sides[i, 0], sides[i, 1]  # as in _center_in, but without views, which are slow
             x = poses[k, X, 0, 0] * d[i, 0] + poses[k, X, 0, 1] * d[i, 1] + poses[k, X, 0, 2] * d[i, 2]
             y = poses[k, X, 1, 0] * d[i, 0] + poses[k, X, 1, 1] * d[i, 1] + poses[k, X, 1, 2] * d[i, 2]
             z = poses[k, X, 2, 0] * d[i, 0] + poses[k, X, 2, 1] * d[i, 1] + poses[k, X, 2, 2] * d[i, 2]
@@ -120,7 +120,7 @@ def overlapping(s: Spheres, sides: Whole, poses: Array, first: Whole, pair: Whol
 
 @compiled
 def _nearest(local: Array, lower: Array, upper: Array, normal: Array, across: Array) -> float:
-    """How far a point is from a box, below 0 inside; the normal there and the derivative of it by the point (3, 3)."""
+    """Return a point's signed distance from a box; compute the normal and its derivative `across` (3, 3)."""
     squared = 0.0
     for a in range(3):
         normal[a] = local[a] - min(max(local[a], lower[a]), upper[a])
@@ -136,7 +136,7 @@ def _nearest(local: Array, lower: Array, upper: Array, normal: Array, across: Ar
             for b in range(3):
                 across[a, b] -= normal[a] * normal[b] / length
         return length
-    way, axis, sign = np.inf, 0, 1.0  # of equal ways the upper faces' come first
+    way, axis, sign = np.inf, 0, 1.0  # for equal distances the upper faces have priority
     for a in range(3):
         if upper[a] - local[a] < way:
             way, axis, sign = upper[a] - local[a], a, 1.0
@@ -149,7 +149,7 @@ def _nearest(local: Array, lower: Array, upper: Array, normal: Array, across: Ar
 
 @compiled
 def touch(s: Spheres, p: Pairs, poses: Array, c: Touching) -> None:
-    """Fill in where the contacts of spheres act, and how that changes."""
+    """Compute the contact points of spheres and their derivatives."""
     center, local, flat, across, R = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     half, skew, back = np.empty((3, 3)), np.zeros((3, 3)), np.empty(3)
     for k in range(len(poses)):
@@ -172,7 +172,7 @@ def touch(s: Spheres, p: Pairs, poses: Array, c: Touching) -> None:
                 back[a] = share * phi * n[a]
                 c.point[m, a] = center[a] - reach * n[a] - back[a]
             c.phi[m] = phi
-            # By the twist at the middle, where the centre moves by [1, -reach n^]; then at the point.
+            # Derivative for the twist at the midpoint, where the centre moves by [1, -reach n^], then at the point.
             skew[0, 1], skew[0, 2], skew[1, 2] = -n[2], n[1], -n[0]
             skew[1, 0], skew[2, 0], skew[2, 1] = n[2], -n[1], n[0]
             for a in range(3):
@@ -218,7 +218,7 @@ def _add_contact(
     across: Array,
     y: Array,
 ) -> None:
-    """Add what contact m changes to right (nv, 2 nv + nu + np), left (nv, nv) and push (nv,); from L on is scratch."""
+    """Add contact m to right (nv, 2 nv + nu + np), left (nv, nv) and push (nv,); L and all after it are scratch."""
     nv, n, here, change = len(v), c.normal[m], c.point[m], c.change[m]
     i_pair, moves, law, h = c.pair[m], p.moves, p.law, p.time_step
     sphere, other = pairs.by_body[pairs.sides[i_pair, 0]], pairs.by_body[pairs.sides[i_pair, 1]]
@@ -227,7 +227,7 @@ def _add_contact(
     solved, u, du, dn, g = np.zeros(23), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     W, G, turned_sum, zero = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3), np.zeros(3)
     u_0 = 0.0
-    for j in range(nv):  # the velocities L of all degrees of freedom at p, and J's W
+    for j in range(nv):  # the velocities L of all degrees of freedom at p, and W of J
         a0, a1, a2 = S[j, 0], S[j, 1], S[j, 2]
         L[j, 0] = S[j, 3] + a1 * here[2] - a2 * here[1]
         L[j, 1] = S[j, 4] + a2 * here[0] - a0 * here[2]
@@ -248,7 +248,7 @@ def _add_contact(
     phi = c.phi[m]
     solve_law(law, h, p.near_rigid, p.constants, n, phi, mu, k_c, tau, d, w, u, u_0, solved)
     f0, f1, f2 = solved[0], solved[1], solved[2]
-    for j in range(nv):  # how p, the normal and phi move, f x a, and what the weight's change is made of
+    for j in range(nv):  # derivatives of p, normal and phi, f x a, and terms for the derivative of the weight
         s = sphere[j] - other[j]
         a0, a1, a2 = S[j, 0], S[j, 1], S[j, 2]
         across[j, 0], across[j, 1], across[j, 2] = f1 * a2 - f2 * a1, f2 * a0 - f0 * a2, f0 * a1 - f1 * a0
@@ -272,8 +272,8 @@ def _add_contact(
         y[j, 6] = (L[j, 0] * y[j, 0] + L[j, 1] * y[j, 1] + L[j, 2] * y[j, 2]) / diagonal[j]
         for a in range(3):
             turned_sum[a] += y[j, 3 + a]
-    ua0, ua1, ua2 = 0.0, 0.0, 0.0  # the angular velocity of the sphere's side less the other's, after the step
-    va0, va1, va2 = 0.0, 0.0, 0.0  # and before it
+    ua0, ua1, ua2 = 0.0, 0.0, 0.0  # the angular velocity of the sphere minus the other shape's, after the step
+    va0, va1, va2 = 0.0, 0.0, 0.0  # and before the step
     for j in range(nv):
         s = sphere[j] - other[j]
         if s != 0:
@@ -283,7 +283,7 @@ def _add_contact(
             va0 += s * v[j] * S[j, 0]
             va1 += s * v[j] * S[j, 1]
             va2 += s * v[j] * S[j, 2]
-    for a in range(3):  # the impulse's slope by the velocity
+    for a in range(3):  # derivative of the impulse with respect to the velocity
         du[a] = 1.0
         change_law(law, h, sigma, n, phi, mu, k_c, d, w, u, solved, du, zero, SAME_STATE, SAME_MATERIAL, g)
         for b in range(3):
@@ -295,7 +295,7 @@ def _add_contact(
     for j in range(nv):
         a0, a1, a2, l0, l1, l2 = S[j, 0], S[j, 1], S[j, 2], L[j, 0], L[j, 1], L[j, 2]
         p0, p1, p2 = point[j, 0], point[j, 1], point[j, 2]
-        # Sums over the k whose axes j moves: of u_k [L_k; a_k] after and before the step, and of the weight's change.
+        # Sums over all k whose axes j moves: of u_k [L_k; a_k] after and before the step, and for the weight.
         b0, b1, b2, b3, b4, b5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         e0, e1, e2, e3, e4, e5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         w0, w1, w2, w3, w4, w5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -346,7 +346,7 @@ def _add_contact(
                 total -= across[i, 0] * l0 + across[i, 1] * l1 + across[i, 2] * l2
             right[i, j] += s * total
     begin = right.shape[1] - pairs.changes.shape[2]
-    for r in range(pairs.changes.shape[2]):  # by parameters of the material: through the law, and as the point moves
+    for r in range(pairs.changes.shape[2]):  # material parameters act through the law and through the contact point
         by = pairs.changes[:, i_pair, r]
         back = -phi * by[4]  # along the normal
         m0, m1, m2 = back * n[0], back * n[1], back * n[2]
@@ -392,9 +392,9 @@ def _add_joint(
     left: Array,
     push: Array,
 ) -> None:
-    """Add what an impulse along j (nv,) changes: (target - j . v') / R, of a limit at least 0.
+    """Add an impulse (target - j . v') / R along j (nv,), which for a limit (`one_sided`) is at least 0.
 
-    `near_rigid` is R / w where R goes with the effective inverse mass w, else 0.
+    `near_rigid` is R / w if R is proportional to the effective inverse mass w, else 0.
     """
     nv, along = len(j), 0.0
     for i in range(nv):
@@ -436,10 +436,10 @@ def step_jacobians(
     out: Array,
     sizes: Array,
 ) -> None:
-    """(N, nx, nx + nu + np) of N steps from q and v to v'; `at_joints` (N, nv) are the positions of hinges and slides.
+    """Compute the Jacobians (N, nx, nx + nu + np) of N steps from q and v to v'.
 
-    `force` (N, nv) are those beside inverse dynamics, which was differentiated at (v' - v) / h. In `sizes` (N, 3) are
-    the momentum that the impulses do not account for, that which v' has, and the impulses', each in Drake's norm.
+    `at_joints` (N, nv) are positions of hinges and slides, and `force` (N, nv) forces in addition to inverse dynamics,
+    which was differentiated at (v' - v) / h. `sizes` (N, 3): Drake's norms of momentum residual, momentum and impulses.
     """
     N, nv = v.shape
     nu, h = p.actuation.shape[1], p.time_step

@@ -1,27 +1,27 @@
-"""The impulses of Drake's contact approximations at the solver's own solution, and how they change.
+"""The impulses of Drake's contact approximations at the solver's own solution, and their derivatives.
 
-With vn and vt the normal and tangential velocity after the step, phi the signed distance and vn_0 the normal velocity
-before it, w the size of the effective inverse mass and h the time step:
+Let vn and vt be the normal and tangential velocity after the step, phi the signed distance and vn_0 the normal velocity
+before the step, w the size of the effective inverse mass and h the time step.
 
 `sap` (Castro, Permenter and Han, "An unconstrained convex formulation of compliant contact", 2021), with the relaxation
-time tau,
+time tau, has
 
     R_n = max(beta^2 / (4 pi^2) w, 1 / (h k (h + tau))),   R_t = sigma w
     y_n = (-phi / (h + tau) - vn) / R_n,   y_t = -vt / R_t,   y_r = sqrt(|y_t|^2 + s^2)
 
-the impulse is y inside the friction cone (y_r <= mu y_n: it sticks), 0 inside its polar, and else, sliding,
+The impulse is y inside the friction cone (stiction, y_r <= mu y_n), 0 inside the polar cone, and else (sliding)
 
     g_n = (y_n + mu R_t / R_n y_r) / (1 + mu^2 R_t / R_n),   g_t = mu g_n y_t / y_r.
 
 `similar` and `lagged` (Castro, Han and Masterjohn, "A theory of irrotational contact fields", 2023), with Hunt and
-Crossley's dissipation d and the stiction tolerance v_s,
+Crossley's dissipation d and the stiction tolerance v_s, have
 
     n(z) = h (-k phi - h k z)+ (1 - d z)+,   n_0 = h (-k phi)+ (1 - d vn_0)+,   e = max(v_s, mu sigma w n_0)
     g_n = n(z),   g_t = -mu n_f vt / s,   s = sqrt(|vt|^2 + e^2)
 
-with z = vn - mu (s - e), n_f = n(z) of `similar`, and z = vn, n_f = n_0 of `lagged`.
+with z = vn - mu (s - e), n_f = n(z) for `similar`, and z = vn, n_f = n_0 for `lagged`.
 
-Of the two sides of a contact, the sphere's s and the other o, Drake makes
+Drake combines the materials of the sphere s and the other shape o to
 
     mu = 2 mu_s mu_o / (mu_s + mu_o),   k = k_s k_o / (k_s + k_o),   b = k_o / (k_s + k_o)
     tau = tau_s + tau_o,   d = b d_s + (1 - b) d_o
@@ -61,9 +61,9 @@ def solve_law(
     u_0: float,
     solved: Array,
 ) -> None:
-    """Solve the law of a contact with the velocity u (3,) after the step and u_0 along the normal before it.
+    """Solve the law of a contact with the velocity u (3,) after the step and u_0 along the normal before the step.
 
-    `solved` keeps what its derivatives are made of, from solved[0:3] the impulse on.
+    `solved` stores the impulse in solved[0:3], followed by the values from which the derivatives are computed.
     """
     sigma, soft_norm, stiction_tolerance = constants
     vn = u[0] * n[0] + u[1] * n[1] + u[2] * n[2]
@@ -131,7 +131,7 @@ def change_law(
     material: tuple[float, float, float, float],
     out: Array,
 ) -> None:
-    """out (3,) the change of the impulse by those of u, of the normal, of phi, w and u_0, and of mu, k, tau and d."""
+    """Compute the impulse's change `out` (3,) from changes of u, n, `state` (phi, w, u_0) and (mu, k, tau, d)."""
     d_phi, d_w, d_before = state
     d_mu, d_k, d_tau, d_d = material
     d_vn = du[0] * n[0] + du[1] * n[1] + du[2] * n[2] + u[0] * dn[0] + u[1] * dn[1] + u[2] * dn[2]
@@ -196,7 +196,7 @@ def impulses(
     impulse: Array,
     slope: Array,
 ) -> None:
-    """`impulse` (M, 3) of M contacts at velocities (M, 3) after the step, and `slope` (M, 3, 3), its derivative."""
+    """Compute `impulse` (M, 3) at velocities (M, 3) after the step for M contacts, and its derivative `slope`."""
     solved, du, zero, g = np.zeros(23), np.zeros(3), np.zeros(3), np.zeros(3)
     for m in range(len(phi)):
         n, mu, k, d, w, u = normal[m], friction[m], stiffness[m], dissipation[m], weight[m], velocity[m]
@@ -211,30 +211,30 @@ def impulses(
 
 
 LAWS = {"sap": SAP, "similar": SIMILAR, "lagged": LAGGED}
-SIGMA = 1e-3  # Drake's, of both papers: regularizes friction so that a contact sticks up to a creep
-# Drake's default [m/s], which it does not give back: another one shows in what it leaves unsolved.
+SIGMA = 1e-3  # Drake's value, as in both papers: regularizes friction, so that stiction has a small creep
+# Drake's default [m/s]. Drake has no getter for it; a different value is detected by a large residual.
 STICTION_TOLERANCE = 1e-4
-SOFT_NORM = 1e-7  # s [N s], Drake's: keeps the norm of an impulse of 0 differentiable
+SOFT_NORM = 1e-7  # s [N s], Drake's value: makes the norm of a zero impulse differentiable
 
 
 @dataclass(frozen=True, eq=False)
 class ContactLaw:
-    """M contacts of one approximation, with all that their impulses depend on but the velocity after the step."""
+    """M contacts of one approximation, with all arguments of their impulses except the velocity after the step."""
 
     approximation: str
     time_step: float
     near_rigid: float  # beta
-    before: Array  # (M,) vn_0 [m/s], which SAP does not know
+    before: Array  # (M,) vn_0 [m/s], not used by SAP
     normal: Array  # (M, 3)
     phi: Array  # (M,) [m]
     weight: Array  # (M,) w [1/kg]
     friction: Array  # (M,)
     stiffness: Array  # (M,) k [N/m]
-    time: Array  # (M,) tau [s], of SAP alone
-    dissipation: Array  # (M,) d [s/m], of the others alone
+    time: Array  # (M,) tau [s], used only by SAP
+    dissipation: Array  # (M,) d [s/m], not used by SAP
 
     def impulses(self, velocity: Array) -> tuple[Array, Array]:
-        """(M, 3) [N s] on the sphere's side and (M, 3, 3) their derivative, at velocities (M, 3) after the step."""
+        """Return impulses on the sphere (M, 3) [N s] and derivatives (M, 3, 3), at velocities (M, 3) after the step."""
         impulse, slope = np.empty((len(self.phi), 3)), np.empty((len(self.phi), 3, 3))
         arrays = (self.normal, self.phi, self.friction, self.stiffness, self.time, self.dissipation, self.weight)
         given = [own_array(array) for array in (*arrays, velocity, self.before)] + [impulse, slope]
@@ -243,19 +243,19 @@ class ContactLaw:
         return impulse, slope
 
     def subset(self, which: Indices) -> "ContactLaw":
-        """Some of the contacts."""
+        """Return some of the contacts."""
         arrays: dict[str, Any] = {n: v[which] for n, v in vars(self).items() if isinstance(v, np.ndarray)}
         return replace(self, **arrays)
 
 
-QUANTITIES = ("friction", "stiffness", "relaxation_time", "dissipation")  # whose derivatives have a closed form
+QUANTITIES = ("friction", "stiffness", "relaxation_time", "dissipation")  # with derivatives in closed form
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Of P pairs, or its derivative by parameters, each (P, np).
+    """The material of P pairs, or its derivative with respect to parameters, each (P, np).
 
-    `sides` (P, 2, 4) is that of the sphere and of the other, in the order of QUANTITIES.
+    `sides` (P, 2, 4) are the materials of the sphere and of the other shape, in the order of QUANTITIES.
     """
 
     sides: Array
@@ -267,12 +267,12 @@ class Material:
 
     @property
     def of_pairs(self) -> tuple[Array, ...]:
-        """What the two sides make."""
+        """The combined material of both sides."""
         return self.friction, self.stiffness, self.time, self.dissipation, self.other_part
 
 
 def read_material(twin: Twin, pairs: Any) -> Material:
-    """What the context has for the pairs, parameters that are applied included; Drake fills in its defaults there."""
+    """Read the material of the pairs in the context, including applied parameters and Drake's defaults."""
     inspector, geometries = twin.inspector, {i for ids in pairs.ids for i in ids}
     read = {i: [proximity_property(inspector, i, quantity) for quantity in QUANTITIES] for i in geometries}
     sides = np.array([[read[i] for i in ids] for ids in pairs.ids], dtype=float).reshape(len(pairs.ids), 2, 4)
@@ -280,20 +280,20 @@ def read_material(twin: Twin, pairs: Any) -> Material:
 
 
 def combine(sides: Array) -> Material:
-    """Of the two sides (P, 2, 4) of pairs."""
+    """Combine the materials of the two sides (P, 2, 4) of pairs."""
     mu, k, tau, d = np.moveaxis(sides, -1, 0)
     b = k[:, 1] / k.sum(axis=1)
     return Material(sides, 2 * _harmonic(mu), _harmonic(k), tau.sum(axis=1), b * d[:, 0] + (1 - b) * d[:, 1], b)
 
 
 def _harmonic(sides: Array) -> Array:
-    """(P,) a b / (a + b) of sides (P, 2), 0 where both are 0."""
+    """Return a b / (a + b) (P,) for sides (P, 2), or 0 where both are 0."""
     total = sides.sum(axis=1)
     return np.asarray(sides.prod(axis=1) / np.where(total > 0, total, 1.0))
 
 
 def material_change(pairs: Any, material: Material, vector: ParameterVector, twin: Twin) -> Material:
-    """By the entries of a vector all of whose quantities are QUANTITIES."""
+    """Differentiate the material with respect to the entries of a vector that has only QUANTITIES."""
     by_sides = np.zeros((len(vector.values), *material.sides.shape))
     of_label = geometries_of(twin)
     for column, parameter in zip(by_sides, vector.parameters, strict=True):
@@ -314,6 +314,6 @@ def material_change(pairs: Any, material: Material, vector: ParameterVector, twi
 
 
 def _harmonic_change(sides: Array, change: Array) -> Array:
-    """(P, np) the change of a b / (a + b) by those (P, 2, np) of a and b: (b^2 da + a^2 db) / (a + b)^2."""
+    """Return the change (P, np) of a b / (a + b) for changes of a and b (P, 2, np): (b^2 da + a^2 db) / (a + b)^2."""
     total = np.where(sides.sum(axis=1) > 0, sides.sum(axis=1), 1.0)[:, None, None]
     return np.asarray(((sides[:, ::-1, None] / total) ** 2 * change).sum(axis=1))

@@ -1,22 +1,22 @@
-"""Pairs without a sphere, as SceneGraph finds them in the double plant, and how their points of contact move.
+"""Overlaps of pairs without a sphere, from SceneGraph of the double plant, and the derivatives of their contact points.
 
-There are two ways to the derivative of what SceneGraph finds. Where it finds the deepest points themselves, it has a
-closed form. Where it does not, as between boxes and cylinders, whose contact point is that of an iteration, and where
-shapes lie flat on each other as long as only the joints between them move, SceneGraph itself is differenced along the
-motions that these joints have. Where what it finds jumps to one side, as between faces that lie on each other, whose
-corner that is deepest is a matter of rounding, it is that of the other side, on which Drake's step is. Where it jumps
-anyhow, as beside the rim of a cylinder where the iteration ends at a tolerance, the contact is not known.
+There are two methods for the derivative of SceneGraph's results. If SceneGraph returns the deepest points, the
+derivative has a closed form. In other cases, SceneGraph is differenced along the motions of the joints between the
+shapes: for boxes and cylinders, whose contact point is computed iteratively, and for shapes that lie flat on each
+other, as long as only these joints move. If the result jumps to one side, as for two faces in contact, whose deepest
+corner depends on rounding, the derivative to the other side is used, on which Drake's step is. If it jumps to both
+sides, as at the rim of a cylinder, where the iteration stops at a tolerance, the derivative is not known.
 
-Of two shapes that overlap, A and B, with support functions s_A and s_B, Drake's normal n from B to A is where the
-overlap s_B(n) + s_A(-n) is smallest, and is -phi there. Near its deepest point p_A a shape is known by the directions F
-in which it is flat, so that the normal keeps square to them in the shape's frame and the point may slide along them,
-and by C = d p / d m, m being its outward normal: 0 at corners and edges, r of a sphere, r / sin of the rim of a
-cylinder whose axis the normal leaves by that angle. With the twist of A in B and dn the change of the normal,
+For two overlapping shapes A and B with support functions s_A and s_B, Drake's normal n from B to A minimizes the
+overlap s_B(n) + s_A(-n), whose minimum is -phi. Near its deepest point p_A, a shape is described by its flat directions
+F and by C = d p / d m, where m is the outward normal. In the shape's frame, the normal remains orthogonal to F and the
+point may slide along F. C is 0 at corners and edges, r for a sphere, and r / sin(angle) for the rim of a cylinder, with
+the angle between normal and axis. With the twist of A relative to B and the change dn of the normal,
 
     d p_A = v(p_A) - C_A (dn - w x n) + F_A a,   d p_B = C_B dn + F_B b,   d p_A - d p_B = d(phi n)
     F_A . (dn - w x n) = 0,   F_B . dn = 0,
 
-which are as many equations as there are unknowns where the smallest overlap is a proper one.
+which determine all unknowns if the smallest overlap is a nondegenerate minimum.
 """
 
 from dataclasses import dataclass
@@ -48,11 +48,11 @@ from drake_diff.model.model import Model
 Flags = NDArray[np.bool_]
 
 KINDS = (Sphere, HalfSpace, Box, Cylinder, Capsule, Ellipsoid, Convex, Mesh)
-FLAT = 1e-8  # what of a normal, a unit vector, is rounding
-SAME_POINT = 1e-9  # [m] how far the closed form's points may be from those that are found
-DIFFERENCES = (1e-5, 1e-4, 1e-6)  # [m or rad] SceneGraph's iterations leave 1e-10 where they end by themselves
-SAME_SLOPE = 1e-4  # of the largest: over a difference and twice that
-PROPER = 1e-6  # [m] the least curvature of the overlap at its smallest, and the least sine between two flat directions
+FLAT = 1e-8  # rounding level of the entries of a normal, a unit vector
+SAME_POINT = 1e-9  # [m] tolerance between the points of the closed form and of SceneGraph
+DIFFERENCES = (1e-5, 1e-4, 1e-6)  # [m or rad] converged iterations of SceneGraph have an error of 1e-10
+SAME_SLOPE = 1e-4  # tolerance between slopes over one and two difference sizes, relative to the largest entry
+PROPER = 1e-6  # [m] smallest curvature of the overlap at its minimum; also smallest sine between two flat directions
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +60,13 @@ class Shape:
     """A convex shape at a pose (3, 4) in its body."""
 
     kind: int  # in KINDS
-    size: Array  # (3,) [m] radius, half sizes, semi-axes; radius and half the length
-    vertices: Array  # (V, 3) of a mesh's hull; else none
+    size: Array  # (3,) [m] radius, half sizes, semi-axes; or radius and half the length
+    vertices: Array  # (V, 3) of a mesh's hull, else empty
     pose: Array
 
     @classmethod
     def read(cls, inspector: Any, geometry: Any) -> "Shape | None":
-        """That of a geometry, None where it is none of KINDS."""
+        """Read the shape of a geometry, or return None if it is not one of KINDS."""
         shape, size, vertices = inspector.GetShape(geometry), np.zeros(3), np.zeros((0, 3))
         if isinstance(shape, Sphere):
             size[0] = shape.radius()
@@ -84,16 +84,16 @@ class Shape:
         return cls(KINDS.index(type(shape)), size, vertices, inspector.GetPoseInFrame(geometry).GetAsMatrix34())
 
     def feature(self, normal: Array, flat: float) -> "Feature":
-        """What is outermost along `normal` (M, 3), in the shape's frame; what of it is below `flat` counts as 0."""
+        """Return the extreme feature along `normal` (M, 3) in the shape's frame; entries below `flat` count as 0."""
         return _FEATURES[self.kind](self, normal, flat)
 
 
 @dataclass(frozen=True, eq=False)
 class Feature:
-    """What of a shape is outermost along M normals."""
+    """The extreme vertices, edges or faces of a shape along M normals."""
 
-    point: Array  # (M, 3) one that is
-    flat: Array  # (M, 3, 2) unit vectors, or 0
+    point: Array  # (M, 3) an extreme point
+    flat: Array  # (M, 3, 2) flat directions F, unit vectors or 0
     curve: Array  # (M, 3, 3) C
 
 
@@ -103,7 +103,7 @@ def _feature(normal: Array) -> Feature:
 
 
 def _round(normal: Array) -> Array:
-    """(M, 3, 3) 1 - n n'."""
+    """Return 1 - n n' (M, 3, 3)."""
     return np.eye(3) - normal[:, :, None] * normal[:, None, :]
 
 
@@ -186,16 +186,16 @@ _FEATURES = (_sphere, _half_space, _box, _cylinder, _capsule, _ellipsoid, _mesh,
 
 @dataclass(frozen=True, eq=False)
 class NearestPointPairs:
-    """Q pairs of which SceneGraph says where they touch."""
+    """Q pairs whose contacts are found by SceneGraph."""
 
     ids: tuple[tuple[Any, Any], ...]
-    bodies: tuple[tuple[Any, Any], ...]  # Drake's
-    shapes: tuple[tuple[Any, Any], ...]  # Drake's
+    bodies: tuple[tuple[Any, Any], ...]  # Drake's bodies
+    shapes: tuple[tuple[Any, Any], ...]  # Drake's shapes
     known: tuple[tuple[Shape | None, Shape | None], ...]
-    scenes: dict[int, "PairScene"]  # made when they are first asked
+    scenes: dict[int, "PairScene"]  # made at first use
 
     def find(self, model: Model) -> list[tuple[int, Array]]:
-        """Those that overlap in the state of the double twin, and the middle, the normal and phi (7,) of each."""
+        """Return the overlapping pairs at the double twin's state, each with its midpoint, normal and phi (7,)."""
         order = {pair: (i, 1.0) for i, pair in enumerate(self.ids)}
         order |= {(b, a): (i, -1.0) for (a, b), (i, _) in order.items()}
         query = model.plant.get_geometry_query_input_port().Eval(model.double.context)
@@ -210,9 +210,9 @@ class NearestPointPairs:
     def change(
         self, pair: int, poses: tuple[Array, Array], overlaps: Array, twists: Array
     ) -> tuple[Array, Flags, Flags]:
-        """(M, 7, 6) of `Touches`, which (M,) are known and which to one side only, of M overlaps (M, 7).
+        """Return `Touches.change` (M, 7, 6) of M overlaps (M, 7), which are known (M,), and which are one-sided (M,).
 
-        With the bodies at `poses` (M, 3, 4) each, and the twists (M, nv, 6) of the first in the second at the middle.
+        The bodies are at `poses` (M, 3, 4) each; `twists` (M, nv, 6) are of the first in the second, at the midpoint.
         """
         a, b = self.known[pair]
         if a is None or b is None:
@@ -236,14 +236,14 @@ class NearestPointPairs:
 
 
 def _times(pose: Array, other: Array) -> Array:
-    """(M, 3, 4) of poses (M, 3, 4) and a pose (3, 4) in them."""
+    """Return the product (M, 3, 4) of poses (M, 3, 4) and a pose (3, 4)."""
     R = pose[:, :, :3]
     position = (R @ other[:, 3])[..., None] + pose[:, :, 3:]
     return np.concatenate([R @ other[:, :3], position], axis=2)
 
 
 def read_nearest_point_pairs(model: Model, without: set[tuple[Any, Any]]) -> NearestPointPairs:
-    """The pairs of `model` that may move against each other and are not among `without`."""
+    """Read the pairs of `model` that have relative motion and are not in `without`."""
     inspector, plant = model.double.inspector, model.plant
     ids = []
     for pair in sorted(inspector.GetCollisionCandidates()) if inspector is not None else ():
@@ -257,16 +257,16 @@ def read_nearest_point_pairs(model: Model, without: set[tuple[Any, Any]]) -> Nea
 
 @dataclass(frozen=True, eq=False)
 class Overlaps:
-    """M overlaps of two shapes, as Drake found them, in world."""
+    """M overlaps of two shapes found by Drake, in world."""
 
     poses: tuple[Array, Array]  # (M, 3, 4) of the shapes A and B
-    middle: Array  # (M, 3) half way between their deepest points
+    middle: Array  # (M, 3) midpoint of their deepest points
     normal: Array  # (M, 3) from B to A
     phi: Array  # (M,)
 
 
 def overlap_change(a: Shape, b: Shape, overlaps: Overlaps) -> tuple[Array, Flags]:
-    """(M, 7, 6) of `Touches`, and which (M,) are known: those at whose points the overlap is the smallest."""
+    """Return `Touches.change` (M, 7, 6), and which overlaps (M,) are known, i.e. minimal at Drake's points."""
     n = overlaps.normal
     sides = []
     for shape, pose, out, sign in ((a, overlaps.poses[0], -n, 0.5), (b, overlaps.poses[1], n, -0.5)):
@@ -286,7 +286,7 @@ def overlap_change(a: Shape, b: Shape, overlaps: Overlaps) -> tuple[Array, Flags
     for off, F in ((off_a, F_a), (off_b, F_b)):
         beside = off - (F @ (F.swapaxes(-1, -2) @ off[:, :, None]))[..., 0]
         known &= (np.abs(beside) <= SAME_POINT).all(axis=1)
-    turn = -skew(n)  # w x n
+    turn = -skew(n)  # the matrix of w -> w x n
     at_a = np.zeros((len(n), 3, 6))
     at_a[..., :3], at_a[..., 3:] = np.eye(3), -skew(overlaps.phi[:, None] / 2 * n)
     at_a[..., 3:] += C_a @ turn
@@ -304,7 +304,7 @@ def overlap_change(a: Shape, b: Shape, overlaps: Overlaps) -> tuple[Array, Flags
 
 
 def _system(H: Array, f_a: Array, f_b: Array) -> tuple[Array, Flags]:
-    """(M, 6, 6) of dn in the tangent plane, a and b, and where (M,) it belongs to a smallest overlap."""
+    """Return the matrix (M, 6, 6) for (dn in the tangent plane, a, b), and where (M,) the overlap is a minimum."""
     count = len(H)
     left = np.zeros((count, 6, 6))
     left[:, :2, :2] = H
@@ -319,7 +319,7 @@ def _system(H: Array, f_a: Array, f_b: Array) -> tuple[Array, Flags]:
     size, axes = np.linalg.eigh(gram)
     proper = np.zeros(count, dtype=bool)
     proper[number == 0] = np.linalg.eigvalsh(H[number == 0])[:, 0] > PROPER
-    free = axes[:, :, 0]  # square to the one flat direction
+    free = axes[:, :, 0]  # orthogonal to the single flat direction
     along = (free[:, None, :] @ H @ free[:, :, None])[:, 0, 0]
     proper[number == 1] = along[number == 1] > PROPER
     proper[number == 2] = size[number == 2, 0] > PROPER
@@ -327,12 +327,12 @@ def _system(H: Array, f_a: Array, f_b: Array) -> tuple[Array, Flags]:
 
 
 def _same(slope: Array, other: Array, times: float = 1.0) -> bool:
-    """Whether two slopes over different widths are of one curve; one-sided ones may be further apart."""
+    """Check if two slopes over different widths agree; for one-sided slopes, `times` increases the tolerance."""
     return bool(np.abs(slope - other).max() <= times * SAME_SLOPE * max(1.0, float(np.abs(slope).max())))
 
 
 def _tangent(normal: Array) -> Array:
-    """(M, 3, 2) two unit vectors square to each normal (M, 3) and to each other."""
+    """Return two unit vectors (M, 3, 2) orthogonal to each normal (M, 3) and to each other."""
     other = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
     first = np.cross(normal, other)
     first /= np.sqrt((first**2).sum(axis=1))[:, None]
@@ -340,10 +340,10 @@ def _tangent(normal: Array) -> Array:
 
 
 class PairScene:
-    """Two shapes alone, of which SceneGraph is asked what it finds of them."""
+    """A SceneGraph with two shapes only, to query their overlap."""
 
     def __init__(self, a: Any, b: Any) -> None:
-        """Of Drake's shapes."""
+        """Register two of Drake's shapes."""
         scene_graph = SceneGraph()
         source = scene_graph.RegisterSource("pair")
         self._frame = scene_graph.RegisterFrame(source, GeometryFrame("a"))
@@ -356,7 +356,7 @@ class PairScene:
         self._poses, self._port = FramePoseVector(), scene_graph.get_source_pose_port(source)
 
     def find(self, pose: RigidTransform) -> Array:
-        """(7,) the middle, the normal and phi in b's frame with a at `pose` in it; NaN where they do not overlap."""
+        """Return the midpoint, normal and phi (7,) in b's frame, for a at `pose` in it; NaN without overlap."""
         self._poses.set_value(self._frame, pose)
         self._port.FixValue(self._context, self._poses)
         overlaps = self._scene_graph.get_query_output_port().Eval(self._context).ComputePointPairPenetration()
@@ -367,12 +367,11 @@ class PairScene:
         return np.concatenate([middle, sign * overlaps[0].nhat_BA_W, [-overlaps[0].depth]])
 
     def change(self, pose: RigidTransform, twists: Array) -> tuple[Array | None, bool]:
-        """(7, 6) the derivative along the span of `twists` (K, 6) of a at the middle, 0 across it; None where none is.
+        """Return the derivative (7, 6) in the span of `twists` (K, 6) of a at the midpoint, or None if it is not known.
 
-        And whether it is one to one side only.
-
-        All in b's frame. Where the shapes turn about one direction alone it does not matter where along it they touch:
-        that of the middle is 0 there, also where SceneGraph leaves it to rounding, as between a face and a cylinder.
+        It is 0 orthogonal to the span. Also return whether it is one-sided. All quantities are in b's frame. If the
+        shapes rotate about one direction only, the position of the contact along this direction is irrelevant. Its
+        derivative is set to 0, also if SceneGraph's result depends on rounding, as for a face and a cylinder.
         """
         here = self.find(pose)
         _, sizes, directions = np.linalg.svd(twists, full_matrices=False)
@@ -390,7 +389,7 @@ class PairScene:
         return change, to_one_side
 
     def _slope(self, pose: RigidTransform, here: Array, direction: Array, matters: Array) -> tuple[Array | None, bool]:
-        """(7,) along a direction, of both sides together or, where what is found jumps on one, of the other."""
+        """Return the derivative (7,) along a direction, central or, if the result jumps on one side, one-sided."""
         for d in DIFFERENCES:
             near, far = (
                 {
@@ -407,7 +406,7 @@ class PairScene:
         return None, False
 
     def _moved(self, pose: RigidTransform, here: Array, motion: Array) -> Array:
-        """What is found after a small motion (6,) of a, about the middle."""
+        """Return SceneGraph's result after a small motion (6,) of a about the midpoint."""
         angle = float(np.linalg.norm(motion[3:]))
         R = RotationMatrix(AngleAxis(angle, motion[3:] / angle)) if angle else RotationMatrix()
         position = R @ (pose.translation() - here[:3]) + here[:3] + motion[:3]
@@ -415,7 +414,7 @@ class PairScene:
 
 
 def move_apart(model: Model, pair: tuple[Any, Any]) -> bool:
-    """Whether two geometries are on bodies that are not welded together, on which contact would do nothing."""
+    """Check if two geometries are on bodies that are not welded together. Contact of welded bodies has no effect."""
     plant, inspector = model.plant, model.double.inspector
     body, other = (plant.GetBodyFromFrameId(inspector.GetFrameId(i)) for i in pair)
     return all(welded.index() != body.index() for welded in plant.GetBodiesWeldedTo(other))
