@@ -1,1 +1,1 @@
-"""The command `drake-diff`: one module for each group of commands."""
+"""The command `drake-diff`, with one module for each group of commands."""

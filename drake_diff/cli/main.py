@@ -1,7 +1,7 @@
 """The command `drake-diff`.
 
-Exit status: 0 what was asked for holds, 1 a check failed, 2 wrong usage or input, 3 a solver or engine is missing,
-4 an internal error, 130 ended by Ctrl-C, SIGTERM or SIGHUP. A reader of the output that goes away changes nothing.
+Exit status: 0 success, 1 a failed check, 2 wrong usage or input, 3 a missing solver or engine, 4 an internal error, 130
+interrupted by Ctrl-C, SIGTERM or SIGHUP. A closed output pipe does not change the status.
 """
 
 import sys
@@ -43,15 +43,15 @@ def about(
 ) -> None:
     """Trajectory optimization on Drake with gradients that are checked before they are used.
 
-    Exit status: 0 what was asked for holds, 1 a check failed, 2 bad input, 3 a missing solver, engine or extra,
-    4 an internal error or one in your script.
+    Exit status: 0 success, 1 a failed check, 2 bad input, 3 a missing solver, engine or extra, 4 an internal error or
+    an error in your script.
     """
 
 
 class _Output:
-    """A stream that takes all that is written: what its file does not take, as a closed pipe, goes nowhere.
+    """A stream that accepts all output, and discards what its file does not accept, such as a closed pipe.
 
-    So a run goes on, and is written, when nobody reads what the command says of it. `error` is what its file said.
+    A run therefore continues and is written even if nobody reads the output. `error` is the file's error.
     """
 
     def __init__(self, stream: Any):
@@ -77,13 +77,13 @@ class _Output:
 
 
 def main() -> None:
-    """The entry point: every error of ours becomes a sentence and an exit status."""
+    """Run the command; convert every error of drake_diff to a sentence and an exit status."""
     interrupt_alike()
     output = _Output(sys.stdout)
     sys.stdout, sys.stderr = output, _Output(sys.stderr)
     status = _status_of_app()
     output.flush()
-    if INTERRUPTIONS and status == 1:  # as Typer has it
+    if INTERRUPTIONS and status == 1:  # Typer's status for an interrupt
         status = INTERRUPTED
     if output.error is not None and not isinstance(output.error, BrokenPipeError):
         print(f"drake-diff: the output could not be written: {output.error}", file=sys.stderr)
@@ -92,7 +92,7 @@ def main() -> None:
 
 
 def _status_of_app() -> Any:
-    """The exit status of the command, after what it has to say of its error."""
+    """Return the exit status of the command, after printing its error."""
     try:
         app()
     except SystemExit as end:

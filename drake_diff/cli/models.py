@@ -39,7 +39,7 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def audit(model: Any, file: Path) -> None:
-    """List what in MODEL cannot be differentiated, or would be wrongly, and how to change it.
+    """List the parts of MODEL that cannot be differentiated correctly, or at all, and how to change them.
 
     Exit status 1 if a finding is an error.
     """
@@ -112,9 +112,9 @@ def compare(
     seed: Seed = 0,
     out: Annotated[Path | None, out_option("artifacts/compare_<model>")] = None,
 ) -> None:
-    """Simulate MODEL in every engine with the same masses, limits and time step; say which agree and why others differ.
+    """Simulate MODEL in every engine with the same masses, limits and time step, and explain the differences.
 
-    Of a recording that is apart, the smallest change of the model that explains it is named, with its interval. Exit
+    If a recording differs, the smallest change of the model that explains it is reported, with its interval. Exit
     status 0 only if every engine agrees with Drake, or differs by a law that its contract states.
     """
     from drake_diff.comparison.files import PAGE, write_comparison
@@ -172,10 +172,10 @@ def identify(
     ] = None,
     out: Annotated[Path | None, out_option("artifacts/identify_<model>")] = None,
 ) -> None:
-    """Estimate parameters of MODEL from recordings: which differ, by how much, how sure, and what stays open.
+    """Estimate parameters of MODEL from recordings, with confidence intervals, and list what cannot be identified.
 
-    Writes record.json, the recordings, trace.mcap and report.html. Exit status 0 only if the values found
-    explain the recordings.
+    Writes record.json, the recordings, trace.mcap and report.html. Exit status 0 only if the estimated values explain
+    the recordings.
     """
     from drake_diff.identification.files import write_identification
     from drake_diff.identification.identify import identify as estimate
@@ -234,9 +234,9 @@ def excite(
     seed: Seed = 0,
     out: Annotated[Path | None, typer.Option(dir_okay=False, help="CSV file to write, with motion and inputs.")] = None,
 ) -> None:
-    """Find inputs for MODEL whose recording tells its parameters, and say how well it will tell each.
+    """Find inputs for MODEL whose recording identifies its parameters, and predict the accuracy of each estimate.
 
-    The file has the columns of a recording: time, states, inputs. What it has of states is how the model moves.
+    The file has the columns of a recording: time, states, inputs. Its states are the model's simulated motion.
     """
     import numpy as np
 
@@ -292,7 +292,7 @@ def export(
     to: Annotated[str, typer.Option(help="gazebo, isaaclab, urdf, sdf or mjcf")],
     out: Annotated[Path, typer.Option(help="Directory to write. It must not exist yet.")],
 ) -> None:
-    """Write MODEL for an engine that does not run here: model file, contract, start states, and what to record."""
+    """Write MODEL for an external engine: model file, contract, start states, and instructions for the recording."""
     from drake_diff.export.export import export_model
 
     show("wrote " + ", ".join(map(str, export_model(model, out, target=to))))

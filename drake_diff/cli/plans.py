@@ -1,4 +1,4 @@
-"""Commands that plan, and that try many times: plan, robustness, panel."""
+"""Commands that plan, or run many trials: plan, robustness, panel."""
 
 import time
 from pathlib import Path
@@ -30,7 +30,7 @@ from drake_diff.cli.text import (
 )
 from drake_diff.exceptions import InputError
 
-EXAMPLE = "panda"  # what `drake-diff plan` alone plans for
+EXAMPLE = "panda"  # the robot of `drake-diff plan` without arguments
 
 Goals = Annotated[
     list[str] | None,
@@ -44,7 +44,7 @@ Obstacles = Annotated[
     ),
 ]
 NUMBERS = {"sphere": 4, "box": 6}
-PAUSE = 5.0  # [s] between two lines of progress where there is no terminal
+PAUSE = 5.0  # [s] between two lines of progress without a terminal
 
 
 def plan(
@@ -61,9 +61,9 @@ def plan(
     without_meshes: WithoutMeshes = False,
     packages: Packages = None,
 ) -> None:
-    """Plan a motion of ROBOT: mend its file, solve, write the run directory and verify it.
+    """Plan a motion of ROBOT: repair its file, solve, write the run directory and verify it.
 
-    Without a goal it goes to a random state that the robot can reach. Exit status 0 only if the plan is verified.
+    The default goal is a random state that the robot can reach. Exit status 0 only if the plan is verified.
     """
     expected = "NAME=x,y,z of a frame, or NAME=number of a joint: numbers with commas between"
     numbers = numbers_in("--goal", goal or (), expected, counts=range(1, 100))
@@ -71,7 +71,7 @@ def plan(
     shapes, folders = [_shape(words) for words in avoid or ()], packages_in(packages)
     if robot is not None and not robot.is_file():
         raise InputError("ROBOT", got=str(robot), expected="a file that exists")
-    # Only here: what is wrong is refused before Drake is loaded.
+    # Imported late, so that invalid input is rejected before Drake is loaded.
     from drake_diff.model.example import example_files
     from drake_diff.optimize.problem.obstacles import BoxObstacle, SphereObstacle
     from drake_diff.planning.planner import plan as planned
@@ -131,9 +131,9 @@ def robustness(
     models: ModelFolder = None,
     out: Annotated[Path | None, out_option("<RUN>_robustness")] = None,
 ) -> None:
-    """Try the plan of RUN under perturbations of plant, start, sensor and actuator: how often does it reach the goal?
+    """Try the plan of RUN under perturbations of plant, start, sensor and actuator, and count how often it succeeds.
 
-    Exit status 0 only if it reaches the goal unperturbed, and each perturbation has a level at which 95 % of the
+    Exit status 0 only if the unperturbed plan reaches the goal, and each perturbation has a level at which 95 % of the
     trials succeed.
     """
     from drake_diff.runs.directory import written_whole
@@ -178,8 +178,8 @@ def panel(
 ) -> None:
     """Evaluate every trial of FILE in parallel, and write table.csv, summary.json, panel.html and trials/.
 
-    Finished trials are kept: after Ctrl-C (exit status 130) or a kill the same command goes on.
-    Exit status 1 if a trial ended in an error; its row says which.
+    Finished trials are kept: after Ctrl-C (exit status 130) or a kill, the same command resumes.
+    Exit status 1 if a trial ended in an error; its row states the error.
     """
     from drake_diff.panels.panel import run_panel
 

@@ -29,7 +29,7 @@ from drake_diff.cli.text import (
 )
 from drake_diff.exceptions import InputError, UnknownNameError, WriteError
 
-OURS = ("problem", "progress", "view")  # arguments of `solve` that a script does not give
+OURS = ("problem", "progress", "view")  # arguments of `solve` that a script cannot set
 MOST_MEMORY = 4 * 2**30  # bytes
 
 
@@ -54,11 +54,11 @@ def run(
 ) -> None:
     """Solve the problem that SCRIPT defines, measure the solution again, and write the run directory.
 
-    SCRIPT may also define solve_options, a dictionary of arguments of drake_diff.solve. With --cross-check the plan
-    is replayed in other plants too, and the record says where it holds; the exit status does not depend on that.
-    Exit status 0 only if the solution passes every check. Ctrl-C, SIGTERM and SIGHUP end the search: its best plan is
-    written. One that comes later, while it is measured, ends the run (exit status 130), which `recover` completes; one
-    that comes before the search leaves a record that says so (130 too).
+    SCRIPT may also define solve_options, a dictionary of arguments of drake_diff.solve. With --cross-check the plan is
+    also replayed in other plants, and the record states where it holds; the exit status does not depend on that. Exit
+    status 0 only if the solution passes every check. Ctrl-C, SIGTERM and SIGHUP end the search, and its best plan is
+    written. A later signal, while the plan is measured, ends the run (exit status 130), and `recover` completes it. A
+    signal before the search leaves a record that says so (130 too).
     """
     if not script.is_file():
         raise InputError("SCRIPT", got=str(script), expected="a Python file that exists")
@@ -78,8 +78,8 @@ def run(
 
 
 def _run_into(directory: Path, script: Path, cross_check: bool, options: dict[str, Any], meshes: bool) -> Any:
-    """Set up the problem and write the record of its solution; what is interrupted takes no other run's place."""
-    from drake_diff.runs.directory import written_whole  # only here: a missing script is refused before Drake is loaded
+    """Set up the problem and write the record of its solution; an interrupted run does not replace another run."""
+    from drake_diff.runs.directory import written_whole  # late, so that a missing script is reported first
     from drake_diff.runs.save import record_without_problem
 
     folder = None
@@ -102,7 +102,7 @@ def _run_into(directory: Path, script: Path, cross_check: bool, options: dict[st
 
 
 def _asked(script: Path, cross_check: bool) -> tuple[Any, dict[str, Any]]:
-    """The problem that a script defines, and its options of `solve`."""
+    """Return the problem that a script defines, and its options of `solve`."""
     module = _loaded(script)
     problem, options = module.problem(), getattr(module, "solve_options", {})
     from drake_diff.optimize.options import Options
@@ -130,9 +130,9 @@ def _asked(script: Path, cross_check: bool) -> tuple[Any, dict[str, Any]]:
 
 
 def _wait_at(location: str) -> None:
-    """Say that until Ctrl-C something is at a place."""
+    """Print a location that is available until Ctrl-C, and wait for that."""
     try:
-        # Not by a console: interrupted after it has written, it would write the line once more.
+        # Not with a console, which would print the line again if it is interrupted after printing.
         typer.echo(f"{location} (Ctrl-C ends it)")
         threading.Event().wait()
     except KeyboardInterrupt:
@@ -142,7 +142,7 @@ def _wait_at(location: str) -> None:
 def _solved_into(
     directory: Path, folder: Path, problem: Any, options: dict[str, Any], checked: bool, meshes: bool
 ) -> Any:
-    """Solve, measure and write `folder`, which is to be `directory`; what is interrupted takes no other run's place."""
+    """Solve, measure and write `folder`, later `directory`; an interrupted run does not replace another run."""
     from drake_diff.optimize.options import Options
     from drake_diff.optimize.solve import solve
     from drake_diff.runs.cross_check import cross_check
@@ -197,7 +197,7 @@ def _show_phases(record: Any) -> None:
 
 
 def _loaded(script: Path) -> ModuleType:
-    """The script as a module; its `if __name__ == "__main__"` part does not run."""
+    """Import the script as a module; its `if __name__ == "__main__"` part does not run."""
     spec = importlib.util.spec_from_file_location("drake_diff_script", script)
     if spec is None or spec.loader is None:
         raise InputError("SCRIPT", got=str(script), expected="a Python file, its name ending in .py")
@@ -236,13 +236,13 @@ def verify(
     time_limit: Annotated[float, typer.Option(help="Time limit of the new computation [s].")] = 60.0,
     memory_limit: Annotated[float, typer.Option(help="Memory limit of the new computation [GiB].")] = 1.0,
 ) -> None:
-    """Check every file of RUN, run it again from its own files, and compare record, trace and pages.
+    """Check every file of RUN, reproduce RUN from its own files, and compare record, trace and pages.
 
-    RUN is what a solve, a comparison, robustness trials or a certification wrote.
-    Exit status 0 only if all of it came out again. What was claimed and what was not checked is printed first.
-    Comparisons and robustness trials are not run again: unchanged, they are "intact", with exit status 1. But what was
-    said of recordings is made again: how they compare, and their causes.
-    RUN may be a stranger's: its model is read in a child process with limits of time and memory.
+    RUN is a directory of a solve, a comparison, robustness trials or a certification.
+    Exit status 0 only if everything was reproduced. The claims and the unchecked parts are printed first.
+    Comparisons and robustness trials are not repeated: if unchanged, they are "intact", with exit status 1. However,
+    results on recordings are reproduced: the comparison and the causes.
+    RUN may be untrusted: its model is read in a child process with limits of time and memory.
     """
     from drake_diff.runs.verify import verify as verify_run
 
@@ -261,7 +261,7 @@ def list_all(
         "artifacts"
     ),
 ) -> None:
-    """List the records in DIRECTORY and their verdicts as written; `verify` checks them."""
+    """List the records in DIRECTORY with their unverified verdicts; `verify` checks them."""
     from drake_diff.runs.view import list_runs
 
     columns = ("run", "verdict", "kind", "status", "cost", "model", "written")
@@ -273,7 +273,7 @@ def recover_run(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="The directory NAME.partial-... that a run left.")],
     out: Annotated[Path | None, out_option("<NAME>")] = None,
 ) -> None:
-    """Complete a run that was killed, interrupted, or met a full disk: measure the plan in RUN, and write the rest.
+    """Complete a run that was killed, interrupted or stopped by a full disk: measure the plan in RUN, write the rest.
 
     Exit status 0 only if the plan passes every check. No run is replaced.
     """
@@ -292,10 +292,10 @@ def compare_runs(
     out: Annotated[Path | None, typer.Option("--out", metavar="PAGE", dir_okay=False, help="Page to write.")] = None,
     models: ModelFolder = None,
 ) -> None:
-    """Show what differs between the runs A and B: configuration, versions, metrics.
+    """Show the differences between the runs A and B: configuration, versions, metrics.
 
-    With --out, a page shows both plans in one replay and in the same plots as well.
-    Exit status 1 if the two define a metric differently; such metrics are not compared.
+    With --out, a page also shows both plans in one replay and in the same plots.
+    Exit status 1 if the runs define a metric differently; such metrics are not compared.
     """
     from drake_diff.runs.view import compare_runs as compare
 
@@ -318,7 +318,7 @@ def compare_runs(
 def schema(
     kind: Annotated[str, typer.Argument(metavar="KIND", help="plan, fit or comparison.")] = "plan",
 ) -> None:
-    """Print the JSON Schema of record.json, of one kind of record."""
+    """Print the JSON Schema of record.json for one kind of record."""
     from drake_diff.runs.directory import KINDS
 
     if kind not in KINDS:

@@ -1,6 +1,6 @@
-"""What all commands share: options, the loading of a model, and text that is safe to print.
+"""Shared parts of all commands: options, loading of a model, and text that is safe to print.
 
-What a record or a model says may be a stranger's text: it is printed without markup and control characters.
+Records and models may contain untrusted text, which is printed without markup and control characters.
 """
 
 import functools
@@ -34,17 +34,17 @@ Seed = Annotated[int, typer.Option(min=0, help="The same seed gives the same dra
 
 
 def out_option(default: str) -> Any:
-    """The option for the directory that a command writes."""
+    """Return the option for the directory that a command writes."""
     return typer.Option("--out", file_okay=False, show_default=default, help="Directory to write.")
 
 
 def names_option(what: str, otherwise: str) -> Any:
-    """An option that takes names with commas between; see `names_in`."""
+    """Return an option for names separated by commas; see `names_in`."""
     return typer.Option(metavar="NAMES", show_default=otherwise, help=f"{what}, with commas between.")
 
 
 def repeated(metavar: str, what: str) -> Any:
-    """An option that can be given several times."""
+    """Return an option that can be given several times."""
     return typer.Option(metavar=metavar, help=f"{what}. Repeatable.")
 
 
@@ -52,19 +52,19 @@ Packages = Annotated[list[str] | None, repeated("NAME=FOLDER", "Folder of a pack
 
 
 def packages_in(given: list[str] | None) -> dict[str, str] | None:
-    """The folders of packages by their names; None of none."""
+    """Return the folders of packages by name, or None if there are none."""
     return dict(split_pair("--packages", words, "NAME=FOLDER") for words in given) if given else None
 
 
 def names_in(words: str | None) -> list[str] | None:
-    """The names in "a, b"; None for None."""
+    """Split "a, b" into names; None gives None."""
     return None if words is None else [name.strip() for name in words.split(",") if name.strip()]
 
 
 def takes_model(command: Callable[..., None]) -> Callable[..., None]:
-    """`command(model, file, ...)` as a command with the argument MODEL and the options of `load_model`.
+    """Convert `command(model, file, ...)` to a command with the argument MODEL and the options of `load_model`.
 
-    Typer reads options from a function's signature, so this one writes them there, once for all commands.
+    Typer reads options from the signature of a function, so this function sets it in one place for all commands.
     """
     loading = inspect.signature(_load).parameters
     arguments = [p for p in inspect.signature(command).parameters.values() if p.name not in ("model", "file")]
@@ -115,7 +115,7 @@ def _load(
     ] = None,
     contact: Annotated[bool, typer.Option(help="Whether anything collides.")] = True,
 ) -> Any:
-    # What is wrong is refused before Drake is loaded.
+    # Invalid input is rejected before Drake is loaded.
     options: dict[str, Any] = {
         "time_step": time_step,
         "contact_model": contact_model,
@@ -140,9 +140,9 @@ def _load(
 
 
 def survived(file: Path, options: Mapping[str, Any]) -> None:
-    """Read a model and make a step of it in a process apart; where that crashes, say so and exit with status 1.
+    """Read a model and take one step in a child process; if that crashes, report it and exit with status 1.
 
-    Drake's parsers crash on some files, OBJ and VTK meshes of wrong numbers among them, and would end this process.
+    Drake's parsers crash on some files, such as OBJ and VTK meshes with wrong numbers, and would end this process.
     """
     from drake_diff._base.sandbox import crash_of
     from drake_diff.model.model import load_model
@@ -170,7 +170,7 @@ def _actuators(words: str | None) -> str | list[str] | dict[str, float] | None:
 
 
 def split_pair(option: str, words: str, expected: str) -> tuple[str, str]:
-    """NAME and VALUE of "NAME=VALUE"."""
+    """Split "NAME=VALUE" into NAME and VALUE."""
     name, sign, value = words.partition("=")
     if not (name and sign and value):
         raise InputError(option, got=repr(words), expected=expected)
@@ -178,7 +178,7 @@ def split_pair(option: str, words: str, expected: str) -> tuple[str, str]:
 
 
 def numbers_in(option: str, words: Iterable[str], expected: str, *, counts: Container[int] = (1,)) -> dict[str, Any]:
-    """A tuple of numbers by name, of "NAME=NUMBER,NUMBER,..." each, as many as `counts` has."""
+    """Parse "NAME=NUMBER,NUMBER,..." to a tuple of numbers by name; `counts` are the allowed numbers of numbers."""
     values: dict[str, Any] = {}
     for word in words:
         name, text = split_pair(option, word, expected)
@@ -191,7 +191,7 @@ def numbers_in(option: str, words: Iterable[str], expected: str, *, counts: Cont
 
 
 def floats_in(option: str, words: str, expected: str) -> list[float]:
-    """The numbers in "1, 2"."""
+    """Parse the numbers in "1, 2"."""
     return [_number(option, word, expected) for word in words.split(",")]
 
 
@@ -203,7 +203,7 @@ def _number(option: str, words: str, expected: str) -> float:
 
 
 def as_options(arguments: Mapping[str, Any]) -> str:
-    """Arguments of `load_model` as they are typed after a command."""
+    """Format arguments of `load_model` as options on the command line."""
     words = []
     for name, value in arguments.items():
         option = "--" + name.replace("_", "-")
@@ -216,7 +216,7 @@ def as_options(arguments: Mapping[str, Any]) -> str:
 
 
 def console(*, stderr: bool = False) -> Console:
-    """A console without markup; tables in a file or pipe are not folded to a terminal's width."""
+    """Return a console without markup; tables in a file or pipe are not folded to a terminal's width."""
     terminal = Console(soft_wrap=True, highlight=False, markup=False, stderr=stderr)
     if not terminal.is_terminal:
         terminal.width = NOT_FOLDED
@@ -224,24 +224,24 @@ def console(*, stderr: bool = False) -> Console:
 
 
 def show(*parts: str | Text) -> None:
-    """Print a line; only `Text` keeps a style."""
+    """Print a line; only `Text` parts keep a style."""
     console().print(*(plain(renderable) if isinstance(renderable, str) else renderable for renderable in parts))
 
 
 def plain(value: Any, style: str = "") -> Text:
-    """`value` as text that changes nothing else on a terminal."""
+    """Convert `value` to text without control characters, for printing on a terminal."""
     shown = "-" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
     return Text("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in shown), style=style)
 
 
 def judged(verdict: str) -> Text:
-    """A verdict in its colour."""
+    """Return a verdict in its colour."""
     colour = "green" if verdict in GREEN else "red" if verdict in RED else "yellow"
     return plain(verdict, f"bold {colour}")
 
 
 def show_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], *, left: int = 99, wrap: bool = True) -> None:
-    """Print a table; all but the first `left` columns are set to the right."""
+    """Print a table; all but the first `left` columns are right-aligned."""
     table = Table(box=None, pad_edge=False, header_style="dim")
     for i, name in enumerate(columns):
         justify: Any = "left" if i < left else "right"
@@ -252,19 +252,18 @@ def show_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], *, left: i
 
 
 def conclude(holds: bool) -> NoReturn:
-    """End the command: status 0 only where what was asked for holds."""
+    """End the command, with status 0 only if its checks hold."""
     raise typer.Exit(0 if holds else 1)
 
 
 def show_written(directory: Path, record: Any) -> None:
-    """Say what of a record is in a directory."""
+    """Print the names of a record's files in a directory."""
     show(f"wrote {directory}: {record.FILE}, {', '.join(record.file_names)}")
 
 
 @contextmanager
 def progress_line(begin: str, *, stderr: bool = False, pause: float = 0.0) -> Iterator[Callable[[str], None]]:
-    """A function that shows a line of progress: rewritten on a terminal; elsewhere one below the other, `pause` [s]
-    between them at least."""
+    """Yield a function that shows progress, on one terminal line, or else in lines at least `pause` [s] apart."""
     screen, last = console(stderr=stderr), -pause
     if screen.is_terminal:
         with screen.status(begin) as status:

@@ -1,4 +1,4 @@
-"""MCAP logs, written and read: the channels of a motion."""
+"""Read and write MCAP logs, and the channels of a motion."""
 
 from drake_diff._base import attach_stub as _attach_stub
 

@@ -1,7 +1,7 @@
-"""The channels of trace.mcap that show a motion in simulated time: states, inputs, joints, frames, contact, energies.
+"""The channels of trace.mcap for a motion in simulated time: states, inputs, joints, frames, contacts, energies.
 
-The protobuf messages of our own are flat, so that any viewer can plot them, and built without protoc. A channel's
-messages are generated while they are written, so that a long motion is never held in memory twice.
+Our own protobuf messages are flat, so that any viewer can plot them, and are built without protoc. The messages of a
+channel are generated while they are written, so that a long motion is not stored in memory twice.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,7 +29,7 @@ NUMBER, NUMBERS = ("double", False), ("double", True)
 WHOLE, FLAG, TEXT, TEXTS = ("int64", False), ("bool", False), ("string", False), ("string", True)
 ROW_PER_COLUMN = "unit of the row per unit of the column"
 
-# message: {field: (type, unit)}; field numbers are the order, so new fields go last.
+# message: {field: (type, unit)}; the order defines the field numbers, so new fields go last.
 MESSAGES: dict[str, dict[str, tuple[tuple[str, bool], str]]] = {
     "State": {"time": (NUMBER, "s"), "q": (NUMBERS, "see names"), "v": (NUMBERS, "see names")},
     "Input": {"time": (NUMBER, "s"), "u": (NUMBERS, "see names")},
@@ -55,12 +55,12 @@ MESSAGES: dict[str, dict[str, tuple[tuple[str, bool], str]]] = {
     "GradientCheck": {
         **dict.fromkeys(("subject", "method", "verdict"), (TEXT, "")),
         **dict.fromkeys(("entries", "agreeing"), (WHOLE, "1")),
-        "cosine": (NUMBER, "1"),  # of the angle between derivative and differences, all entries in one vector
+        "cosine": (NUMBER, "1"),  # of the angle between derivative and differences, with all entries in one vector
         **dict.fromkeys(("worst_row", "worst_column"), (TEXT, "")),
         **dict.fromkeys(("worst_derivative", "worst_difference", "worst_tolerance"), (NUMBER, ROW_PER_COLUMN)),
         "mode_changes": (TEXTS, ""),
     },
-    "GradientNorm": {  # |d x_N / d x_k| and |d L / d x_k|; NaN where it is not known
+    "GradientNorm": {  # |d x_N / d x_k| and |d L / d x_k|; NaN if unknown
         "step": (WHOLE, "1"),
         "final_state": (NUMBER, "state unit per state unit"),
         "lagrangian": (NUMBER, "1 per state unit"),
@@ -71,7 +71,7 @@ MESSAGES: dict[str, dict[str, tuple[tuple[str, bool], str]]] = {
         "horizon": (NUMBER, "s"),
         "horizon_is_free": (FLAG, "1"),
         "parameters": (NUMBERS, "see names"),
-        "mesh": (NUMBERS, "1"),  # the knots as parts of the horizon, where they are not equally far apart
+        "mesh": (NUMBERS, "1"),  # the knots relative to the horizon, if they are not equidistant
     },
     "Replay": {
         **dict.fromkeys(("variant", "control", "approximation"), (TEXT, "")),
@@ -84,7 +84,7 @@ MESSAGES: dict[str, dict[str, tuple[tuple[str, bool], str]]] = {
     },
     "Event": {"time": (NUMBER, "s"), **dict.fromkeys(("kind", "failure_label", "code", "message"), (TEXT, ""))},
 }
-# In a file of their own: what is added to the file of the others changes the schemas in every trace.
+# In a separate file, since an addition to the other file would change the schemas in every trace.
 LOOP_MESSAGES: dict[str, dict[str, tuple[tuple[str, bool], str]]] = {
     "Deadline": {**dict.fromkeys(("time", "latency", "budget"), (NUMBER, "s")), "missed": (FLAG, "1")},
 }
@@ -118,13 +118,13 @@ def _build(file_name: str, messages: dict[str, Any]) -> dict[str, MessageType]:
 TYPES = _build("drake_diff.proto", MESSAGES) | _build("drake_diff_loop.proto", LOOP_MESSAGES)
 
 ARROW_LENGTH_PER_NEWTON = 0.02  # [m/N]
-GHOST = "planned/"  # before a body's name: its frame as planned
+GHOST = "planned/"  # prefix of a body's name for its planned frame
 
 Rows = Iterator[tuple[int, Any]]
 
 
 class Coordinate(Protocol):
-    """What a channel says of an entry of its states or inputs."""
+    """The properties of an entry of states or inputs that a channel needs."""
 
     @property
     def name(self) -> str: ...
@@ -135,7 +135,7 @@ class Coordinate(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What is shown: a model, its states as planned, and the motion of the discrete plant if there is one."""
+    """A model, its planned states, and the motion of the discrete plant if there is one."""
 
     model: Model
     time_step: float  # [s]
@@ -144,28 +144,28 @@ class Shown:
 
     @property
     def xs(self) -> Array:
-        """The motion's states; none if it could not be taken."""
+        """The motion's states, without rows if the motion could not be computed."""
         return np.zeros((0, self.model.nx)) if self.motion is None else self.motion.xs
 
     @property
     def us(self) -> Array:
-        """The motion's inputs; none if it could not be taken."""
+        """The motion's inputs, without rows if the motion could not be computed."""
         return np.zeros((0, self.model.nu)) if self.motion is None else self.motion.us
 
     def times(self, count: int) -> Array:
-        """The first `count` times [s]: k h."""
+        """Return the first `count` times [s]: k h."""
         return np.asarray(self.time_step * np.arange(count), dtype=float)
 
 
 def motion_channels(shown: Shown) -> Iterator[Channel]:
-    """The motion of the discrete plant, with everything measured along it, and the planned joints and frames."""
+    """Yield the channels of the discrete plant's motion and its measures, and of the planned joints and frames."""
     contract = shown.model.contract
     yield state_channel("/state", shown.times(len(shown.xs)), shown.xs, contract.positions, contract.velocities)
     yield input_channel("/input", shown.times(len(shown.us)), shown.us, contract.inputs)
     efforts = None if shown.motion is None else shown.motion.efforts
     yield _joint_states(shown, "/joint_states", shown.xs, efforts)
     yield _joint_states(shown, "/planned/joint_states", shown.planned_xs, None)
-    # The ghost is the plan, shown if it is another motion than the plant's own.
+    # The ghost is the plan, which is shown if it differs from the plant's own motion.
     ghost = not np.array_equal(shown.xs, shown.planned_xs)
     frames = {"": shown.xs, **({GHOST: shown.planned_xs} if ghost else {})}
     count = max(len(shown.xs), len(shown.planned_xs))
@@ -177,7 +177,7 @@ def motion_channels(shown: Shown) -> Iterator[Channel]:
 
 
 def nanoseconds(time: float) -> int:
-    """Simulated time [s] as log time [ns]."""
+    """Convert simulated time [s] to log time [ns]."""
     return round(float(time) * 1e9)
 
 
@@ -189,7 +189,7 @@ def _stamp(stamp: Any, time: float) -> None:
 def state_channel(
     topic: str, times: Array, xs: Array, positions: Sequence[Coordinate], velocities: Sequence[Coordinate]
 ) -> Channel:
-    """drake_diff.State of states (n, nx) at `times` (n,) [s]: exact, names and units as metadata."""
+    """Return drake_diff.State of states (n, nx) at `times` (n,) [s], not rounded, with names and units as metadata."""
     kind, nq, parts = TYPES["State"], len(positions), {"q": positions, "v": velocities}
     rows = (
         (nanoseconds(t), kind.cls(time=t, q=x[:nq], v=x[nq:])) for t, x in zip(times.tolist(), xs.tolist(), strict=True)
@@ -198,7 +198,7 @@ def state_channel(
 
 
 def input_channel(topic: str, times: Array, us: Array, inputs: Sequence[Coordinate]) -> Channel:
-    """drake_diff.Input of inputs (n, nu) at `times` (n,) [s]."""
+    """Return drake_diff.Input of inputs (n, nu) at `times` (n,) [s]."""
     kind = TYPES["Input"]
     rows = ((nanoseconds(t), kind.cls(time=t, u=u)) for t, u in zip(times.tolist(), us.tolist(), strict=True))
     return Channel(topic, kind.cls, rows, _column_metadata({"u": inputs}))
@@ -211,7 +211,7 @@ def _column_metadata(parts: Mapping[str, Sequence[Coordinate]]) -> dict[str, Any
 
 
 def _joint_states(shown: Shown, topic: str, xs: Array, efforts: Array | None) -> Channel:
-    """foxglove.JointStates of every joint with one degree of freedom; efforts where an actuator drives it."""
+    """Return foxglove.JointStates of every joint with one degree of freedom, with efforts of actuated joints."""
     plant, coupling = shown.model.plant, shown.model.coupling
     single = [j for j in joints(plant) if j.num_positions() == 1 and j.num_velocities() == 1]
     driven = {a.joint().index(): i for i, a in enumerate(actuators(plant))}
@@ -225,7 +225,7 @@ def _joint_states(shown: Shown, topic: str, xs: Array, efforts: Array | None) ->
         for k, (t, x) in enumerate(zip(shown.times(len(xs)), xs.tolist(), strict=True)):
             message = JointStates()
             _stamp(message.timestamp, t)
-            x = x if coupling is None else coupling.state(np.array(x)).tolist()  # joints that follow others, too
+            x = x if coupling is None else coupling.state(np.array(x)).tolist()  # including coupled joints
             for name, position, velocity, actuator in places:
                 state = message.joints.add(name=name, position=x[position], velocity=x[velocity])
                 if actuator is not None and k < len(applied):
@@ -239,7 +239,7 @@ def _joint_states(shown: Shown, topic: str, xs: Array, efforts: Array | None) ->
 def transform_channel(
     model: Model, times: Array, motions: Mapping[str, Array], more: Mapping[str, str] | None = None
 ) -> Channel:
-    """foxglove.FrameTransforms in /tf of the bodies in `motions`, (n, nx) by what their frames' names begin with."""
+    """Return foxglove.FrameTransforms in /tf of the bodies in `motions`, (n, nx) by the prefix of the frames' names."""
     plant = model.plant
     named = [(b, f"{plant.GetModelInstanceName(b.model_instance())}::{b.name()}") for b in bodies(plant)]
 
@@ -261,7 +261,7 @@ def transform_channel(
 
 
 def _poses(model: Model, named: list[tuple[Any, str]], x: Array) -> list[tuple[str, list[float], list[float]]]:
-    """Name, translation [m] and quaternion of each body; none of a state without a pose (NaN, a zero quaternion)."""
+    """Return name, translation [m] and quaternion of each body; [] for a state without poses (NaN, zero quaternion)."""
     plant, context = model.plant, model.double.context
     try:
         set_state(model.double, x)
@@ -318,7 +318,7 @@ def _contacts(shown: Shown) -> Channel:
 
 
 def _contact_scene(shown: Shown) -> Channel:
-    """foxglove.SceneUpdate: an arrow along the force at each contact, for drawing; the numbers are in /contacts."""
+    """Return foxglove.SceneUpdate with an arrow along the force at each contact; the numbers are in /contacts."""
 
     def rows() -> Rows:
         for t, contacts in _steps_in_contact(shown):
@@ -335,7 +335,7 @@ def _contact_scene(shown: Shown) -> Channel:
 
 
 def _draw_arrow(arrow: Any, contact: ContactPoint) -> None:
-    """An arrow along +x, turned onto the force by the shortest rotation."""
+    """Draw an arrow along +x, rotated to the force by the shortest rotation."""
     size = float(np.linalg.norm(contact.force))
     direction = contact.force / size if size else np.array([1.0, 0.0, 0.0])
     arrow.pose.position.x, arrow.pose.position.y, arrow.pose.position.z = contact.point

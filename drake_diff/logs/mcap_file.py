@@ -1,7 +1,7 @@
-"""MCAP files of protobuf channels: written byte for byte the same for the same content, and read back.
+"""Read MCAP files of protobuf channels, and write them with the same bytes for the same content.
 
-The `mcap` package does not check the checksums of attachments, of the data section and of the summary, and unpacks
-whatever a chunk says that it holds: this module checks all of that before it reads.
+The `mcap` package does not check the checksums of attachments, data section and summary, and unpacks chunks of any
+declared size. This module checks both before it reads.
 """
 
 import json
@@ -31,15 +31,15 @@ from drake_diff._base.sandbox import check_memory
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError, InputError, UnknownNameError
 
-CHUNK_SIZE = 64 * 1024  # the most that is lost if a process is killed or a file damaged
+CHUNK_SIZE = 64 * 1024  # largest loss if a process is killed or a file is damaged
 LIBRARY = "drake_diff"
-MOST_UNPACKED = GIB  # of all chunks of a file
-PACKED_AT_MOST, PACKED_APART = 100, 16 * MIB  # what unpacks to more times its size, and this, is a bomb: ours 20 times
+MOST_UNPACKED = GIB  # limit for all chunks of a file
+PACKED_AT_MOST, PACKED_APART = 100, 16 * MIB  # allowed unpacked size: 100 times the file (ours: 20 times) plus 16 MiB
 MOST_MESSAGES, MOST_CHANNELS = 5_000_000, 10_000
-BETWEEN_LOOKS = 10_000  # messages: at memory that is nearly used up, where protobuf ends the process
+BETWEEN_LOOKS = 10_000  # messages between memory checks: protobuf ends the process if memory is exhausted
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of its offsets, CRC of the summary
-DATA_END = struct.Struct("<BQI")  # opcode, length, CRC of all before it
+DATA_END = struct.Struct("<BQI")  # opcode, length, CRC of everything before it
 RECORD = struct.Struct("<BQ")  # opcode, length
 CRC = struct.Struct("<I")
 FOOTER_OPCODE, CHUNK, ATTACHMENT, METADATA, DATA_END_OPCODE = 0x02, 0x06, 0x09, 0x0C, 0x0F
@@ -49,7 +49,7 @@ MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 
 @dataclass(frozen=True)
 class Channel:
-    """One topic: messages of one protobuf class with their log times [ns], in order; units or names as metadata."""
+    """A topic: messages of one protobuf class with log times [ns], in order; units or names are metadata."""
 
     topic: str
     message_class: Any
@@ -60,9 +60,9 @@ class Channel:
 def write_mcap(
     path: Path, channels: Sequence[Channel], metadata: Mapping[str, str], attachments: Mapping[str, tuple[str, bytes]]
 ) -> None:
-    """Write `channels` to `path`; attachments are name: (media type, data).
+    """Write `channels` to `path`; `attachments` maps names to (media type, data).
 
-    Written chunk by chunk beside `path`, and moved into place once it is whole. InputError if a time decreases.
+    The file is written in chunks and moved to `path` when it is complete. Raises InputError if a time decreases.
     """
     with whole_file(path) as file:
         writer = Writer(
@@ -99,7 +99,7 @@ def _timed(rank: int, channel: Channel) -> Iterator[tuple[int, int, int, Any]]:
 
 @dataclass(frozen=True, repr=False)
 class McapLog(ShowsItsRepr):
-    """What a file holds: messages by topic, the channels' metadata, metadata records and attachments."""
+    """The content of a file: messages by topic, the channels' metadata, metadata records and attachments."""
 
     messages: dict[str, list[tuple[int, Any]]]  # log time [ns], message
     channel_metadata: dict[str, dict[str, Any]]
@@ -108,9 +108,9 @@ class McapLog(ShowsItsRepr):
     message_types: dict[str, Any]
 
     def arrays(self, topic: str) -> dict[str, Any]:
-        """The fields of a channel of flat messages (ours are), bit for bit as they were written.
+        """Return the fields of a channel of flat messages, such as ours, bit for bit as they were written.
 
-        By name: (n,) of a number, (n, width) of numbers, a list of arrays where the widths differ, a list of texts.
+        By name: (n,) numbers, (n, width) numbers, a list of arrays of different widths, or a list of texts.
         """
         if topic not in self.messages:
             raise UnknownNameError("topic", got=topic, known=self.messages)
@@ -131,19 +131,19 @@ class McapLog(ShowsItsRepr):
 
 
 def read_mcap(path: str | Path, *, links: bool = True) -> McapLog:
-    """Read everything in an MCAP file of protobuf channels, of at most 1 GiB, packed and unpacked.
+    """Read all content of an MCAP file of protobuf channels, of at most 1 GiB, packed and unpacked.
 
     Args:
-        path: the file; of this project's runs it is trace.mcap.
-        links: whether a link is followed, as where you name the file; not in a directory that somebody else made.
+        path: The file, for example trace.mcap of a run.
+        links: Whether to follow links. Use False for files in an untrusted directory.
 
     Returns:
-        The log; its times are in nanoseconds of simulated time, `arrays` gives a channel's fields as arrays.
+        The log. Its times are in nanoseconds of simulated time, and `arrays` returns a channel's fields as arrays.
 
     Raises:
-        ArtifactError: the file is missing, no plain file, cut short, unpacks to too much, a checksum (of chunks,
-            data section, summary, attachments) does not hold, or the schema of a channel does not decode. The message
-            names the file.
+        ArtifactError: The file is missing, not a regular file, truncated, or unpacks to too much, a checksum (of
+            chunks, data section, summary, attachments) is wrong, or a channel's schema cannot be decoded. The message
+            contains the path.
 
     Source:
         The format: https://mcap.dev/spec
@@ -158,19 +158,19 @@ def read_mcap(path: str | Path, *, links: bool = True) -> McapLog:
 
 
 def parse_mcap(data: bytes, name: str) -> McapLog:
-    """What the bytes of a file of that name hold; see `read_mcap`."""
+    """Parse the bytes of a file with that `name`; see `read_mcap`."""
     log = McapLog({}, {}, {}, {}, {})
     try:
         _collect(data, _check_crcs(data), log)
     except MemoryError:
         raise
-    except Exception as error:  # a damaged file makes the reader fail in many ways; none of them is ours
+    except Exception as error:  # a damaged file causes many kinds of errors in the reader
         raise ArtifactError(f"{name} is no whole MCAP file of this project: {type(error).__name__}: {error}") from error
     return log
 
 
 def fields_of(message: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """(name, value) of each number and text of a protobuf message: those of inner messages by path, lists by index."""
+    """Yield (name, value) of all numbers and texts of a protobuf message: nested messages by path, lists by index."""
     for described in message.DESCRIPTOR.fields:
         name = f"{path}.{described.name}" if path else described.name
         value, repeated = getattr(message, described.name), described.default_value == []
@@ -184,9 +184,9 @@ def fields_of(message: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def records(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """(opcode, body) of each record of a file, from its start; what chunks unpack to is checked before they are.
+    """Yield (opcode, body) of each record of a file; the unpacked size of chunks is checked before they are unpacked.
 
-    ValueError where that is too much, and at the end where the last record is cut short.
+    Raises ValueError if that size is too large, or at the end if the last record is truncated.
     """
     position, unpacked, most = len(MAGIC), 0, min(MOST_UNPACKED, PACKED_AT_MOST * len(data) + PACKED_APART)
     while position + RECORD.size <= len(data):
@@ -206,17 +206,17 @@ def records(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _unpacked_size(body: bytes, most: int) -> int:
-    """What a chunk says that it unpacks to; ValueError where that is more than `most`, or not what is packed in it."""
+    """Return the declared unpacked size of a chunk; raise ValueError if it exceeds `most` or is wrong."""
     chunk = kinds.Chunk.read(ReadDataStream(BytesIO(body)))
     if chunk.uncompressed_size > most:
         raise ValueError(f"it unpacks to {chunk.uncompressed_size} bytes, but at most {most} are read")
     if chunk.compression == "zstd":
         packed = zstandard.frame_content_size(chunk.data)
-        if packed not in (-1, chunk.uncompressed_size):  # -1: the frame does not say it, and no more is unpacked
+        if packed not in (-1, chunk.uncompressed_size):  # -1: not declared by the frame, and no more is unpacked
             raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes unpacks to {packed}")
     else:
         result: Any = chunk.data
-        if chunk.compression == "lz4":  # whose frames need not say it: unpacked as far as the chunk says, to be sure
+        if chunk.compression == "lz4":  # frames need not declare a size: unpack one byte more than the declared size
             result = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=chunk.uncompressed_size + 1)
         if len(result) != chunk.uncompressed_size:
             raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes has {len(result)}")
@@ -224,11 +224,11 @@ def _unpacked_size(body: bytes, most: int) -> int:
 
 
 def _check_crcs(data: bytes) -> int:
-    """Check the checksums of the data section and of the summary, and return where the summary begins.
+    """Check the checksums of the data section and of the summary, and return the summary's start.
 
-    Between them they cover every byte but the last magic.
+    Together they cover every byte except the last magic.
 
-    The format allows a file without them, the reader does not check them, and ours always has them.
+    The format permits files without them and the reader does not check them, but our files always have them.
     """
     if len(data) < len(MAGIC) + FOOTER.size or not data.endswith(MAGIC):
         raise ValueError("it does not end as an MCAP file does: it was cut short")
@@ -246,7 +246,7 @@ def _check_crcs(data: bytes) -> int:
 
 
 def _collect(data: bytes, summary_start: int, log: McapLog) -> None:
-    """Everything in the file, in one pass; what its own statistics say is too much is refused before that."""
+    """Read all content of the file in one pass, unless its own statistics exceed the limits."""
     reading = _Reading(log, _declared(data, summary_start))
     for opcode, body in _unpacked(data):
         if opcode == MESSAGE_OPCODE:
@@ -260,12 +260,12 @@ def _collect(data: bytes, summary_start: int, log: McapLog) -> None:
 
 
 class _Reading:
-    """Takes in the records of a file, one after the other."""
+    """The state of reading a file, record by record."""
 
     def __init__(self, log: McapLog, declared: int):
         self.log, self.declared, self.counted = log, declared, 0
         self.schemas: dict[int, Any] = {}
-        self.channels: dict[int, tuple[list[tuple[int, Any]], Any]] = {}  # the messages, and what decodes one
+        self.channels: dict[int, tuple[list[tuple[int, Any]], Any]] = {}  # messages of a channel, and their decoder
         self.decoders = DecoderFactory()
 
     def message(self, body: bytes) -> None:
@@ -292,11 +292,11 @@ class _Reading:
             self.log.attachments[attachment.name] = bytes(attachment.data)
         else:
             channel = kinds.Channel.read(stream)
-            if channel.id not in self.channels:  # the summary repeats them
+            if channel.id not in self.channels:  # the summary repeats the channels
                 self.channels[channel.id] = self._begin(channel)
 
     def _begin(self, channel: Any) -> tuple[list[tuple[int, Any]], Any]:
-        """Where the messages of a channel go, and what decodes one."""
+        """Return the list for the messages of a channel, and the decoder of a message."""
         topic, log = channel.topic, self.log
         if len(self.channels) >= MOST_CHANNELS:
             raise ValueError(f"it has more than {MOST_CHANNELS} channels")
@@ -311,18 +311,18 @@ class _Reading:
 
 
 def has_channels(data: bytes, encoding: str) -> bool:
-    """Whether a file has a channel whose messages have that encoding; what is damaged has none."""
+    """Return whether a file has a channel with this message encoding; False for a damaged file."""
     try:
         channels = (kinds.Channel.read(ReadDataStream(BytesIO(body))) for o, body in _unpacked(data) if o == CHANNEL)
         return any(channel.message_encoding == encoding for channel in channels)
-    except Exception:  # as in `parse_mcap`, which names the damage
+    except Exception:  # as in `parse_mcap`, which reports the damage
         return False
 
 
 def raw_messages(data: bytes, encoding: str) -> tuple[list[tuple[str, str, bytes]], dict[str, dict[str, str]]]:
-    """Topic, schema's name and bytes of all messages of an `encoding`, such as "cdr", and the metadata records.
+    """Return topic, schema name and bytes of all messages of an `encoding`, such as "cdr", and the metadata records.
 
-    No checksum but that of each chunk is looked at: other writers leave the rest out. ValueError where it is damaged.
+    Only the checksums of chunks are checked, since other writers omit the rest. Raises ValueError for a damaged file.
     """
     names, topics, rows, metadata = dict[int, str](), dict[int, tuple[str, str]](), [], dict[str, dict[str, str]]()
     for opcode, body in _unpacked(data):
@@ -342,7 +342,7 @@ def raw_messages(data: bytes, encoding: str) -> tuple[list[tuple[str, str, bytes
 
 
 def _unpacked(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Those of `records`, and in the place of each chunk what is in it."""
+    """Yield `records`, with the contents of each chunk in its place."""
     for opcode, body in records(data):
         if opcode != CHUNK:
             yield opcode, body
@@ -358,7 +358,7 @@ def _unpacked(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _declared(data: bytes, position: int) -> int:
-    """How many messages the statistics say there are, in the summary at `position`; ValueError if too many."""
+    """Return the number of messages in the statistics of the summary at `position`; raise ValueError if too large."""
     while position + RECORD.size <= len(data):
         opcode, length = RECORD.unpack_from(data, position)
         position += RECORD.size + length
@@ -376,7 +376,7 @@ def _declared(data: bytes, position: int) -> int:
 
 
 def _column(field: Any, values: list[Any], width: int) -> Any:
-    repeated = field.default_value == []  # `is_repeated` came with protobuf 6
+    repeated = field.default_value == []  # `is_repeated` was added in protobuf 6
     if field.cpp_type in (field.CPPTYPE_STRING, field.CPPTYPE_MESSAGE):
         return [list(value) if repeated else value for value in values]
     dtypes: dict[int, Any] = {field.CPPTYPE_INT64: np.int64, field.CPPTYPE_BOOL: np.bool_}

@@ -1,1 +1,1 @@
-"""HTML pages that open from a disk: their templates, the plots on them, and motions drawn by Drake's Meshcat."""
+"""HTML pages that open without a server: templates, plots, and motions drawn by Drake's Meshcat."""

@@ -1,9 +1,9 @@
-"""Pages of HTML that open from a disk and ask nothing of the network: data in, `templates/*.html.j2` around it.
+"""Write HTML pages that open without a server or a network, from data and `templates/*.html.j2`.
 
-Names from models, files and records are untrusted text. Templates escape whatever they print (autoescape), data for
-scripts is JSON that cannot close its script element, and only our own scripts and style sheets, from `assets/`, are
-marked as safe. The content policy of a page then lets the browser run those scripts alone, by their hashes, so that a
-script that got into the page all the same is refused.
+Names from models, files and records are untrusted text. Templates escape all values (autoescape), and data for scripts
+is JSON that cannot close its script element. Only our own scripts and style sheets in `assets/` are marked as safe. The
+content security policy of a page permits only these scripts, by their hashes, so the browser refuses any injected
+script.
 """
 
 import base64
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 SCRIPTS = ("uPlot.iife.min.js", "report.js")
-# Fields of a record that are not embedded: wall-clock times differ from run to run, and neither the hash of this page
-# nor the hash of the record that holds it can be in the page.
+# Fields of a record that are not embedded: wall-clock times differ between runs, and the page can contain neither its
+# own hash nor that of the record.
 APART = ("wall_clock", "files", "record_sha256")
 
 _SCRIPT = re.compile(r"<script(?![^>]*application/json)[^>]*>(.*?)</script>", re.DOTALL)
 _VIEW = re.compile(r'(?<= srcdoc=")[^"]*')
-COMMAND = re.compile(  # to the viewer of a scene
+COMMAND = re.compile(  # a command to the viewer of a scene
     r'fetch\("data:application/octet-binary;base64,([A-Za-z0-9+/=]*)"\)\s*\.then\(res => res\.arrayBuffer\(\)\)\s*'
     r"\.then\(buffer => viewer\.handle_command_bytearray\(new Uint8Array\(buffer\)\)\);\s*"
 )
@@ -59,18 +59,18 @@ class Plot:
     """One plot of `series` over `x`.
 
     Attributes:
-        title: What is plotted, as its heading.
+        title: The heading.
         unit: The unit of y.
-        x: (n,) where the series have their values.
-        series: The lines; a name shows in the legend.
-        axis: What x is: "time" [s] follows the slider, any other word is a label.
-        place: Where on the page: that of the template's macro `plots`.
-        group: What is shown together, one group at a time where a place has several; a group has one legend.
-        log: Whether y has a logarithmic scale; what is not above 0 is left out.
-        levels: Whether x are the few levels of something, each a tick on a logarithmic scale.
-        limits: The lower and upper limit of y, None or infinite where there is none: dashed, what is beyond is shaded.
-        percent: Whether to draw y as a part of its limit, where it has one on either side.
-        range: The range of y, where it is not to follow the data.
+        x: (n,) the positions of the values of the series.
+        series: The lines. Their names are shown in the legend.
+        axis: The quantity of x. "time" [s] follows the slider; any other word is a label.
+        place: The position on the page, as in the template's macro `plots`.
+        group: The name of a group of plots with one legend. A place with several groups shows one group at a time.
+        log: Whether y has a logarithmic scale. Values that are not positive are omitted.
+        levels: Whether x are a few discrete levels, each with a tick on a logarithmic scale.
+        limits: The lower and upper limit of y, or None or infinity. They are dashed, and the area beyond is shaded.
+        percent: Whether to draw y relative to its limit, if it has a limit on either side.
+        range: The range of y, if it does not follow the data.
         marks: "lines", "points" or "both".
         band: Whether to shade between the last two series.
         note: A remark below the plot.
@@ -93,19 +93,19 @@ class Plot:
     note: str = ""
 
 
-ENTRY = {"derivative": 9, "difference": 9, "tolerance": 2, "noticeable": 2}  # what is told of one, in so many digits
-MOST_POINTS = 1200  # of a plot: of a longer one the lowest and highest of each stretch are kept
-MOST_ENTRIES = 500  # of a certificate, whose numbers are in the page; of a larger one those nearest to failing
+ENTRY = {"derivative": 9, "difference": 9, "tolerance": 2, "noticeable": 2}  # numbers of an entry, and their digits
+MOST_POINTS = 1200  # of a plot; the minimum and maximum of each stretch of a longer plot are drawn
+MOST_ENTRIES = 500  # of a certificate in a page; for a larger certificate, the entries that are closest to failing
 
 
 def page_data(duration: float, plots: Iterable[Plot], certificates: Iterable[Certificate] = ()) -> dict[str, Any]:
-    """All that `report.js` draws, for JSON: `plots` and a heat map of each of `certificates`, over `duration` [s]."""
+    """Return the data of `report.js` for JSON: `plots`, and a heat map of each certificate, over `duration` [s]."""
     maps = [_map_of(c) for c in certificates]
     return {"duration": duration, "plots": [_drawn(p) for p in plots], "certificates": maps, "verdicts": list(VERDICTS)}
 
 
 def _drawn(plot: Plot) -> dict[str, Any]:
-    """A plot for JSON, `points` of how many its series have; what is left out lies within what is drawn."""
+    """Convert a plot to JSON with at most MOST_POINTS points; `points` is the original number."""
     x, ys = numbers(plot.x), [numbers(line.y) for line in plot.series]
     retained = _points_to_draw(ys, len(x)) if plot.marks == "lines" else range(len(x))
     series = [{**vars(line), "y": [y[i] for i in retained]} for line, y in zip(plot.series, ys, strict=True)]
@@ -114,7 +114,7 @@ def _drawn(plot: Plot) -> dict[str, Any]:
 
 
 def _points_to_draw(ys: Sequence[Sequence[float | None]], count: int) -> Sequence[int]:
-    """Which of `count` points to draw, MOST_POINTS at most: both ends, and each series' extremes in every stretch."""
+    """Return the indices of up to MOST_POINTS of `count` points: both ends, and each series' extremes per stretch."""
     stretches = MOST_POINTS // (2 * max(1, len(ys)) + 1)
     if count <= MOST_POINTS:
         return range(count)
@@ -123,12 +123,12 @@ def _points_to_draw(ys: Sequence[Sequence[float | None]], count: int) -> Sequenc
     for start, end in pairwise(ends):
         for y in ys:
             known = [(value, i) for i, value in enumerate(y[start:end], start) if value is not None]
-            retained |= {min(known)[1], max(known)[1]} if known else {start}  # a gap stays one
+            retained |= {min(known)[1], max(known)[1]} if known else {start}  # keep gaps
     return sorted(retained)
 
 
 def _map_of(c: Certificate) -> dict[str, Any]:
-    """A certificate for JSON: all verdicts, and the numbers of the entries `told`, by their index, worst first."""
+    """Convert a certificate to JSON: all verdicts, and the numbers of the entries with indices `told`, worst first."""
     codes = c.codes.ravel()
     gap = np.abs(c.difference - c.derivative).ravel() / np.maximum(c.tolerance.ravel(), 1e-300)
     gap = np.nan_to_num(gap, nan=np.inf, posinf=np.inf)
@@ -146,33 +146,33 @@ def _map_of(c: Certificate) -> dict[str, Any]:
 
 
 def _pooled(data: Mapping[str, Any]) -> dict[str, Any]:
-    """`data` for the page, in which each x stands once, in `xs`, and plots say which it is."""
+    """Return `data` with each distinct x only once, in `xs`, and with the index of its x in each plot."""
     xs: dict[tuple[Any, ...], int] = {}
     plots = [{**plot, "x": xs.setdefault(tuple(plot["x"]), len(xs))} for plot in data.get("plots", ())]
     return {**data, "plots": plots, "xs": [list(x) for x in xs]}
 
 
 def numbers(values: Iterable[Any], digits: int = 8) -> list[float | None]:
-    """`values` with so many digits (a screen shows fewer than eight); None where there is no finite one."""
+    """Round `values` to significant digits (a screen shows fewer than eight); non-finite values become None."""
     return [float(f"{v:.{digits}g}") if v is not None and math.isfinite(v) else None for v in values]
 
 
 def write_page(
     path: Path, template: str, *, record: Mapping[str, Any], data: Mapping[str, Any], view: str = "", **facts: Any
 ) -> None:
-    """Render one page and write it.
+    """Render a page and write it.
 
     Args:
         path: The file to write.
-        template: A name in `templates/`, of one that extends base.html.j2.
-        record: The record of what the page shows, as plain data. A reader can download it from the page, without the
+        template: The name of a file in `templates/` that extends base.html.j2.
+        record: The record of the page's subject, as plain data. Readers can download it from the page, without the
             fields `APART`.
-        data: What `report.js` draws: see `page_data`.
-        view: The page of the replay (see `meshcat.write_replay`), shown in a frame; "" where the page has no motion.
-        facts: What else the template asks for.
+        data: The data of `report.js`; see `page_data`.
+        view: The page of the replay (see `meshcat.write_replay`), shown in a frame, or "" without a motion.
+        facts: Other values of the template.
 
     Raises:
-        jinja2.UndefinedError: If the template asks for a name that is not there.
+        jinja2.UndefinedError: The template uses a missing name.
     """
     write_whole(path, _page(template, record, _pooled(data), view, facts).encode())
 
@@ -191,9 +191,9 @@ def _page(template: str, record: Mapping[str, Any], pooled: Mapping[str, Any], v
 
 
 def page_again(path: Path, template: str, *, record: Mapping[str, Any], view: str = "", **facts: Any) -> bytes:
-    """What `write_page` writes of `record` and `view`, with the plots that the page at `path` has.
+    """Return what `write_page` writes for `record` and `view`, with the plots of the page at `path`.
 
-    ArtifactError where that has none, or the template cannot have such a record.
+    Raises ArtifactError if that page has no plots, or the template does not accept the record.
     """
     from jinja2 import TemplateError
 
@@ -205,22 +205,22 @@ def page_again(path: Path, template: str, *, record: Mapping[str, Any], view: st
 
 
 def content_policy(page: str) -> str:
-    """The meta element that lets exactly the scripts in `page` run, and lets nothing be fetched."""
+    """Return a meta element that permits exactly the scripts in `page`, and no network access."""
     return render("content_policy.html.j2", hashes=script_hashes(page))
 
 
 def script_hashes(*pages: str) -> list[str]:
-    """SHA-256 in base64 of every script in `pages`, as a content policy names them; JSON is no script."""
+    """Return the SHA-256 hashes in base64 of all scripts in `pages` for a content policy; JSON is not a script."""
     scripts = dict.fromkeys(script for page in pages for script in _SCRIPT.findall(page) if script)
     return [base64.b64encode(sha256(script.encode()).digest()).decode() for script in scripts]
 
 
 @dataclass(frozen=True)
 class PagePieces:
-    """A page by what it consists of, the page of a replay in it included.
+    """The parts of a page, including the page of a replay in it.
 
-    `text` has all but the `scripts`, and hashes of these, which a content policy has; `scene` are the commands to a
-    viewer that the scripts have, in base64.
+    `text` is everything except the `scripts`, with the scripts' hashes in the content policy replaced by their numbers.
+    `scene` are the commands to a viewer in the scripts, in base64.
     """
 
     text: str
@@ -229,7 +229,7 @@ class PagePieces:
 
 
 def pieces_of(page: str) -> PagePieces:
-    """A page in pieces, any text being a page."""
+    """Split a page into its parts; any text is accepted."""
     views = [html.unescape(view) for view in _VIEW.findall(page)]
     inner = [pieces_of(view) for view in views]
     hashes = {name: f"script {i}" for i, name in enumerate(script_hashes(*views, page))}
@@ -244,12 +244,12 @@ def pieces_of(page: str) -> PagePieces:
 
 
 def asset(name: str) -> str:
-    """The text of one of our own scripts or style sheets."""
+    """Return the text of one of our own scripts or style sheets."""
     return files("drake_diff.pages").joinpath("assets", name).read_text(encoding="utf-8")
 
 
 def render(template: str, **values: Any) -> str:
-    """A template with `values` in it, each escaped; a name that is missing is an error, not an empty place."""
+    """Render a template with `values`, which are escaped; a missing name is an error."""
     return _environment().get_template(template).render(values)
 
 
@@ -261,7 +261,7 @@ def _environment() -> "Environment":
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    # tojson writes <, >, & and ' as \u003c and so on: no text can end the script element that it is in.
+    # tojson writes <, >, & and ' as \u003c and so on, so that no text can close its script element.
     environment.policies["json.dumps_kwargs"] = {"sort_keys": True, "allow_nan": False, "separators": (",", ":")}
     environment.filters["worst_first"] = worst_first
     environment.filters.update(short=short_number, words=in_words, phrase=phrase, unit=unit_of, shell=shlex.join)
@@ -270,7 +270,7 @@ def _environment() -> "Environment":
 
 
 def worst_first(measures: list[Any]) -> list[Any]:
-    """Measures of a record: failed, undecided and passed ones, each from the largest excess down, and then the rest."""
+    """Sort the measures of a record: failed, undecided, and passed ones, each by decreasing excess, then all others."""
 
     def used(measure: Any) -> float:
         value, bound = measure["value"], measure["tolerance"]
@@ -287,22 +287,22 @@ def worst_first(measures: list[Any]) -> list[Any]:
 
 
 def phrase(key: str) -> str:
-    """A field's name as words."""
+    """Convert the name of a field to words."""
     return str(key).replace("_", " ")
 
 
 def short_number(value: float | None, digits: int = 6) -> str:
-    """A number with so many significant digits; a dash where there is none."""
+    """Format a number with `digits` significant digits, or None as a dash."""
     return "–" if value is None else f"{value:.{digits}g}"
 
 
 def unit_of(unit: str) -> str:
-    """A unit for a reader: nothing for pure numbers."""
+    """Format a unit for printing; pure numbers have no unit."""
     return " or ".join(piece for piece in unit.split(" or ") if piece != "1")
 
 
 def in_words(value: Any, digits: int = 6) -> str:
-    """Anything of a record in one line."""
+    """Format any value of a record on one line."""
     if isinstance(value, dict):
         return ", ".join(f"{phrase(k)} {in_words(v, digits)}" for k, v in value.items())
     if isinstance(value, list):

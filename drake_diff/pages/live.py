@@ -1,8 +1,8 @@
-"""A search as it goes on, for browsers on this machine alone: Drake's Meshcat beside plots of cost and violation.
+"""Show a running search to browsers on this machine: Drake's Meshcat, and plots of cost and violation.
 
-Drake lets only the thread that made a Meshcat use it, and ends the process where another one lets it go. So one thread
-makes one Meshcat, draws whatever it is given, and stays until the process ends. It draws the latest scene alone: a
-browser that is slow, or gone, keeps nobody waiting.
+Only the thread that created a Meshcat may use it, and the process ends if another thread deletes it. Therefore one
+thread creates one Meshcat, draws all scenes, and runs until the process ends. It draws only the latest scene, so a slow
+or closed browser does not delay the search.
 """
 
 import json
@@ -25,8 +25,8 @@ from drake_diff.pages.meshcat import Stills, draw
 from drake_diff.pages.scene import Scene
 
 HOST = "127.0.0.1"
-PATIENCE = 5.0  # [s] that a search which has ended waits until its motion is drawn
-GROUND = Rgba(0.867, 0.882, 0.902, 1)  # as on other pages: most robots are grey
+PATIENCE = 5.0  # [s] longest time for which a finished search waits until its motion is drawn
+GROUND = Rgba(0.867, 0.882, 0.902, 1)  # as on other pages, because most robots are grey
 ASSETS = {
     "uPlot.iife.min.js": "text/javascript",
     "live.js": "text/javascript",
@@ -38,13 +38,13 @@ POLICY = "default-src 'self'; img-src data:; object-src 'none'; base-uri 'none';
 
 
 class LivePage:
-    """The page of this process; it shows one search at a time, the last that was begun."""
+    """The page of this process, which shows the search that was begun last."""
 
     def __init__(self) -> None:
         self.process, self._changed = os.getpid(), threading.Condition()
         self._number, self._rows, self._told = 0, list[list[float | None]](), dict[str, Any]()
-        self._starts = list[int]()  # which rows are the first of a solver's own table
-        self._next: tuple[int, Scene, bool] | None = None  # the number of its search, and whether it is the end's
+        self._starts = list[int]()  # indices of the rows that begin a solver's table
+        self._next: tuple[int, Scene, bool] | None = None  # the number of its search, and whether it is the final scene
         self._drawing, self.viewer, self._begun = False, "", 0.0
         made = threading.Event()
         threading.Thread(target=self._draw, args=[made], name="drake_diff live view", daemon=True).start()
@@ -54,16 +54,16 @@ class LivePage:
 
     @property
     def address(self) -> str:
-        """What a browser on this machine opens."""
+        """The address for a browser on this machine."""
         return f"http://{HOST}:{self._server.server_port}/"
 
     @property
     def is_busy(self) -> bool:
-        """Whether a scene waits to be drawn, or is drawn."""
+        """Whether a scene is being drawn or waits to be drawn."""
         return self._next is not None or self._drawing
 
     def viewer_page(self) -> str:
-        """Meshcat's page for our frame: from here, so that our slider reaches into it, and connected to Meshcat."""
+        """Return Meshcat's page, connected to Meshcat; this server serves it, so that our slider can access it."""
         with urlopen(self.viewer, timeout=10) as answer:
             page = str(answer.read().decode())
         there = self.viewer.rstrip("/") + "/"
@@ -71,9 +71,9 @@ class LivePage:
         return page.replace("<head>", f'<head><base href="{there}"><script>WebSocket = {socket};</script>', 1)
 
     def begin(self, title: str, colours: Sequence[tuple[str, str, str]]) -> int:
-        """Show another search from now on; the number that tells its scenes and rows from those of others.
+        """Show another search; return the number that identifies its scenes and rows.
 
-        `colours` are the legend: a colour of CSS, "line", "dot" or "arrow", and what it means.
+        `colours` is the legend: a CSS colour, "line", "dot" or "arrow", and the meaning.
         """
         with self._changed:
             self._number += 1
@@ -82,14 +82,14 @@ class LivePage:
             return self._number
 
     def show(self, number: int, scene: Scene, *, end: bool = False) -> None:
-        """Draw some states of `scene` at once, or at the `end` all of it, to be played."""
+        """Draw some states of `scene` at the same time, or at the `end` all of it as an animation."""
         with self._changed:
             if number == self._number:
                 self._next = number, scene, end
                 self._changed.notify_all()
 
     def add(self, number: int, iteration: int, cost: float, violation: float) -> None:
-        """A row of the solver's table."""
+        """Add a row of the solver's table."""
         with self._changed:
             if number == self._number:
                 if iteration <= self._told.get("iteration", iteration):
@@ -98,7 +98,7 @@ class LivePage:
                 self._told["iteration"] = iteration
 
     def tell(self, number: int, **facts: Any) -> None:
-        """State, message, the last line of progress, and a verdict when it ends."""
+        """Set the state, the message, the last line of progress, or the verdict at the end."""
         with self._changed:
             if number == self._number:
                 if "verdict" in facts:
@@ -106,12 +106,12 @@ class LivePage:
                 self._told |= facts
 
     def wait(self, seconds: float | None = None) -> bool:
-        """Until all that was given is drawn, but for PATIENCE at most where no `seconds` are given; whether it is."""
+        """Wait up to `seconds`, by default PATIENCE, until everything is drawn; return whether it is."""
         with self._changed:
             return self._changed.wait_for(lambda: not self.is_busy, PATIENCE if seconds is None else seconds)
 
     def news(self, number: int, known: int) -> dict[str, Any]:
-        """What a page is told that knows `known` rows of the search `number`."""
+        """Return the news for a page that has `known` rows of the search `number`."""
         with self._changed:
             first = known if number == self._number else 0
             facts = {"number": self._number, "first": first, "rows": self._rows[first:], "starts": [*self._starts]}
@@ -127,7 +127,7 @@ class LivePage:
             paved = [replace(s, colour=GROUND) if isinstance(s.shape, HalfSpace) else s for s in scene.shapes]
             scene = replace(scene, shapes=tuple(paved))
             try:
-                with np.errstate(over="ignore", invalid="ignore"):  # of motions that leave every finite number
+                with np.errstate(over="ignore", invalid="ignore"):  # diverged motions
                     if end:
                         stills = None
                         meshcat.Delete()
@@ -138,14 +138,14 @@ class LivePage:
                         stills = number, Stills(meshcat, scene)
                     else:
                         stills[1].show(scene)
-            except Exception as error:  # whatever Drake says of a shape: the search is not to end by it
+            except Exception as error:  # any error of Drake about a shape; the search continues
                 self.tell(number, line=f"the motion cannot be drawn: {type(error).__name__}: {error}")
             with self._changed:
                 self._drawing = False
                 self._changed.notify_all()
 
     def _taken(self) -> tuple[int, Scene, bool]:
-        """What is to be drawn next, when there is something."""
+        """Wait for the next scene to draw, and return it."""
         with self._changed:
             while self._next is None:
                 self._changed.wait()
@@ -153,14 +153,14 @@ class LivePage:
             return result
 
 
-_PAGES: list[LivePage] = []  # one at most
+_PAGES: list[LivePage] = []  # at most one
 _MAKING = threading.Lock()
 
 
 def live_page() -> LivePage:
-    """The page of this process, made when it is first asked for: a tab that shows one search shows the next one too."""
+    """Return the page of this process; it is created once, so an open tab also shows the next search."""
     with _MAKING:
-        if not _PAGES or _PAGES[0].process != os.getpid():  # a fork has none of the threads
+        if not _PAGES or _PAGES[0].process != os.getpid():  # a fork does not have the threads
             _PAGES[:] = [LivePage()]
         return _PAGES[0]
 
@@ -173,7 +173,7 @@ class _Server(ThreadingHTTPServer):
         super().__init__((HOST, 0), _Handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        if not isinstance(sys.exception(), ConnectionError):  # a browser that was closed is no error
+        if not isinstance(sys.exception(), ConnectionError):  # a closed browser is not an error
             super().handle_error(request, client_address)
 
 
@@ -183,7 +183,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         port = self.server.server_port
         if self.headers.get("Host") not in (f"{HOST}:{port}", f"localhost:{port}"):
-            self.send_error(403)  # a stranger's page whose name leads here
+            self.send_error(403)  # a foreign page whose host name resolves to this server
             return
         asked = urlsplit(self.path)
         name = asked.path[1:]
@@ -216,4 +216,4 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(data)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """A page that asks for news twice a second is nothing to tell."""
+        """Do nothing: a page asks for news twice a second."""

@@ -1,4 +1,4 @@
-"""A motion drawn and animated by Drake's own Meshcat: as one offline HTML page, or live."""
+"""Draw and animate a motion with Drake's own Meshcat, as an offline HTML page or live."""
 
 import html
 import logging
@@ -31,25 +31,25 @@ from drake_diff.pages.html import COMMAND, asset, content_policy
 from drake_diff.pages.scene import ARROW_PART, SMALLEST_SIZE, Force, Poses, Scene
 from drake_diff.pages.shapes import Drawn
 
-# Drake prints the port that it listens on, but nobody is meant to connect to it.
+# Drake prints the port of the server, but nobody is meant to connect to it.
 logging.getLogger("drake").addFilter(lambda record: "Meshcat listening" not in record.getMessage())
 
 VIEWPORT = '<meta name="viewport" content="width=device-width, initial-scale=1">'
 FRAMES_PER_SECOND = 64.0
-MOST_POSES = 6000  # of all bodies in all frames, at 140 bytes each: between two frames the viewer interpolates
+MOST_POSES = 6000  # of all bodies in all frames, at 140 bytes each; the viewer interpolates between frames
 FEWEST_FRAMES = 60
 REPETITIONS = 5
 RED, TRAIL, VIOLET = Rgba(0.85, 0.2, 0.1, 1), Rgba(0.93, 0.55, 0.1, 1), Rgba(0.62, 0.24, 0.85, 1)
 LINES = Rgba(0.72, 0.75, 0.79, 1)
 WORLD = "world"
-TOP, BOTTOM = [0.86, 0.89, 0.93], [0.97, 0.97, 0.98]  # of the background; replay.js has them, and those of the dark
-LONGEST = 3.0  # times the arrow of the reference force: longer ones are cut, as an impact is a hundred times a weight
-THICKNESS = 0.003  # of the scene's size: the radius of the trail and of an arrow's shaft
-FIELD_OF_VIEW = np.deg2rad(75.0)  # Meshcat's camera, from top to bottom
-ASPECT = 1.1  # width over height of the picture in a report: on a phone it is wider
-FILLED = 0.9  # of the picture, by what is drawn
-# Meshcat's own lamps are 2.5 m from the origin: far from it all is dark, and beside them white. These shine alike
-# everywhere; the light of a point is divided by the square of its distance.
+TOP, BOTTOM = [0.86, 0.89, 0.93], [0.97, 0.97, 0.98]  # of the background; replay.js repeats them, with dark ones
+LONGEST = 3.0  # in lengths of the reference arrow: longer arrows are cut, since an impact is a hundred times a weight
+THICKNESS = 0.003  # radius of the trail and of an arrow's shaft, relative to the scene's size
+FIELD_OF_VIEW = np.deg2rad(75.0)  # of Meshcat's camera, from top to bottom
+ASPECT = 1.1  # width over height of the picture in a report; it is larger on a phone
+FILLED = 0.9  # part of the picture that the drawn objects fill
+# Meshcat's own lamps are 2.5 m from the origin: objects far from it are dark, and objects near it white. These lamps
+# give the same light everywhere; Meshcat divides the light of a point by the square of its distance.
 FAR = 1e3  # [m]
 LIGHTS: dict[str, dict[str, Any]] = {
     "AmbientLight": {"intensity": 1.0},
@@ -61,7 +61,7 @@ LIGHTS: dict[str, dict[str, Any]] = {
 
 
 def write_replay(path: Path, scene: Scene, *, title: str = "") -> None:
-    """Write `scene` as one page that opens without a network, plays the motion, and can be paused and moved.
+    """Write `scene` as a page that works offline and plays the motion, with pause and camera control.
 
     Forces are arrows (see `Scene.reference_of`), ghosts are translucent, and the trail is a line.
     """
@@ -71,7 +71,7 @@ def write_replay(path: Path, scene: Scene, *, title: str = "") -> None:
 
 
 def replay_again(page: str, title: str) -> bytes:
-    """What `write_replay` writes with that title of the scene in `page`, whatever else is in it."""
+    """Return the page of `write_replay` with `title` for the scene in `page`, without any other content of it."""
     meshcat = Meshcat(MeshcatParams(host="127.0.0.1", show_stats_plot=False))
     meshcat.SetProperty("/Grid", "visible", False)
     before, *_, after = COMMAND.split(meshcat.StaticHtml())
@@ -88,12 +88,12 @@ def _titled(page: str, title: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Arrows:
-    """Arrows of forces below the path `root`: `slots` of them, of which a step shows as many as it has forces."""
+    """Force arrows below the path `root`: `slots` arrows, of which each step shows as many as it has forces."""
 
     root: str
     steps: Sequence[Sequence[Force]]
     colour: Rgba
-    longest: float  # [m] the arrow of `reference`
+    longest: float  # [m] length of the arrow of `reference`
     reference: float  # [N]
 
     @property
@@ -101,7 +101,7 @@ class _Arrows:
         return max((len(step) for step in self.steps), default=0)
 
     def make(self, meshcat: Meshcat, radius: float) -> None:
-        """Each along +z from its point, one metre long until it is scaled."""
+        """Create the arrows along +z from their points, with a length of one metre until they are scaled."""
         for slot in range(self.slots):
             path = f"{self.root}/{slot}"
             meshcat.SetObject(f"{path}/point", Sphere(2 * radius), self.colour)
@@ -112,7 +112,7 @@ class _Arrows:
             meshcat.SetTransform(f"{path}/tip/cone", RigidTransform(turned, [0.0, 0.0, 4 * radius]))
 
     def show_step(self, meshcat: Meshcat, k: int, time: float | None) -> None:
-        """The forces in the step from state k, or in the last step."""
+        """Show the forces in the step that starts at state k, or in the last step."""
         step = self.steps[min(k, len(self.steps) - 1)] if self.steps else ()
         pushing = [item for item in step if np.linalg.norm(item.force) > 0]
         for slot in range(self.slots):
@@ -127,26 +127,26 @@ class _Arrows:
             meshcat.SetProperty(path, "visible", used, time_in_recording=time)
 
 
-STILLS = 7  # of a motion that is searched for: so many of its states are seen at once
-FAINT = 0.22  # how opaque they are, but for the last one
-ASIDE = 0.03  # of its size: so far a motion may leave what the camera has in view, which looks anew where it is further
-SMALLER = 0.5  # or where the motion is so much smaller
+STILLS = 7  # number of states of a changing motion that are shown at the same time
+FAINT = 0.22  # opacity of these states, except the last one
+ASIDE = 0.03  # excess of the motion over the view, relative to its size, above which the camera moves
+SMALLER = 0.5  # relative size of the motion below which the camera moves
 
 
 def stills_of(count: int) -> list[int]:
-    """Which of `count` states are seen at once: the first, the last, and others evenly between them."""
+    """Return the indices of the shown states: the first, the last, and others evenly between them."""
     return sorted({round(k * (count - 1) / (STILLS - 1)) for k in range(STILLS)})
 
 
 class Stills:
-    """A motion that changes while it is searched for: some of its states at once, the last of them solid.
+    """A motion that changes during a search: some of its states at the same time, the last of them opaque.
 
-    All that `meshcat` shows is taken away first. The shapes are those of the first scene.
+    Everything in `meshcat` is deleted first. The shapes are those of the first scene.
     """
 
     def __init__(self, meshcat: Meshcat, scene: Scene):
         self.meshcat, self.shapes, self.framed = meshcat, scene.shapes, scene
-        self.made = {"contacts": 0, "thrusts": 0}  # arrows
+        self.made = {"contacts": 0, "thrusts": 0}  # number of arrows
         meshcat.Delete()
         for name in [f"stills/{i}" for i in range(STILLS - 1)]:
             for k, drawn in enumerate(scene.shapes):
@@ -161,18 +161,18 @@ class Stills:
 
     @property
     def size(self) -> float:
-        """[m] of what the camera has in view."""
+        """[m] the size of the view."""
         return self.framed.size
 
     def show(self, scene: Scene) -> None:
-        """Put the shapes where `scene` has them."""
+        """Move the shapes to their poses in `scene`."""
         places = stills_of(len(scene.times))
         (low, high), (least, most) = scene.box, self.framed.box
         if max(np.max(least - low), np.max(high - most)) > ASIDE * self.size or scene.size < SMALLER * self.size:
             self.framed = scene
             _look_at(self.meshcat, scene)
         for path in {drawn.body for drawn in (*self.shapes, *scene.marks)} & scene.poses.keys():
-            for i in range(STILLS - 1):  # of a motion with fewer states, several at one place
+            for i in range(STILLS - 1):  # several stills coincide if the motion has fewer states
                 self.meshcat.SetTransform(f"stills/{i}/{path}", scene.poses[path][places[min(i, len(places) - 1)]])
             self.meshcat.SetTransform(f"motion/{path}", scene.poses[path][-1])
         for i, mark in enumerate(scene.marks):
@@ -199,7 +199,7 @@ def _arrows_of(root: str, steps: Sequence[Sequence[Force]], colour: Rgba, scene:
 def draw(meshcat: Meshcat, scene: Scene) -> None:
     """Draw `scene` and publish its animation."""
     _draw_shapes(meshcat, scene)
-    level = {  # marks that go with a body, and do not turn with it
+    level = {  # marks that move with a body, but do not rotate with it
         str(i): [RigidTransform(pose @ mark.origin) for pose in scene.poses[mark.body]]
         for i, mark in enumerate(scene.marks)
         if mark.origin is not None
@@ -219,7 +219,7 @@ def draw(meshcat: Meshcat, scene: Scene) -> None:
     for time, k in frames:
         _show_state(meshcat, motions, arrows, k, time)
     meshcat.StopRecording()
-    _show_state(meshcat, motions, arrows, 0, None)  # what is seen before play
+    _show_state(meshcat, motions, arrows, 0, None)  # the state before playback
     animation = meshcat.get_mutable_recording()
     animation.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
     animation.set_repetitions(REPETITIONS)
@@ -229,28 +229,28 @@ def draw(meshcat: Meshcat, scene: Scene) -> None:
 
 
 def _draw_shapes(meshcat: Meshcat, scene: Scene) -> None:
-    """The robot and its ghosts, goals and obstacles, each on its body. A page's bytes are those of this order."""
+    """Draw the robot, its ghosts, goals and obstacles on their bodies. The order determines the bytes of a page."""
     for i, drawn in enumerate(scene.shapes):
-        name = f"ground{i}" if isinstance(drawn.shape, HalfSpace) else str(i)  # replay.js paints the former
+        name = f"ground{i}" if isinstance(drawn.shape, HalfSpace) else str(i)  # replay.js colours the ground
         _draw_shape(meshcat, f"motion/{drawn.body or WORLD}/{name}", drawn, drawn.colour, scene.size)
         for ghost in scene.ghosts:
             if drawn.body in ghost.poses:
                 _draw_shape(meshcat, f"{ghost.name}/{drawn.body}/{i}", drawn, ghost.colour, scene.size)
     for i, mark in enumerate(scene.marks):
-        kind = "above" if mark.above else "mark"  # replay.js draws the former through all else
+        kind = "above" if mark.above else "mark"  # replay.js draws "above" in front of everything
         path = f"motion/{mark.body or WORLD}/{kind}{i}" if mark.origin is None else f"level/{i}/{kind}"
         _draw_shape(meshcat, path, mark, mark.colour, scene.size)
 
 
 def frames_of(times: Array, most: int = MOST_POSES) -> list[tuple[float, int]]:
-    """(time, index of the state) of `most` frames or fewer, evenly apart, the first and the last state included."""
+    """Return (time, index of the state) of at most `most` evenly spaced frames, including the first and last state."""
     steps = len(times) - 1
     count = min(steps, max(1, int(np.ceil(times[-1] * FRAMES_PER_SECOND))), most)
     return [(float(times[-1]) * k / count, round(k * steps / count)) for k in range(count + 1)]
 
 
 def _draw_shape(meshcat: Meshcat, path: str, drawn: Drawn, colour: Rgba, size: float) -> None:
-    """Transparency is in the colour: a property set later does not reach a static page's objects."""
+    """Draw a shape; transparency is in the colour, since later properties do not affect objects of a static page."""
     shape, pose = drawn.shape, drawn.pose
     if isinstance(shape, HalfSpace):
         side = 20 * size
@@ -258,14 +258,14 @@ def _draw_shape(meshcat: Meshcat, path: str, drawn: Drawn, colour: Rgba, size: f
     if isinstance(shape, Triangles):
         _draw_triangles(meshcat, path, shape, colour)
     elif isinstance(shape, Mesh) and colour.a() < 1:
-        meshcat.SetTriangleMesh(path, *_hull(shape), colour)  # a mesh has colours of its own, its hull has none
+        meshcat.SetTriangleMesh(path, *_hull(shape), colour)  # a mesh has its own colours, its hull does not
     else:
         meshcat.SetObject(path, shape, colour)
     meshcat.SetTransform(path, pose)
 
 
 def _draw_triangles(meshcat: Meshcat, path: str, mesh: Triangles, colour: Rgba) -> None:
-    """A mesh in its own colours, or in `colour` where it has none; its hull where that is translucent."""
+    """Draw a mesh in its own colours, or in `colour` if it has none; draw its hull if `colour` is translucent."""
     if colour.a() < 1:
         try:
             hull = hull_of(mesh.vertices, path)
@@ -278,7 +278,7 @@ def _draw_triangles(meshcat: Meshcat, path: str, mesh: Triangles, colour: Rgba) 
 
 
 def _hull(shape: Mesh) -> tuple[Array, Any]:
-    """Vertices (3, n) and triangles (3, m) of a mesh's convex hull."""
+    """Return the vertices (3, n) and triangles (3, m) of a mesh's convex hull."""
     hull = shape.GetConvexHull()
     corners = [
         [hull.element(e).vertex(0), hull.element(e).vertex(i), hull.element(e).vertex(i + 1)]
@@ -289,7 +289,7 @@ def _hull(shape: Mesh) -> tuple[Array, Any]:
 
 
 def _draw_tube(meshcat: Meshcat, path: str, points: Array, radius: float) -> bool:
-    """A line along `points` (n, 3) thick enough to be seen, which a browser's own lines are not; if it has a length."""
+    """Draw a tube along `points` (n, 3), as browsers only draw thin lines; return False if it has no length."""
     apart = np.append(True, np.linalg.norm(np.diff(points, axis=0), axis=1) > radius / 10)
     points = points[apart]
     if len(points) < 2:
@@ -312,14 +312,14 @@ def _draw_tube(meshcat: Meshcat, path: str, points: Array, radius: float) -> boo
 
 
 def _only(poses: Poses, shaped: set[str]) -> Poses:
-    """Of the bodies that have a shape."""
+    """Return the poses of the bodies that have a shape."""
     return {path: result for path, result in poses.items() if path in shaped}
 
 
 def _show_state(
     meshcat: Meshcat, motions: Mapping[str, Poses], arrows: Sequence[_Arrows], k: int, time: float | None
 ) -> None:
-    """Bodies and ghosts as in state k, and the forces of the step from there."""
+    """Show bodies and ghosts in state k, and the forces of the step that starts there."""
     for root, poses in motions.items():
         for path, result in poses.items():
             meshcat.SetTransform(f"{root}/{path}", result[k], time_in_recording=time)
@@ -328,10 +328,10 @@ def _show_state(
 
 
 def camera_of(scene: Scene) -> tuple[Array, Array]:
-    """Where the camera is, and what it looks at, (3,) each [m]: so near that what is drawn fills the picture."""
+    """Return the camera's position and target, (3,) each [m], such that the drawn objects fill the picture."""
     low, high = scene.box
     flat = high - low < 0.35 * np.max(high - low)
-    view = np.array([0.6, -0.9, 0.45])  # at an angle, or onto the motion's plane where it has one
+    view = np.array([0.6, -0.9, 0.45])  # oblique, or onto the plane of a planar motion
     if flat[0] or flat[1]:
         view = np.array([0.15, -1.0, 0.25] if flat[1] else [1.0, -0.15, 0.25])
     view /= np.linalg.norm(view)
@@ -343,12 +343,12 @@ def camera_of(scene: Scene) -> tuple[Array, Array]:
     half = FILLED * np.tan(FIELD_OF_VIEW / 2) * np.array([ASPECT, 1.0])
 
     def distance(centred: Array) -> float:
-        """How far away balls at these places in the picture are in view."""
+        """Return the camera distance at which balls at these places in the picture are visible."""
         reach = (np.abs(centred[:, :2]) + radii[:, None]) / half
         nearest = SMALLEST_SIZE / 2 / np.tan(FIELD_OF_VIEW / 2)
         return max(float(np.max(centred[:, 2] + np.max(reach, axis=1))), nearest)
 
-    for _ in range(3):  # what is in the middle of the picture depends on how far away the camera is
+    for _ in range(3):  # the middle of the picture depends on the camera's distance
         centred = (centres - target) @ axes.T
         back = distance(centred)
         depth = np.maximum(back - centred[:, 2], 1e-6)[:, None]
@@ -359,7 +359,7 @@ def camera_of(scene: Scene) -> tuple[Array, Array]:
 
 
 def _look_at(meshcat: Meshcat, scene: Scene) -> None:
-    """A camera far enough back to have all of the motion in view, and a grid to see it by."""
+    """Place the camera so that all of the motion is visible, and draw a grid."""
     low, high = scene.box
     centre = (low + high) / 2
     meshcat.SetCameraPose(*camera_of(scene))
@@ -370,7 +370,7 @@ def _look_at(meshcat: Meshcat, scene: Scene) -> None:
         meshcat.SetProperty(decoration, "visible", False)
     meshcat.SetProperty("/Background/<object>", "top_color", TOP)
     meshcat.SetProperty("/Background/<object>", "bottom_color", BOTTOM)
-    # The grid is on the ground, or under the lowest point of the motion; cells are half or a fifth of a power of ten.
+    # The grid is on the ground, or below the motion's lowest point; its cells are 1/2 or 1/5 of a power of ten.
     grounds = [d.pose.translation()[2] for d in scene.shapes if isinstance(d.shape, HalfSpace)]
     below = 0.002 * scene.size
     height = max(grounds) + below if grounds else low[2] - below

@@ -1,4 +1,4 @@
-"""What is seen of a motion: shapes on bodies, where the bodies are over time, contact forces, and how large it is."""
+"""The scene of a motion: shapes on bodies, poses over time, contact forces, and its size."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,10 +19,10 @@ from drake_diff.model.step import set_state
 from drake_diff.pages.shapes import Drawn, body_path, shapes_of
 
 BLUE = Rgba(0.15, 0.4, 0.95, 0.3)
-LOOKED_AT = 60  # at most so many poses of a motion are looked at for its bounding box
-ARROW_PART = 0.2  # of the scene's size: how long the arrow of `Scene.reference_force` is
-LARGEST_MARK = 0.5  # [m] so much of a goal or an obstacle has to be in view
-SMALLEST_SIZE = 0.3  # [m] the camera comes no closer
+LOOKED_AT = 60  # largest number of poses of a motion that determine its bounding box
+ARROW_PART = 0.2  # length of the arrow of the reference force, relative to the scene's size
+LARGEST_MARK = 0.5  # [m] the part of a goal or an obstacle that must be in view
+SMALLEST_SIZE = 0.3  # [m] smallest size that the camera shows
 
 Poses = Mapping[str, Sequence[RigidTransform]]
 
@@ -37,7 +37,7 @@ class Force:
 
 @dataclass(frozen=True)
 class Ghost:
-    """Another motion of the same bodies at the same times, translucent; one that is not `framed` may leave the picture.
+    """Another, translucent motion of the same bodies at the same times; if not `framed`, it may leave the view.
 
     `name` is a path of Meshcat.
     """
@@ -50,10 +50,10 @@ class Ghost:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A motion to be drawn: `poses` of every moving body at `times` (N+1,) [s].
+    """A motion to draw: `poses` of every moving body at `times` (N+1,) [s].
 
-    In each of the N steps there are contact forces, `contacts`, and those that inputs put on bodies, `thrusts`.
-    `trail` (N+1, 3) [m] is the path of the point that is followed, `marks` are goals and obstacles.
+    Each of the N steps has contact forces, `contacts`, and forces of inputs on bodies, `thrusts`. `trail` (N+1, 3) [m]
+    is the path of the tracked point, and `marks` are goals and obstacles.
     """
 
     shapes: tuple[Drawn, ...]
@@ -67,7 +67,7 @@ class Scene:
 
     @cached_property
     def balls(self) -> tuple[Array, Array]:
-        """Centres (n, 3) and radii (n,) [m] of balls that hold the motion, framed ghosts and marks in the world."""
+        """Centres (n, 3) and radii (n,) [m] of balls around the motion, framed ghosts and marks in the world."""
         trail = self.trail[:: max(1, len(self.trail) // LOOKED_AT)]
         result = [(point, 0.0) for point in (*trail, self.trail[-1])]
         motions = [self.poses, *(ghost.poses for ghost in self.ghosts if ghost.framed)]
@@ -80,7 +80,7 @@ class Scene:
 
     @cached_property
     def box(self) -> tuple[Array, Array]:
-        """The lowest and highest corner (3,) of the box that holds the balls."""
+        """The lowest and highest corner (3,) of the balls' bounding box."""
         centres, radii = self.balls
         return np.min(centres - radii[:, None], axis=0), np.max(centres + radii[:, None], axis=0)
 
@@ -91,7 +91,7 @@ class Scene:
         return max(SMALLEST_SIZE, float(np.linalg.norm(high - low)))
 
     def reference_of(self, forces: Sequence[Sequence[Force]]) -> float:
-        """[N] the force whose arrow is ARROW_PART of the size: nine tenths of all `forces` are no larger."""
+        """Return the force [N] whose arrow is ARROW_PART of the size: the 90 % quantile of all `forces`."""
         sizes = [float(np.linalg.norm(item.force)) for step in forces for item in step]
         pushing = [size for size in sizes if size > 0]
         return float(np.quantile(pushing, 0.9)) if pushing else 1.0
@@ -109,21 +109,21 @@ def scene_of(
     marks: Sequence[Drawn] = (),
     shapes: Sequence[Drawn] = (),
 ) -> Scene:
-    """The scene of a motion of `model`.
+    """Build the scene of a motion of `model`.
 
     Args:
-        model: Whose bodies move.
+        model: The model whose bodies move.
         times: (N+1,) [s].
         xs: (N+1, nx) the states at those times.
-        us: (N, nu) the inputs in each of the N steps: the forces that they put on bodies are drawn as arrows.
-        contacts: The contacts in each of the N steps, drawn as arrows.
-        ghosts: States (N+1, nx) and colour by name; a ghost that would hide behind the motion is left out.
-        frame: The name of the frame or body whose origin leaves a trail; by default the centre of mass that moves most.
+        us: (N, nu) the inputs in each of the N steps. Their forces on bodies are drawn as arrows.
+        contacts: The contacts in each of the N steps, which are drawn as arrows.
+        ghosts: States (N+1, nx) and colour by name. Ghosts that are equal to the motion are omitted.
+        frame: The frame or body whose origin draws the trail; by default the centre of mass with the longest path.
         marks: Goals and obstacles.
-        shapes: Those of an earlier scene of this model, which need not be read again.
+        shapes: The shapes of an earlier scene of this model, to avoid reading them again.
 
     Raises:
-        UnknownNameError: If there is no such frame.
+        UnknownNameError: There is no such frame.
     """
     drawn = bodies(model.plant)
     moving = [body for body in drawn if not model.plant.IsAnchored(body)]
@@ -144,7 +144,7 @@ def scene_of(
 
 
 def _thrusts_of(model: Model, xs: Array, us: Array) -> tuple[tuple[Force, ...], ...]:
-    """The forces that propellers, thrusters and the like put on bodies from each state on; () without any such."""
+    """Return the forces of propellers, thrusters and the like on bodies at each state, or () if there are none."""
     twin = model.double
     port = twin.plant.get_applied_spatial_force_input_port()
     if int(port.get_index()) not in twin.inputs.fed:
@@ -162,7 +162,7 @@ def _thrusts_of(model: Model, xs: Array, us: Array) -> tuple[tuple[Force, ...], 
 
 
 def _poses_of(model: Model, moving: Sequence[Any], xs: Array) -> dict[str, list[RigidTransform]]:
-    """Where each of the bodies `moving` is in each of `xs` (N+1, nx), by its path."""
+    """Return the pose of each body in `moving` at each of `xs` (N+1, nx), by the body's path."""
     poses: dict[str, list[RigidTransform]] = {body_path(body): [] for body in moving}
     for x in xs:
         set_state(model.double, x)
@@ -172,19 +172,19 @@ def _poses_of(model: Model, moving: Sequence[Any], xs: Array) -> dict[str, list[
 
 
 def moving_bodies(plant: Any) -> list[Any]:
-    """The bodies that are not fixed to the world."""
+    """Return the bodies that are not fixed to the world."""
     return [body for body in bodies(plant) if not plant.IsAnchored(body)]
 
 
 def longest_path(poses: Poses, moving: Sequence[Any] = ()) -> Array:
-    """(N+1, 3) the path of that centre of mass of the bodies `moving` that moves most; of the origins without any."""
+    """Return the longest path (N+1, 3) of a centre of mass of the bodies `moving`, or of an origin without any."""
     centres = {body_path(body): np.asarray(body.default_com()) for body in moving}
     paths = [np.array([pose @ centres.get(name, np.zeros(3)) for pose in result]) for name, result in poses.items()]
     return max(paths, key=lambda path: float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()))
 
 
 def _path_of(model: Model, poses: Poses, count: int, name: str) -> Array:
-    """(N+1, 3) the path of a frame's origin, which is fixed to its body."""
+    """Return the path (N+1, 3) of the origin of a frame, which is fixed to its body."""
     known = {f.name(): f for f in (model.plant.get_frame(FrameIndex(i)) for i in range(model.plant.num_frames()))}
     if name not in known:
         raise UnknownNameError("frame", got=name, known=tuple(known))

@@ -1,4 +1,4 @@
-"""The shapes that are seen of a robot: its visuals, meshes with fewer faces, and a skeleton where there is neither."""
+"""The displayed shapes of a robot: its visuals, meshes with fewer faces, or a skeleton if it has no geometries."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from drake_diff.model.triangles import READ_BY_TRIMESH, Triangles, read_mesh, sc
 DRAWN = (Box, Capsule, Convex, Cylinder, Ellipsoid, HalfSpace, Mesh, Sphere, Triangles)
 GREY = Rgba(0.6, 0.6, 0.62, 1)
 BONE, JOINT = Rgba(0.72, 0.72, 0.74, 1), Rgba(0.33, 0.42, 0.55, 1)  # of a skeleton
-BALL = 0.05  # [m] radius of what stands for a body of a robot without a size
-MOST_FACES = 30_000  # of all meshes of a robot: about 0.7 MB of a page
-BONE_PART, JOINT_PART = 0.008, 0.014  # of a robot's size: the radii of a skeleton's bones and joints
-SHORTEST_BONE = 0.01  # of a robot's size
+BALL = 0.05  # [m] radius of the ball that represents a body of a robot without a size
+MOST_FACES = 30_000  # of all meshes of a robot, which is about 0.7 MB of a page
+BONE_PART, JOINT_PART = 0.008, 0.014  # radii of a skeleton's bones and joints, relative to the robot's size
+SHORTEST_BONE = 0.01  # relative to the robot's size
 ROLES = (Role.kIllustration, Role.kProximity)
 
-MeshFile = tuple[Path, tuple[float, float, float], int, int]  # with its scale, when it was changed, and its size
+MeshFile = tuple[Path, tuple[float, float, float], int, int]  # with its scale, modification time [ns] and size [bytes]
 
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """A shape on the body of that path, or in the world for ""; `centre` and `radius` [m] are of a ball around it.
+    """A shape on the body with path `body`, or in the world for ""; `centre` and `radius` [m] are a ball around it.
 
-    Where `origin` (3,) [m] is given, a point on the body, `pose` is from there and along the world's axes. What is
-    `above` is seen through all that is before it.
+    If `origin` (3,) [m], a point on the body, is given, `pose` is relative to it and along the world's axes. A shape
+    with `above` is drawn in front of everything else.
     """
 
     body: str
@@ -50,7 +50,7 @@ class Drawn:
 
 
 def shapes_of(plant: Any, context: Any, drawn: Sequence[Any]) -> list[Drawn]:
-    """The shapes of the world and of the bodies `drawn`, with a skeleton of those bodies that have none."""
+    """Return the shapes of the world and of the bodies `drawn`, with a skeleton for bodies without shapes."""
     port = plant.get_geometry_query_input_port()
     result: dict[int, list[Drawn]] = {}
     if port.HasValue(context):
@@ -73,7 +73,7 @@ def shapes_of(plant: Any, context: Any, drawn: Sequence[Any]) -> list[Drawn]:
 
 
 class _Looks:
-    """How the geometries on some frames look, their mesh files read together, as all share a number of faces."""
+    """The appearance of geometries on some frames; all mesh files are read together and share a number of faces."""
 
     def __init__(self, inspector: Any, frames: Sequence[Any]):
         self._inspector = inspector
@@ -84,7 +84,7 @@ class _Looks:
         self._meshes = dict(zip(wanted, _read_together(wanted), strict=True))
 
     def on(self, frame: Any, path: str) -> list[Drawn]:
-        """Of a frame's geometries those meant to be seen, or those that touch where there are none."""
+        """Return the illustration geometries of a frame, or its proximity geometries if it has none."""
         for role in ROLES:
             looks = (self._drawn(geometry, role, path) for geometry in self._inspector.GetGeometries(frame, role))
             result = [d for d in looks if d is not None and isinstance(d.shape, DRAWN)]
@@ -93,7 +93,7 @@ class _Looks:
         return []
 
     def _file(self, geometry: Any) -> MeshFile | None:
-        """The mesh file of a geometry that has one which trimesh reads."""
+        """Return the mesh file of a geometry if trimesh can read it."""
         shape = self._inspector.GetShape(geometry)
         if not isinstance(shape, Mesh) or not shape.source().is_path() or shape.extension() not in READ_BY_TRIMESH:
             return None
@@ -105,7 +105,7 @@ class _Looks:
         return shape.source().path(), (x, y, z), state.st_mtime_ns, state.st_size
 
     def _drawn(self, geometry: Any, role: Role, path: str) -> Drawn | None:
-        """A geometry as it is drawn; None where its mesh cannot be read."""
+        """Return the drawing of a geometry, or None if its mesh cannot be read."""
         colour, pose = GREY, self._inspector.GetPoseInFrame(geometry)
         if role == Role.kIllustration:
             properties = self._inspector.GetIllustrationProperties(geometry)
@@ -119,16 +119,16 @@ class _Looks:
             return Drawn(path, mesh, pose, colour, pose @ ((low + high) / 2), float(np.linalg.norm(high - low)) / 2)
         try:
             box = self._inspector.GetObbInGeometryFrame(geometry)
-        except RuntimeError:  # a mesh is read when it is first asked for
+        except RuntimeError:  # a mesh is read at its first use
             return None
         centre = pose.translation() if box is None else pose @ box.pose().translation()
         radius = 0.0 if box is None else float(np.linalg.norm(box.half_width()))
         return Drawn(path, self._inspector.GetShape(geometry), pose, colour, np.asarray(centre), radius)
 
 
-@lru_cache(maxsize=4)  # a run is drawn when it is saved, and again when it is verified
+@lru_cache(maxsize=4)  # a run is drawn when it is saved and again when it is verified
 def _read_together(files: tuple[MeshFile, ...]) -> tuple[Triangles | None, ...]:
-    """The meshes of a robot, with MOST_FACES faces together; None for a file that cannot be read."""
+    """Read the meshes of a robot, with MOST_FACES faces together; None for a file that cannot be read."""
     result: list[Triangles | None] = []
     for path, scale, *_ in files:
         try:
@@ -140,10 +140,9 @@ def _read_together(files: tuple[MeshFile, ...]) -> tuple[Triangles | None, ...]:
 
 
 def _skeleton(plant: Any, context: Any, drawn: Sequence[Any], bare: Sequence[Any]) -> dict[int, list[Drawn]]:
-    """What stands for each of the bodies `bare`, by its index: bones from its joint to the next, or to its mass.
+    """Return bones and joints for each of the bodies `bare`, by index: from its joint to the next, or to its mass.
 
-    Bodies that have neither mass nor anything behind them (frames of tools and cameras) get nothing, unless there is
-    nothing else to be seen.
+    Bodies with neither mass nor descendants (frames of tools and cameras) get nothing, unless nothing else is visible.
     """
     if not bare:
         return {}
@@ -152,7 +151,7 @@ def _skeleton(plant: Any, context: Any, drawn: Sequence[Any], bare: Sequence[Any
     tree = [(j, int(j.parent_body().index()), int(j.child_body().index())) for j in joints(plant)]
     without = {int(body.index()) for body in bare}
     seen = {int(b.index()) for b in drawn if int(b.index()) not in without or b.default_mass() > 0}
-    for _ in tree:  # as often as it takes from the tips to the root, in whatever order the file has its joints
+    for _ in tree:  # repeated up to the root, since the joints may be in any order
         behind = {parent for _, parent, child in tree if child in seen}
         if behind <= seen:
             break
@@ -171,7 +170,7 @@ def _skeleton(plant: Any, context: Any, drawn: Sequence[Any], bare: Sequence[Any
 
 
 def _origin(frame: Any, context: Any) -> Array:
-    """(3,) where a frame is on its body."""
+    """Return the position (3,) of a frame on its body."""
     return np.asarray(frame.CalcPoseInBodyFrame(context).translation())
 
 
@@ -187,16 +186,16 @@ def _ball(path: str, centre: Array, radius: float) -> Drawn:
 
 
 def ball(path: str, centre: ArrayLike = (0.0, 0.0, 0.0)) -> Drawn:
-    """What stands for a body of which nothing is known, at `centre` (3,) [m] on it."""
+    """Return a ball that represents an unknown body, at `centre` (3,) [m] on it."""
     position = np.asarray(centre, dtype=float)
     return Drawn(path, Sphere(BALL), RigidTransform(position), GREY, position, BALL)
 
 
 def body_path(body: Any) -> str:
-    """The path of a body in Meshcat."""
+    """Return the Meshcat path of a body."""
     return meshcat_path(int(body.index()), body.name())
 
 
 def meshcat_path(index: int, name: str) -> str:
-    """A path of Meshcat that no name can break out of; the index keeps it unique."""
+    """Return a Meshcat path that is safe for any name; the index makes it unique."""
     return f"{index}_" + re.sub(r"[^A-Za-z0-9_.-]", "_", name)

@@ -1,4 +1,4 @@
-"""Directories of runs: measure a solution, write it, read it, verify it, list it, show it; and records."""
+"""Run directories and records: measure, save, load, verify, list and display solutions."""
 
 import lazy_loader as _lazy
 

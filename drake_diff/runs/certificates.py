@@ -1,4 +1,4 @@
-"""Certificates of a model's step at sampled states, as a record."""
+"""Certify the derivatives of a model's step at sampled states and write a record."""
 
 import time
 from collections.abc import Sequence
@@ -31,26 +31,26 @@ def certify_model(
     method: str = "auto",
     directory: str | Path | None = None,
 ) -> PlanRecord:
-    """Certify the derivatives of the step at sampled states, every other one in contact where the model can touch.
+    """Certify the step's derivatives at sampled states; every second state is in contact if contact is possible.
 
-    The same seed gives the same states, so that `verify` can take the certificates again.
+    The same seed gives the same states, so `verify` can repeat the certificates.
 
     Args:
         model: The model to certify.
-        states: How many states to sample.
+        states: Number of sampled states.
         seed: Seed of the states.
-        parameters: Names of parameters whose derivatives are certified too.
-        method: How the derivative is taken: "auto", "autodiff", "implicit", "analytic" or "finite_difference".
-        directory: Where to write record.json and a copy of the model's files; nothing is written without one. An
-            earlier run there is replaced when the last state is done.
+        parameters: Names of the parameters whose derivatives are certified too.
+        method: Derivative method: "auto", "autodiff", "implicit", "analytic" or "finite_difference".
+        directory: Directory for record.json and a copy of the model's files; nothing is written if it is None. An
+            earlier run in it is replaced after the last state.
 
     Returns:
-        A `PlanRecord`, whose verdict is "pass" only where every certificate agrees.
+        A `PlanRecord`. Its verdict is "pass" only if every certificate agrees.
 
     Raises:
-        InputError: `states`, `seed`, `parameters` or `method` is not one that can be used, or `directory` holds what
-            no run wrote.
-        WriteError: The disk is full, or does not let `directory` be written.
+        InputError: `states`, `seed`, `parameters` or `method` is invalid, or `directory` contains files that no run
+            wrote.
+        WriteError: `directory` cannot be written, for example because the disk is full.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -84,7 +84,7 @@ def certify_model(
         record("incomplete", sentence).begin(folder)
         made = certified()
         if model.source is not None and made.model.file is not None:
-            write_whole(folder / model.source.name, model.source.read_bytes())  # to certify it again
+            write_whole(folder / model.source.name, model.source.read_bytes())  # for repeated certification
             write_bundle(folder, model)
         return made.write(folder)
 

@@ -1,7 +1,7 @@
-"""Replays of a solution in plants that had no part in it: continuous time, and other simulators.
+"""Replay a solution in plants that the solver did not use: continuous time, and other simulators.
 
-The plan's own controller follows it, each command of which is held over one of the controller's steps. Where TVLQR does
-not lead to the goal, the inputs alone are tried. No verdict rests on these replays.
+The plan's own controller tracks the plan. Each command is constant over one step of the controller. If the plan does
+not reach its goal under TVLQR, the planned inputs are replayed open loop. No verdict depends on these replays.
 """
 
 import math
@@ -38,30 +38,30 @@ from drake_diff.optimize.replay import (
 from drake_diff.optimize.solution import Solution
 
 SIMULATORS = ("mujoco",)
-NOT_INSTALLED = "it is not installed: "  # the failure of a simulator begins so
-LONGEST = 1e-3  # [s] a step of another simulator
+NOT_INSTALLED = "it is not installed: "  # start of the failure message of a missing simulator
+LONGEST = 1e-3  # [s] longest time step of another simulator
 
 
 def cross_check(solution: Solution, engines: Sequence[str] = SIMULATORS) -> Solution:
     """Replay a solution in continuous time and in other simulators.
 
-    The motion in continuous time is the one that Drake's steps stand for, integrated with error control, or Drake's in
-    64 steps of each interval where there is none. Other simulators take steps of 1 ms or less, with contacts matched to
-    Drake's. The checks are those of replays. In another simulator all tolerances but those of obstacles are twice as
-    wide.
+    The motion in continuous time is the limit of Drake's steps. It is integrated with error control, or by Drake in 64
+    steps per interval if that is not possible. Other simulators take steps of at most 1 ms, with contact parameters
+    that match Drake's. The checks are those of the replays. In another simulator all tolerances except those of
+    obstacles are twice as wide.
 
     Args:
         solution: A result of `solve` for a model, of any status.
-        engines: Names of simulators for `engines.load_engine`. One that is not installed or cannot have the model is
-            a replay that could not be taken.
+        engines: Names of simulators for `engines.load_engine`. A simulator that is not installed or does not support
+            the model gives a failed replay.
 
     Returns:
-        The same solution with its `cross_checks`: a replay in each plant under TVLQR and, where that does not hold,
-        open loop. They are among its `checks`; `save` writes them, and `verify` takes them again.
+        The same solution with its `cross_checks`: a replay in each plant under TVLQR and, if that fails, open loop.
+        They are also among its `checks`. `save` writes them, and `verify` repeats them.
 
     Raises:
-        InputError: The solution has no model, or is one in phases.
-        UnknownNameError: There is no such simulator.
+        InputError: The solution has no model, or has several phases.
+        UnknownNameError: No simulator has such a name.
 
     Example:
         >>> from drake_diff.runs import cross_check
@@ -85,7 +85,7 @@ def _in_simulator(follower: PlanFollower, name: str) -> list[Replay]:
     try:
         if not np.array_equal(plan.vector.values, select(plan.problem.model, plan.vector.names).values):
             raise ModelError("another simulator uses the model's own parameters, but the plan has others")
-        if name == "mujoco":  # which takes any step of a model that Drake has at one alone
+        if name == "mujoco":  # MuJoCo accepts any time step, also for a model that Drake has at one step only
             return replays_in(follower, load_engine(name, plan.problem.model, time_step=follower.period / parts))
         return replays_in(follower, load_engine(name, plan.problem.model.at_time_step(follower.period / parts)))
     except MissingDependencyError as error:
@@ -96,10 +96,10 @@ def _in_simulator(follower: PlanFollower, name: str) -> list[Replay]:
 
 
 def follower_of(plan: ReplayPlan, known: Sequence[Replay] = ()) -> PlanFollower:
-    """The controller of a plan in other plants.
+    """Return the controller that tracks a plan in other plants.
 
-    It has a quarter of the steps of the plan, with offsets for continuous time, or these steps where bodies can touch.
-    Of a collocated plan it has the first steps in which that has to hold, by its replays (`known` or taken).
+    Its step is a quarter of the plan's step, with offsets for continuous time, or the plan's step if bodies can
+    collide. For a collocated plan, it is the first step size that has to hold in the replays (`known` or new).
     """
     model = plan.problem.model
     if not plan.continuous or plan.problem.motion == CONTINUOUS:
@@ -112,7 +112,7 @@ def follower_of(plan: ReplayPlan, known: Sequence[Replay] = ()) -> PlanFollower:
 
 
 def replays_in(follower: PlanFollower, engine: Engine) -> list[Replay]:
-    """A plan in a simulator; what its contract has otherwise than Drake's is a check that fails."""
+    """Replay a plan in a simulator; each deviation of its contract from Drake's is a failed check."""
     plan, h, x0 = follower.plan, engine.contract.time_step, follower.xs[0]
     model, pieces = plan.problem.model, round(follower.period / h)
     if not pieces or abs(pieces * h - follower.period) > 1e-9 * follower.period:
@@ -143,7 +143,7 @@ def replays_in(follower: PlanFollower, engine: Engine) -> list[Replay]:
 
 @dataclass(frozen=True, eq=False)
 class _Moved:
-    """A `Motion` of another simulator."""
+    """A `MeasuredMotion` of another simulator."""
 
     times: Array
     xs: Array
@@ -152,7 +152,7 @@ class _Moved:
 
 
 def _overlaps(model: Model, xs: Array) -> Array:
-    """(n+1,) [m] of Drake's geometries at xs, NaN where these are no numbers."""
+    """Compute the largest overlap (n+1,) [m] of Drake's geometries at each state, NaN for non-finite states."""
     depths = np.full(len(xs), np.nan)
     touches = bool(model.contract.contact.collision_pairs)
     for k in np.flatnonzero(np.isfinite(xs).all(axis=1)):

@@ -1,8 +1,8 @@
-"""Where two records, traces or pages differ: texts exactly, numbers by more than machines round differently.
+"""Compare records, traces or pages: texts exactly, and numbers up to the rounding differences between machines.
 
-BLAS and libm round differently from machine to machine. A number that was measured on a motion may be a millionth of
-itself, and 1e-9, away from the same number taken again; one that is read out of a file 1e-9 of itself. A number within
-a text is such a number too. Whatever differs at all is told, whether it is allowed or not.
+BLAS and libm round differently on different machines. A number measured on a motion may differ by 1e-6 relative plus
+1e-9. A number read from a file may differ by 1e-9 relative. The same limits apply to numbers within a text. All
+differences are reported, including the allowed ones.
 """
 
 import json
@@ -20,7 +20,7 @@ from drake_diff.logs.mcap_file import McapLog, fields_of, parse_mcap
 from drake_diff.pages.html import PagePieces, pieces_of
 
 RELATIVE, ABSOLUTE = 1e-6, 1e-9
-READ = (1e-9, 1e-15)  # the same of what is read out of a file and not computed along a motion
+READ = (1e-9, 1e-15)  # the limits (relative, absolute) of values read from a file instead of computed along a motion
 READ_SECTIONS = (
     "contract",
     "data",
@@ -29,21 +29,21 @@ READ_SECTIONS = (
     "phases",
     "problem",
 )
-NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?(?!\w)")  # digits in a hash or a name are none
+NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?(?!\w)")  # not the digits in a hash or a name
 
 
-DRAWN = ("scripts", "scene")  # of a page
+DRAWN = ("scripts", "scene")  # the parts of a page that are compared
 
 
 @dataclass(frozen=True)
 class Reproduced:
-    """A directory that was reproduced: the record's fields, and the bytes of the other files by name.
+    """A reproduced directory: the record's fields, and the bytes of the other files by name.
 
-    `apart` is how far the plan of the search is from the recorded one, relative, 0 where they are the same to the last
-    bit; `unrepeated` says why the search was not run again, and `missing` which keys of the record rest on that.
-    `unchecked` are parts of the record that could not be measured on this machine, and stand as they are recorded.
-    `problems` are contradictions between the files of the directory, `undecided` what cannot be judged, `written` the
-    files that drake_diff writes there. `recorded` are the fields to compare with, where not all are compared.
+    `apart` is the relative distance of the repeated plan from the recorded one, 0 if they are bitwise equal.
+    `unrepeated` states why the search was not repeated, and `missing` the keys of the record that depend on the search.
+    `unchecked` are the parts of the record that could not be measured on this machine and are copied from it.
+    `problems` are contradictions between the files, `undecided` reasons for an undecided verdict, and `written` the
+    files that drake_diff writes. `recorded` are the fields to compare, if not all are compared.
     """
 
     fields: dict[str, Any]
@@ -60,7 +60,7 @@ class Reproduced:
 
 @dataclass(frozen=True)
 class Difference:
-    """A value that is not the one that was computed again; `allowed` where machines may round so differently."""
+    """A value that differs from the recomputed one; `allowed` if machines may round that differently."""
 
     file: str
     key: str
@@ -74,19 +74,19 @@ class Difference:
 
 @dataclass
 class FileDifferences:
-    """How many values were compared in a file, and those that differ."""
+    """The number of compared values in a file, and the differences."""
 
     file: str
     count: int = 0
     differing: list[Difference] = field(default_factory=list)
 
     def differ(self, key: str, recorded: Any, again: Any, *, allowed: bool = False) -> None:
-        """Note a difference."""
+        """Add a difference."""
         self.differing.append(Difference(self.file, key, recorded, again, allowed))
 
 
 def shown(value: Any) -> str:
-    """A value in a few words."""
+    """Format a value as a short text."""
     if value is None:
         return "none"
     if isinstance(value, float):
@@ -96,19 +96,19 @@ def shown(value: Any) -> str:
 
 
 def is_number(value: Any) -> bool:
-    """Whether it is a number; a flag is none."""
+    """Return whether `value` is a number; bool does not count."""
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def is_near(recorded: float, again: float, relative: float = RELATIVE, absolute: float = ABSOLUTE) -> bool:
-    """Whether two numbers are as near as machines round; NaN is NaN, and infinities are themselves."""
+    """Return whether two numbers agree up to rounding; NaN equals NaN, and infinities must be equal."""
     if not (math.isfinite(recorded) and math.isfinite(again)):
         return recorded == again or (recorded != recorded and again != again)
     return abs(recorded - again) <= relative * max(abs(recorded), abs(again)) + absolute
 
 
 def is_near_text(recorded: str, again: str) -> bool:
-    """Whether two texts are the same but for numbers in them that are near."""
+    """Return whether two texts agree apart from numbers that agree up to rounding."""
     if NUMBER.split(recorded) != NUMBER.split(again):
         return False
     pairs = zip(NUMBER.findall(recorded), NUMBER.findall(again), strict=True)
@@ -116,9 +116,9 @@ def is_near_text(recorded: str, again: str) -> bool:
 
 
 def differences(recorded: Any, again: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """(key, recorded, again) wherever two JSON values differ at all; entries of a list by their name, if they have one.
+    """Yield (key, recorded, again) for each difference of two JSON values; list entries are matched by name, if any.
 
-    A key that only one of them has is null in the other.
+    A key that is missing in one of them is null.
     """
     if isinstance(recorded, dict) and isinstance(again, dict):
         for key in sorted(recorded.keys() | again.keys()):
@@ -137,7 +137,7 @@ def differences(recorded: Any, again: Any, path: str = "") -> Iterator[tuple[str
 
 
 def _labels(entries: Sequence[Any]) -> list[str]:
-    """A name for each entry of a list: its own where all have one and no two the same, else its index."""
+    """Return the names of the entries of a list if all have distinct names, else their indices."""
     names = [entry.get("name") if isinstance(entry, dict) else None for entry in entries]
     if all(isinstance(name, str) for name in names) and len(set(names)) == len(names):
         return [str(name) for name in names]
@@ -145,7 +145,7 @@ def _labels(entries: Sequence[Any]) -> list[str]:
 
 
 def compare_fields(compared: FileDifferences, recorded: Mapping[str, Any], again: Mapping[str, Any]) -> None:
-    """Two JSON objects, value by value."""
+    """Compare two JSON objects value by value."""
     compared.count += sum(1 for _ in leaves(again))
     for key, old, new in differences(dict(recorded), dict(again)):
         limits = READ if key.split(".")[0] in READ_SECTIONS else (RELATIVE, ABSOLUTE)
@@ -155,7 +155,7 @@ def compare_fields(compared: FileDifferences, recorded: Mapping[str, Any], again
 
 
 def leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """(path, value) of every value in a JSON value that has no others in it, empty lists and objects included."""
+    """Yield (path, value) for each leaf of a JSON value, including empty lists and objects."""
     parts = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     if not parts or not value:
         yield path, value
@@ -164,14 +164,14 @@ def leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def compare_bytes(compared: FileDifferences, recorded: bytes, again: bytes) -> None:
-    """Two files of bytes, exactly."""
+    """Compare two files byte by byte."""
     compared.count += 1
     if recorded != again:
         compared.differ("its bytes", sha256(recorded).hexdigest()[:16], sha256(again).hexdigest()[:16])
 
 
 def compare_pages(compared: FileDifferences, recorded: bytes, again: bytes) -> None:
-    """Two pages: scripts and styles exactly; numbers in the text, and in what a scene draws, by how machines round."""
+    """Compare two pages: scripts and styles exactly, numbers in the text and in drawn scenes up to rounding."""
     compared.count += 1
     if recorded == again:
         return
@@ -202,7 +202,7 @@ def _compare_pieces(compared: FileDifferences, old: PagePieces, new: PagePieces)
 
 
 def _is_near_drawing(recorded: str, again: str) -> bool:
-    """Whether two commands to a viewer, in base64, are the same but for numbers that are near for the largest one."""
+    """Return whether two base64 viewer commands agree up to rounding relative to the largest number."""
     try:
         old, new = (list(_values_of(b64decode(text, validate=True))) for text in (recorded, again))
     except (ValueError, IndexError, struct.error):
@@ -211,16 +211,16 @@ def _is_near_drawing(recorded: str, again: str) -> bool:
     return len(old) == len(new) and all(a == b or _is_near_value(a, b, largest) for a, b in zip(old, new, strict=True))
 
 
-# By the head of a value in MessagePack: the bytes that give its length, and the bytes beside that length.
+# MessagePack head byte -> the number of bytes of the length field, and of the type field after it
 SIZED = {0xC4: (1, 0), 0xC5: (2, 0), 0xC6: (4, 0), 0xC7: (1, 1), 0xC8: (2, 1), 0xC9: (4, 1)}
 SIZED |= {0xD9: (1, 0), 0xDA: (2, 0), 0xDB: (4, 0)}
 FIXED = {0xCC: 1, 0xCD: 2, 0xCE: 4, 0xCF: 8, 0xD0: 1, 0xD1: 2, 0xD2: 4, 0xD3: 8, 0xDC: 2, 0xDD: 4, 0xDE: 2, 0xDF: 4}
 FIXED |= {0xD4 + i: 1 + 2**i for i in range(5)}
-FLOATS = 0x17  # the type of an array of single precision
+FLOATS = 0x17  # extension type of a single-precision array
 
 
 def _values_of(data: bytes) -> Iterator[float | bytes]:
-    """The values of MessagePack one after the other: numbers that are not whole, and the bytes of all else."""
+    """Yield the values of a MessagePack stream: floating-point numbers, and the bytes of all other values."""
     i = 0
     while i < len(data):
         head, start = data[i], i + 1
@@ -242,10 +242,10 @@ def _values_of(data: bytes) -> Iterator[float | bytes]:
 def compare_traces(
     compared: FileDifferences, recorded: bytes, again: bytes, *, alike: Sequence[str] = (), skip: Sequence[str] = ()
 ) -> None:
-    """Two MCAP files: attachments, metadata, schemas and channels exactly, every message field by field.
+    """Compare two MCAP files: attachments, metadata, schemas and channels exactly, every message field by field.
 
-    Of the attachments named in `alike` only that they are there is compared. Channels whose topics begin as one of
-    `skip` are not compared.
+    The attachments in `alike` must exist in both files, but their content is not compared. Channels whose topics start
+    with an entry of `skip` are not compared.
     """
     before = len(compared.differing)
     old, new = (parse_mcap(data, compared.file) for data in (recorded, again))
@@ -259,11 +259,11 @@ def compare_traces(
     for topic in (t for t in new.messages if t in old.messages and not t.startswith(tuple(skip))):
         _compare_messages(compared, topic, old, new)
     if len(compared.differing) == before and old.attachments == new.attachments and not skip:
-        compare_bytes(compared, recorded, again)  # what stands beside the data: indexes, empty space
+        compare_bytes(compared, recorded, again)  # the bytes outside the data: indexes, empty space
 
 
 def _compare_messages(compared: FileDifferences, topic: str, old: McapLog, new: McapLog) -> None:
-    """The messages of one channel, field by field; a number may be off by a part of the largest of its field."""
+    """Compare the messages of one channel; the tolerance of a number is relative to the largest value of its field."""
     kinds = [log.message_types[topic].DESCRIPTOR.file.serialized_pb for log in (old, new)]
     if kinds[0] != kinds[1]:
         compared.differ(f"{topic} schema", repr(kinds[0]), repr(kinds[1]))
@@ -289,7 +289,7 @@ def _compare_messages(compared: FileDifferences, topic: str, old: McapLog, new: 
 
 
 def _is_near_value(recorded: Any, again: Any, largest: float) -> bool:
-    """Whether two fields are near, numbers in a column whose largest one is `largest`."""
+    """Return whether two field values agree up to rounding, relative to the `largest` value of their column."""
     if isinstance(recorded, str) and isinstance(again, str):
         return is_near_text(recorded, again)
     both = isinstance(recorded, float) and isinstance(again, float)

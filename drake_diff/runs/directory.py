@@ -1,14 +1,14 @@
-"""A run directory: its record read, of whichever kind, and the directory written whole.
+"""Run directories: records of every kind are read, and directories are written atomically.
 
-It is written beside its place under a name of its own, and moved there at the end:
+A run is written to a temporary folder next to its final directory, and moved there at the end:
 
-    run                          a run that ended
-    run.partial-4711-0f3a9c21    one that is under way, or that was killed or failed: process 4711, and a random part
-    .run.lock                    locked for as long as somebody writes `run`
+    run                          a finished run
+    run.partial-4711-0f3a9c21    a run that is in progress, was killed or failed: process ID, and a random part
+    .run.lock                    locked while a process writes `run`
 
-What was at `run` is there, whole, until the moment in which the new one is; where the file system can exchange two
-names, no moment is without either. Else the old one is called run.replaced-... for that moment. Records of versions 2
-and 3 of the schema are converted.
+An earlier run at `run` stays complete until it is replaced. If the file system can exchange two names, `run` exists at
+every moment. Otherwise the earlier run is called run.replaced-... for a moment. Records of versions 2 and 3 of the
+schema are converted.
 """
 
 import json
@@ -43,7 +43,7 @@ from drake_diff.runs.fields import SCHEMA_VERSION, FileEvidence, SealedRecord, c
 from drake_diff.runs.other_records import ComparisonRecord, FitRecord, is_trial_file
 from drake_diff.runs.plan_record import PlanRecord
 
-# The kinds of version 2, by the file that their record was in, and the section that their own fields are in now.
+# Version 2: the kind of record in each file, the present kind, and the present section of the fields of each kind.
 FILES = {
     "record.json": "solve",
     "phases.json": "phases",
@@ -70,15 +70,15 @@ SECTIONS = {
     "panel": ("panel", "trials", "errors", "ranked_by", "ranking"),
     "trial": ("id", "cell", "inputs", "result", "panel"),
 }  # fmt: skip
-DROPPED = ("evaluations", "elsewhere")  # a second measurement, which is a test now, and what replays say now
+DROPPED = ("evaluations", "elsewhere")  # a second measurement, and what the replays contain now
 ARGUMENTS = ("method", "initial_guess", "max_iterations", "time_limit", "seed", "restarts")  # of `solve`
-RENAMED = {"panel": "conditions"}  # within the sections of a panel and of a trial
+RENAMED = {"panel": "conditions"}  # fields in the sections of a panel and of a trial
 READ_VERSIONS = ("2", "3", SCHEMA_VERSION.split(".")[0])
 FIXED_CONTACTS = {"HeldSpeeds": "FixedSpeeds", "HeldPlaces": "FixedPositions", "HeldForce": "FixedForce"}  # constraints
 
 
 def upgraded(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of a record of version 2 by the names of version 3; the version that wrote them stays."""
+    """Convert the fields of a version 2 record to the names of version 3; `schema_version` is unchanged."""
     kind = fields.get("kind")
     names = SECTIONS.get(str(kind), ())
     moved = {name: fields[name] for name in names if name in fields}
@@ -94,7 +94,7 @@ def upgraded(fields: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _with_fixed_contacts(problem: Mapping[str, Any]) -> dict[str, Any]:
-    """The problem of a phase whose points the world held, by the names of version 3."""
+    """Convert the problem of a phase with fixed contacts to the names of version 3."""
     constraints = [
         {**c, "quantity": c["quantity"] and {FIXED_CONTACTS.get(kind, kind): v for kind, v in c["quantity"].items()}}
         for c in problem["constraints"]
@@ -107,9 +107,9 @@ KINDS: dict[str, type[SealedRecord]] = {kind.KIND: kind for kind in (PlanRecord,
 
 
 def record_path(directory: str | Path) -> Path | None:
-    """The file of the record in `directory`, or of one trial; None where there is none.
+    """Return the path of the record in `directory`, or of a trial's record, or None if it does not exist.
 
-    What has that name need not be a plain file: reading it says so.
+    The path may not be a regular file. Reading it raises an error then.
     """
     if is_trial_file(Path(directory)):
         return Path(directory)
@@ -119,10 +119,10 @@ def record_path(directory: str | Path) -> Path | None:
 def load_record(directory: str | Path) -> SealedRecord:
     """Read the record in a directory that a solve, a fit, a comparison, trials or a certification wrote.
 
-    It is read, not verified: see `verify`. A record of version 2 or 3 of the schema is converted.
+    The record is not verified; see `verify`. A record of version 2 or 3 of the schema is converted.
 
     Args:
-        directory: The directory that holds record.json; or trials/ID.json of a panel.
+        directory: The directory with record.json, or trials/ID.json of a panel.
 
     Returns:
         A `PlanRecord`, `FitRecord` or `ComparisonRecord`.
@@ -142,7 +142,7 @@ def load_record(directory: str | Path) -> SealedRecord:
 
 
 def load_plan_record(directory: str | Path) -> PlanRecord:
-    """The record in `directory`; ArtifactError where it is not that of a solve."""
+    """Return the record in `directory`; raise ArtifactError if it is not the record of a solve."""
     record = load_record(directory)
     if not isinstance(record, PlanRecord) or record.subject != "plan":
         raise ArtifactError(f"{directory}: expected the record of a solve, got one of a {record.subject}")
@@ -150,7 +150,7 @@ def load_plan_record(directory: str | Path) -> PlanRecord:
 
 
 def options_of_search(fields: dict[str, Any]) -> None:
-    """Move the arguments of `solve` that are options now to where they are, in a record that was written before."""
+    """Move the arguments of `solve` that have become options to `options`, in a record of an earlier version."""
     for section in (fields.get("inputs"), fields.get("phases")):
         search = section.get("search") if isinstance(section, dict) else None
         if isinstance(search, dict) and "options" not in search:
@@ -159,7 +159,7 @@ def options_of_search(fields: dict[str, Any]) -> None:
 
 
 def parse_record(path: Path, fields: Mapping[str, Any]) -> SealedRecord:
-    """The record with these fields, read from `path`; of a later minor version without what is not known here."""
+    """Parse the fields of a record read from `path`; unknown fields of a later minor version are removed."""
     version = fields.get("schema_version")
     if not isinstance(version, str) or version.split(".")[0] not in READ_VERSIONS:
         raise ArtifactError(f"{path}: schema_version {version!r}; this drake_diff reads {', '.join(READ_VERSIONS)}.x.y")
@@ -170,7 +170,7 @@ def parse_record(path: Path, fields: Mapping[str, Any]) -> SealedRecord:
     if isinstance(gradient, dict) and isinstance(gradient.get("stationarity"), dict):  # before version 4
         quantities = {"stationarity": "stationarity", "solver_tolerance": "solver_tolerance", "horizon": "horizon_s"}
         gradient |= {new: (gradient.pop(old, None) or {}).get("value") for old, new in quantities.items()}
-        known["data"] = None  # which followed from the other sections
+        known["data"] = None  # earlier versions derived it from the other sections
     kind = KINDS.get(str(known.get("kind")))
     if kind is None:
         raise ArtifactError(f"{path}: kind {fields.get('kind')!r}; expected one of {', '.join(KINDS)}")
@@ -187,7 +187,7 @@ def parse_record(path: Path, fields: Mapping[str, Any]) -> SealedRecord:
 
 
 def read_checked(path: Path) -> tuple[SealedRecord, tuple[str, ...]]:
-    """The record in a file, and what of it and of the files beside it is damaged."""
+    """Return the record in a file, and the problems of the record and of the other files in its directory."""
     problems = []
     try:
         fields = read_fields(path)
@@ -206,7 +206,7 @@ def read_checked(path: Path) -> tuple[SealedRecord, tuple[str, ...]]:
 
 
 def _damage_of_files(path_of_record: Path, record: SealedRecord) -> Iterator[str]:
-    """Whether the directory holds the recorded files, as they were, and no others. Nothing outside it is opened."""
+    """Yield the missing, changed and additional files of a directory. Files outside the directory are never opened."""
     paths, read, lister = files_in(path_of_record.parent), 0, path_of_record.name
     paths.pop(lister, None)
     for name in sorted(record.files.keys() - paths.keys()):
@@ -219,7 +219,7 @@ def _damage_of_files(path_of_record: Path, record: SealedRecord) -> Iterator[str
             yield f"{name}: {lister} does not list it"
         else:
             size, result = path.stat(follow_symlinks=False).st_size, ""
-            if size == described.bytes:  # one of another size is not read
+            if size == described.bytes:  # a file of another size is not read
                 read += size
                 if read > MOST_READ:
                     yield f"{name}: it and the files before it have more than {MOST_READ} bytes"
@@ -235,15 +235,15 @@ EXPECTED = "a new or empty directory, or one with only the files of a run"
 
 @contextmanager
 def written_whole(directory: str | Path) -> Iterator[Path]:
-    """A new folder to write to, which takes the place of `directory` when the block has ended well.
+    """Yield a new folder to write to, which replaces `directory` if the block succeeds.
 
-    Else it stays beside `directory`, and a WriteError, or a note of another error, says where. What is in `directory`
-    is replaced where a run wrote it; the record of a run is named by `name_of` the folder.
+    If the block fails, the folder remains next to `directory`, and a WriteError, or a note of another error, contains
+    its path. An earlier run in `directory` is replaced. The record's name is `name_of` the folder.
 
     Raises:
-        InputError: `directory` cannot be replaced: it is no directory, or holds what no run wrote.
-        ArtifactError: Somebody else is writing `directory`.
-        WriteError: The disk is full, or does not let it be written.
+        InputError: `directory` cannot be replaced: it is not a directory, or contains files that no run wrote.
+        ArtifactError: Another run is being written to `directory`.
+        WriteError: `directory` cannot be written, for example because the disk is full.
     """
     target = Path(directory).resolve()
     check_place(target)
@@ -255,7 +255,7 @@ def written_whole(directory: str | Path) -> Iterator[Path]:
             old = _put(partial, target)
         except BaseException as error:
             with suppress(OSError):
-                partial.rmdir()  # where nothing was written
+                partial.rmdir()  # succeeds only if nothing was written
             if partial.is_dir() and isinstance(error, WriteError):
                 raise _with_files_in(f"{error}; what was written is in {partial}", partial) from error
             if partial.is_dir():
@@ -266,9 +266,9 @@ def written_whole(directory: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def writing(target: Path) -> Iterator[None]:
-    """While nobody else writes the directory `target`; ArtifactError where somebody does.
+    """Lock the directory `target` for writing during the block; raise ArtifactError if it is locked already.
 
-    The folders that it is to be in are made; where the block raises, those that are still empty are not left.
+    The parent folders are created. If the block raises, those that are still empty are removed.
     """
     new = [folder for folder in target.parents if not folder.exists()]
     make_folder(target.parent)
@@ -278,14 +278,14 @@ def writing(target: Path) -> Iterator[None]:
                 raise ArtifactError(f"{target}: another run is being written there; choose another directory, or wait")
             yield
     except BaseException:
-        with suppress(OSError):  # one has something in it
+        with suppress(OSError):  # a folder is not empty
             for folder in new:
                 folder.rmdir()
         raise
 
 
 def check_place(target: Path) -> None:
-    """InputError where `target`, a whole path, is not for a run to take: it is no directory, or has others' files."""
+    """Raise InputError if a run cannot take the absolute path `target`: no directory, or one with other files."""
     if target.is_dir():
         if os.path.ismount(target) or Path.cwd().is_relative_to(target):
             got = f"{target}, a mount point or the working directory"
@@ -298,15 +298,15 @@ def check_place(target: Path) -> None:
 
 
 def move_into_place(partial: Path, target: Path) -> None:
-    """Move the written folder `partial` to `target`; the run that was there is removed after that."""
+    """Move the written folder `partial` to `target`, then remove the run that it replaces."""
     _clear(_put(partial, target), target)
 
 
 def _put(partial: Path, target: Path) -> Path | None:
-    """Move `partial` to `target`; where the run is now that was there, None where none was."""
+    """Move `partial` to `target`; return the new path of the run that it replaces, or None if there was no run."""
     for folder, _, _ in os.walk(partial):
         sync_folder(Path(folder))
-    check_place(target)  # a run may take hours
+    check_place(target)  # checked again, since a run may take hours
     if target.is_dir():
         take_mode(partial, target)
         if is_taken(target):
@@ -329,12 +329,12 @@ def _exchanged(partial: Path, target: Path) -> Path:
 
 
 def _replaced(partial: Path) -> Path:
-    """Another name for what lost its place to the run that `partial` was."""
+    """Return a new name for the run that `partial` replaces."""
     return partial.with_name(partial.name.replace(".partial-", ".replaced-"))
 
 
 def _clear(old: Path | None, target: Path) -> None:
-    """Put onto the disk that `target` is in its place, and remove the `old` run."""
+    """Flush the folder of `target` to the disk, and remove the `old` run."""
     try:
         sync_folder(target.parent)
         if old is not None:
@@ -354,29 +354,29 @@ def _with_files_in(message: str, folder: Path) -> WriteError:
 
 
 def is_taken(directory: Path) -> bool:
-    """Whether there is anything in `directory`."""
+    """Return whether `directory` contains anything."""
     return directory.is_dir() and any(directory.iterdir())
 
 
 def partial_of(target: Path) -> Path:
-    """A new name beside `target`, for what is written there first."""
+    """Return a new name next to `target` for a temporary folder."""
     return target.with_name(f"{target.name}.partial-{os.getpid()}-{secrets.token_hex(4)}")
 
 
 def name_of(folder: Path) -> str:
-    """The name of the run in `folder`: that of the directory whose place it takes."""
+    """Return the name of the run in `folder`, which is that of its final directory."""
     name = folder.resolve().name
     result = PARTIAL.fullmatch(name)
     return name if result is None else result["name"]
 
 
 def is_partial(folder: Path) -> bool:
-    """Whether `folder` has the name of a run that did not take its place, or that lost it."""
+    """Return whether `folder` has the name of a run that was not moved to its place, or that was replaced."""
     return PARTIAL.fullmatch(folder.resolve().name) is not None
 
 
 def _others(folder: Path) -> Iterator[Path]:
-    """What is in `folder` that the run there did not write; of one without the record of a run, everything."""
+    """Yield the paths in `folder` that its run did not write; all of them if it has no record of a run."""
     local = set(_written(folder))
     folders = {parent for path in local for parent in path.parents}
     for top, inner, files in os.walk(folder):
@@ -385,11 +385,11 @@ def _others(folder: Path) -> Iterator[Path]:
 
 
 def _written(folder: Path) -> Iterator[Path]:
-    """The files that the records in `folder` list, and these records."""
+    """Yield the records in `folder` and the files that they list."""
     for name in FILES:
         if (folder / name).is_symlink() or not (folder / name).is_file():
             continue
-        with suppress(ArtifactError, ValueError):  # what is no record of ours lists nothing
+        with suppress(ArtifactError, ValueError):  # a file that is not a record lists no files
             fields: dict[str, Any] = read_fields(folder / name)
             if own_sha256(fields) == fields.get("record_sha256"):
                 yield folder / name

@@ -1,8 +1,8 @@
-"""The base of all records, and the fields that they are made of: numbers with units and verdicts, files, failures.
+"""The base class of all records, and their fields: numbers with units and verdicts, files, and failures.
 
-A record is canonical JSON, record.json, beside the files that it describes and a copy of its JSON Schema. It is written
-when a run begins, as "incomplete", and again, last of all files, when everything that it names is there. No number in
-it is NaN or infinite: null stands for one that is not there.
+A record is a canonical JSON file, record.json, in the directory of the files that it describes and of a copy of its
+JSON Schema. It is written as "incomplete" when a run begins, and again after all files that it names. Its numbers are
+never NaN or infinite; missing numbers are null.
 """
 
 import json
@@ -20,18 +20,18 @@ from drake_diff._base.files import MOST_TEXT, json_of, make_folder, read_plain, 
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError
 
-# A new major one where a field goes or changes its meaning, a minor one where one is added.
+# The major version changes if a field is removed or changes its meaning, and the minor version if a field is added.
 SCHEMA_VERSION = "4.1.0"
-# How others are read, word for word in every published schema.
+# The rules for reading other versions, which every published schema contains.
 READING = (
     f"This is version {SCHEMA_VERSION}. An earlier minor version of the same major one is read with what it lacks "
     "empty or null, which says that it was not recorded. A later minor version is read without the fields that are not "
     "known here. Records of versions 2 and 3 are converted. Another major version is refused by name."
 )
 SCHEMAS = Path(__file__).parent.parent / "schema"
-MOST_NAMES = 6  # of files, in a printed record
-BUNDLE = "model"  # the folder of a run directory with what the model file names
-APART = ("wall_clock", "files", "record_sha256")  # of what is the same, byte for byte, in every run
+MOST_NAMES = 6  # largest number of files in a printed record
+BUNDLE = "model"  # the folder of a run directory with the files that the model file names
+APART = ("wall_clock", "files", "record_sha256")  # fields that differ between runs that are otherwise byte-identical
 Passed = Literal["pass", "fail", "incomplete"]
 NOTHING_SOLVED = "nothing was solved"
 Label = Literal["perception_error", "state_error", "planning_error", "control_error", "evaluation_error"]
@@ -39,7 +39,7 @@ Table = dict[str, JsonValue]
 
 
 def _finite(table: Any) -> Any:
-    """`table` as it is; ValueError where a number in it is none that JSON has."""
+    """Return `table` unchanged; raise ValueError if it contains a NaN or infinite number."""
     if isinstance(table, float) and table - table != 0:
         raise ValueError("expected finite numbers, with null for a missing one")
     for item in table.values() if isinstance(table, dict) else table if isinstance(table, list) else ():
@@ -51,12 +51,12 @@ FiniteTable = Annotated[Table, AfterValidator(_finite)]
 
 
 def canonical(fields: Mapping[str, Any]) -> str:
-    """JSON with sorted keys: the same fields give the same text."""
+    """Return the fields as JSON with sorted keys; the same fields give the same text."""
     return json.dumps(fields, sort_keys=True, indent=2, allow_nan=False) + "\n"
 
 
 class Fields(BaseModel):
-    """The rules of all fields: no field that the schema does not have, no NaN, no infinity."""
+    """The base class of all fields: unknown fields, NaN and infinity are forbidden."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
@@ -65,17 +65,17 @@ Section = TypeVar("Section", bound=Fields)
 
 
 def evidence(kind: type[Section], value: object, **given: Any) -> Section:
-    """A section of a record with the attributes of `value`, but for those `given`; null for what is not finite."""
+    """Build a section of a record from the attributes of `value` and from `given`; non-finite numbers become null."""
     return kind(**{name: plain(getattr(value, name)) for name in kind.model_fields if name not in given}, **given)
 
 
 def finite(value: float) -> float | None:
-    """`value`, None where it is none that JSON has."""
+    """Return `value`, or None if it is not finite."""
     return float(value) if math.isfinite(value) else None
 
 
 def plain(value: Any) -> Any:
-    """A number, or lists of them, for JSON: null for what is not finite."""
+    """Convert a number, or nested lists of numbers, to JSON; non-finite numbers become null."""
     if isinstance(value, (float, np.floating)):
         return finite(float(value))
     return [plain(item) for item in value] if isinstance(value, (tuple, list, np.ndarray)) else value
@@ -113,7 +113,7 @@ class Metric(Fields):
         return self
 
     def keeps(self, value: float | None) -> bool:
-        """Whether `value` keeps the tolerance; no value keeps none."""
+        """Return whether `value` satisfies the tolerance; False if either is missing."""
         if value is None or self.tolerance is None:
             return False
         return value <= self.tolerance if self.direction == "at_most" else value >= self.tolerance
@@ -134,9 +134,9 @@ class Failure(Fields):
     label: Label
     code: str
     message: str
-    t_s: float | None = None  # along the motion, where the failure is at one time
+    t_s: float | None = None  # time along the motion, if the failure has one
     detected_by: str
-    evidence: str | None = None  # the section of the record that shows it
+    evidence: str | None = None  # the section of the record that shows the failure
 
 
 class Event(Fields):
@@ -171,8 +171,8 @@ class Certified(Fields):
     entries: int
     counts: dict[str, int]
     worst: str | None
-    power: float  # the smallest error that every entry's differences would have noticed, as a part of the entry
-    told: str  # whose differences they are
+    power: float  # the smallest relative error that the differences detect in every entry
+    told: str  # note on the source of the differences
 
 
 class Provenance(Fields):
@@ -240,7 +240,7 @@ class Inputs(Fields):
     """
 
     initial_guess: str = NOTHING_SOLVED
-    initial_guess_sha256: str | None = None  # of the bytes of xs (N+1, nx), then us (N, nu), as doubles
+    initial_guess_sha256: str | None = None  # SHA-256 of the bytes of xs (N+1, nx), then us (N, nu), as doubles
     seed: int | None = None
     search: FiniteTable | None = None
 
@@ -302,10 +302,10 @@ class GradientEvidence(Fields):
     regularization: str = "none"
     solver_tolerance: float | None = None
     horizon_s: float | None = None
-    final_state_norms: list[float | None] = Field(default_factory=list)  # null where one is not finite
-    lagrangian_norms: list[float | None] = Field(default_factory=list)  # the same
+    final_state_norms: list[float | None] = Field(default_factory=list)  # null for a non-finite norm
+    lagrangian_norms: list[float | None] = Field(default_factory=list)  # null for a non-finite norm
     stationarity: float | None = None
-    reason: str | None = None  # why norms or stationarity are missing
+    reason: str | None = None  # reason for missing norms or stationarity
     certificates: list[Certified] = Field(default_factory=list)
 
 
@@ -316,8 +316,8 @@ class ReplayEvidence(Fields):
     control: str
     time_step_s: float
     contact_approximation: str
-    goal_error: float | None  # the largest, in the state's units
-    bound_violation: float | None  # the same
+    goal_error: float | None  # largest error, in the state's units
+    bound_violation: float | None  # largest violation, in the state's units
     energy_error_J: float | None
     penetration_m: float | None
     holds: bool
@@ -329,7 +329,7 @@ class WallClock(Fields):
 
     written_utc: str
     duration_s: float | None = None
-    latency_median_s: float | None = None  # of a controller, in the unperturbed run and the worst trials
+    latency_median_s: float | None = None  # latency of a controller in the unperturbed run and the worst trials
     latency_99_percent_s: float | None = None
     latency_largest_s: float | None = None
     late: int | None = None
@@ -339,10 +339,10 @@ class WallClock(Fields):
 
 
 class SealedRecord(ShowsItsRepr, Fields):
-    """The base of every record. "incomplete" is what a run that is under way, or was killed, says of itself.
+    """The base class of every record; "incomplete" is the verdict of a run that is in progress or was killed.
 
-    `files` are all others of the directory, by their path in it. `record_sha256` is the hash of this record's canonical
-    JSON (sorted keys, indented by 2) with `record_sha256` empty.
+    `files` are all other files of the directory, by their path in it. `record_sha256` is the hash of this record's
+    canonical JSON (sorted keys, indented by 2) with an empty `record_sha256`.
     """
 
     FILE: ClassVar[str] = "record.json"
@@ -355,7 +355,7 @@ class SealedRecord(ShowsItsRepr, Fields):
     verdict: Passed
     sentence: str
     model: ModelInput
-    data: DataBoundary | None = None  # null: nothing was fitted to data or judged on them
+    data: DataBoundary | None = None  # null: no data were used for fitting or evaluation
     provenance: Provenance
     wall_clock: WallClock
     files: dict[str, FileEvidence] = Field(default_factory=dict)
@@ -363,12 +363,12 @@ class SealedRecord(ShowsItsRepr, Fields):
 
     @property
     def subject(self) -> str:
-        """What the record is of: its kind, or the name of its section."""
+        """The record's kind, or the name of its section."""
         return self.kind
 
     @property
     def file_names(self) -> list[str]:
-        """The files beside the record; those of the model, whose names are hashes, as how many they are."""
+        """The names of the other files in the directory; the model's files, named by hashes, are only counted."""
         sizes = [file.bytes or 0 for name, file in self.files.items() if name.startswith(f"{BUNDLE}/")]
         names = sorted(name for name in self.files if not name.startswith(f"{BUNDLE}/"))
         size = f"{sum(sizes) / 1e6:.2g} MB in {BUNDLE}/" if sizes else ""
@@ -376,39 +376,39 @@ class SealedRecord(ShowsItsRepr, Fields):
 
     @property
     def state(self) -> Literal["incomplete", "complete"]:
-        """Whether the run has ended, well or not."""
+        """Whether the run has ended, with success or failure."""
         return "incomplete" if self.verdict == "incomplete" else "complete"
 
     def is_before(self, *version: int) -> bool:
-        """Whether it was written by an earlier version of the schema, of which the first numbers are given."""
+        """Return whether an earlier schema version wrote the record; the first numbers of the version are given."""
         return tuple(map(int, self.schema_version.split(".")[: len(version)])) < version
 
     @classmethod
     def published_schema(cls) -> bytes:
-        """The JSON Schema as the package has it."""
+        """Return the JSON Schema in the package."""
         return (SCHEMAS / f"{cls.KIND}.schema.json").read_bytes()
 
     @classmethod
     def generated_schema(cls) -> bytes:
-        """The JSON Schema as pydantic makes it from the class; a test holds it equal to the published one."""
+        """Return the JSON Schema that pydantic generates from the class; a test compares it with the published one."""
         schema = {**_untitled(cls.model_json_schema()), "$comment": READING}
         return (json.dumps(schema, sort_keys=True, indent=2) + "\n").encode()
 
     def to_json(self) -> str:
-        """The record as canonical JSON: the same record gives the same bytes."""
+        """Return the record as canonical JSON; the same record gives the same bytes."""
         return canonical(self.model_dump(mode="json"))
 
     def sealed(self) -> Self:
-        """This record with its own hash."""
+        """Return this record with its own hash."""
         return self.model_copy(update={"record_sha256": own_sha256(self.model_dump(mode="json"))})
 
     def begin(self, directory: Path) -> None:
-        """Write this record of a run that is under way."""
+        """Write this record at the start of a run."""
         make_folder(directory)
         write_whole(directory / self.FILE, self.sealed().to_json().encode())
 
     def write(self, directory: Path) -> Self:
-        """Write the schema and then this record, with the hash of every other file in `directory` and its own."""
+        """Write the schema, then this record with its own hash and the hash of every other file in `directory`."""
         make_folder(directory)
         write_whole(directory / self.SCHEMA_FILE, self.published_schema())
         record = self.model_copy(update={"files": files_below(directory, self.FILE)}).sealed()
@@ -416,7 +416,7 @@ class SealedRecord(ShowsItsRepr, Fields):
         return record
 
     def facts(self) -> dict[str, str]:
-        """A few lines about the record, for a reader; each kind adds its own."""
+        """Return a few lines about the record for printing; subclasses add their own."""
         names = self.file_names
         more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
         made = f"{self.wall_clock.written_utc} with Drake {self.provenance.packages.get('drake', '?')}"
@@ -431,7 +431,7 @@ class SealedRecord(ShowsItsRepr, Fields):
 
 
 def _untitled(schema: Any) -> Any:
-    """A JSON Schema without the titles that pydantic makes of names."""
+    """Remove the titles that pydantic generates from names in a JSON Schema."""
     if isinstance(schema, list):
         return [_untitled(item) for item in schema]
     if not isinstance(schema, dict):
@@ -440,23 +440,23 @@ def _untitled(schema: Any) -> Any:
 
 
 def own_sha256(fields: Mapping[str, Any]) -> str:
-    """The hash that belongs into `record_sha256` of a record with these fields."""
+    """Return the `record_sha256` of a record with these fields."""
     return sha256(canonical({**fields, "record_sha256": ""}).encode()).hexdigest()
 
 
 def reproducible(fields: Mapping[str, Any]) -> str:
-    """The canonical JSON of a record's fields without wall-clock facts and hashes: what trace.mcap carries."""
+    """Return the canonical JSON of a record's fields without wall clock, files and hash; trace.mcap contains it."""
     return canonical({key: value for key, value in fields.items() if key not in APART})
 
 
 def files_below(directory: Path, but: str) -> dict[str, FileEvidence]:
-    """Size and hash of every plain file below `directory` except `but`, by its path there; links are left out."""
+    """Return the size and hash of every regular file below `directory` except `but`, by relative path; skip links."""
     paths = {p.relative_to(directory).as_posix(): p for p in directory.rglob("*") if p.is_file() and not p.is_symlink()}
     return {name: file_evidence(path, name) for name, path in sorted(paths.items()) if name != but}
 
 
 def read_fields(path: Path) -> dict[str, Any]:
-    """The JSON object in `path` as it stands there; ArtifactError where it is none."""
+    """Read the JSON object in `path`; raise ArtifactError if there is none."""
     if not os.path.lexists(path):
         raise ArtifactError(f"{path}: no such record; expected a directory that drake_diff wrote")
     try:
@@ -469,6 +469,6 @@ def read_fields(path: Path) -> dict[str, Any]:
 
 
 def file_evidence(path: Path, name: str) -> FileEvidence:
-    """Size and hash of the file at `path`, under the name it has in the record."""
+    """Return the size and hash of the file at `path`, under its `name` in the record."""
     data = path.read_bytes()
     return FileEvidence(path=name, bytes=len(data), sha256=sha256(data).hexdigest())

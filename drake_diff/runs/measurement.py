@@ -1,6 +1,6 @@
-"""Everything that is measured of a solution, once: record.json, trace.mcap and the pages are written from it.
+"""Measure a solution once; record.json, trace.mcap and the pages are written from this measurement.
 
-Whatever a record says of a motion, `verify` computes again by the same function.
+`verify` recomputes every statement of a record about a motion with the same function.
 """
 
 import math
@@ -26,7 +26,7 @@ from drake_diff.optimize.replay import PENETRATION_PART, Replay, energy_toleranc
 from drake_diff.optimize.solution import Solution, Status
 from drake_diff.runs.fields import Event, Failure, Label, Metric, ReplayEvidence, evidence, finite
 
-AT_LIMIT = 1e-3  # of a limit: so close to it an input counts as there; interior points never quite reach it
+AT_LIMIT = 1e-3  # relative distance to a limit that counts as saturation; interior-point solutions stay slightly inside
 ON_THE_PLANT = {  # by the problem's motion
     STEPS: "in the open-loop replay on the discrete plant",
     CONTINUOUS: "in the open-loop replay in continuous time, integrated apart",
@@ -40,7 +40,7 @@ INVARIANTS = {
     "linear momentum error": "N s",
     "angular momentum error": "N m s",
     "penetration": "m",
-    "limit violation": "",  # the positions' own
+    "limit violation": "",  # the unit of the positions
     "friction-cone excess": "N",
 }
 FAILURES: dict[Status, tuple[Label, str]] = {
@@ -57,20 +57,20 @@ FAILURES: dict[Status, tuple[Label, str]] = {
 
 @dataclass(frozen=True, eq=False)
 class Measurement(ShowsItsRepr):
-    """What a solution is on Drake's plant; `measure` makes it.
+    """The measures of a solution on Drake's plant, computed by `measure`.
 
     Attributes:
-        solution: The plan, and how the solver came to it.
-        positions, velocities, inputs: The columns of its states and inputs, with the bounds that the problem sets.
+        solution: The plan, and the solver's result.
+        positions, velocities, inputs: The columns of its states and inputs, with the problem's bounds.
         times, xs, us: (N+1,), (N+1, nx), and (N, nu) or (N+1, nu): the plan at the problem's own knots.
-        motion: The plant's own motion under the planned inputs; None where it could not be taken.
-        integrated: (N+1, nx) where the equations lead from the first state, for a plan in continuous time.
-        penetration_limit: [m] how deep two geometries may overlap; `thinnest` is the geometry that decides it.
-        replays: The plan in every variant of the plant.
-        metrics: Every measure of the plan and of its replay; those with a tolerance decide.
-        invariants: What physics keeps along the replay.
-        failures: Why the run is no success; none for a success.
-        events: What happened, in order: the solver, contacts, inputs at their limits, failures.
+        motion: The plant's own motion under the planned inputs; None if it could not be computed.
+        integrated: (N+1, nx) the states integrated from the first state, for a plan in continuous time.
+        penetration_limit: [m] allowed overlap of two geometries; `thinnest` is the geometry that determines it.
+        replays: The replays of the plan in every variant of the plant.
+        metrics: All measures of the plan and of its replay; those with a tolerance decide the verdict.
+        invariants: The physical invariants along the replay.
+        failures: The reasons why the run is not a success; empty for a success.
+        events: The events in order: the solver, contacts, inputs at their limits, failures.
 
     Example:
         >>> from drake_diff.runs import measure
@@ -100,7 +100,7 @@ class Measurement(ShowsItsRepr):
 
     @property
     def shown(self) -> tuple[Rollout | None, str]:
-        """The motion that the verdict rests on, and what it is; the open-loop one where none holds."""
+        """The motion on which the verdict depends, and its description; the open-loop motion if no replay holds."""
         judged = self.solution.judged_replay
         if judged is None or judged.motion is None or judged.motion is self.motion:
             return self.motion, "open loop"
@@ -117,9 +117,9 @@ class Measurement(ShowsItsRepr):
         return "\n  ".join((*lines, *(f"{m.name}: {m.value} {m.unit} ({m.verdict})" for m in self.metrics)))
 
 
-@np.errstate(over="ignore", invalid="ignore")  # numbers of a run that diverged: they are measured as infinite
+@np.errstate(over="ignore", invalid="ignore")  # values of a diverged run, which are measured as infinite
 def measure(solution: Solution) -> Measurement:
-    """Measure a solution on the plant: once, for all that is written of it.
+    """Measure a solution on the plant, for everything that is written about it.
 
     Args:
         solution: A result of `solve`.
@@ -170,7 +170,7 @@ def measure(solution: Solution) -> Measurement:
 
 
 def _unit(columns: Sequence[CoordinateTerms | Parameter]) -> str:
-    """The units of the worst of several numbers: "rad or m"."""
+    """Join the units of several columns: "rad or m"."""
     return " or ".join(dict.fromkeys(column.unit for column in columns))
 
 
@@ -240,21 +240,21 @@ def _metrics_of_the_replay(
             float(np.max(motion.constraint_violation)),
         ]
     bounds = {}
-    judged = solution.judged_replay  # each that holds has kept its own energy
+    judged = solution.judged_replay  # a replay that holds has passed its own energy check
     rests_on_it = judged is None or judged.motion is None or judged.motion is motion
-    if motion is not None and rests_on_it and np.all(np.isfinite(motion.constraint_violation)):  # which may take some
+    if motion is not None and rests_on_it and np.all(np.isfinite(motion.constraint_violation)):  # else may lose energy
         bounds["energy drift"] = energy_tolerance(motion)
     if motion is not None and solution.problem.has_model and solution.problem.model.file_facts.held_points:
         loop = loop_check(solution.problem.model, motion)
         yield measured("loop gap", f"largest distance of points that a loop holds together {here}", loop.value, "m")
     for (name, definition, unit), value in zip(measures, values, strict=True):
         if name == HALF_STEP and solution.problem.motion != STEPS:
-            continue  # it has no steps
+            continue  # continuous time has no steps
         yield measured(name, definition, value, unit, bounds.get(name), reason=reason)
 
 
 def _failures(solution: Solution, metrics: Sequence[Metric]) -> Iterator[Failure]:
-    """None for a success; else the status, the first certificate and the metrics that do not hold."""
+    """Yield the status and a failed certificate of an unsuccessful solve, or the failed metrics of a successful one."""
     if not solution.success:
         label, code = FAILURES[solution.status]
         found_by = "the solver's status, measured again"
@@ -271,13 +271,13 @@ def _failures(solution: Solution, metrics: Sequence[Metric]) -> Iterator[Failure
 
 
 def gradient_norms(solution: Solution) -> tuple[Array | None, Array | None]:
-    """(N+1,) |d x_N / d x_k| and |d L / d x_k|, None where they are not known."""
+    """Return the norms (N+1,) |d x_N / d x_k| and |d L / d x_k|, or None if they are unknown."""
     ends, result = solution.final_state_norms, solution.optimality
     return None if isinstance(ends, Refusal) else ends, None if isinstance(result, Refusal) else result.state_norms
 
 
 def replay_evidence(r: Replay) -> ReplayEvidence:
-    """A replay as it stands in a record."""
+    """Convert a replay to a section of a record."""
     return evidence(
         ReplayEvidence,
         r,
@@ -289,7 +289,7 @@ def replay_evidence(r: Replay) -> ReplayEvidence:
 
 
 def failure_of(error: BaseException) -> Failure:
-    """The failure of a run that `error` ended before there was a solution."""
+    """Return the failure of a run that `error` ended before there was a solution."""
     label: Label = "evaluation_error"
     if isinstance(error, (SimulationError, GradientError)):
         label = "state_error" if isinstance(error, SimulationError) else "planning_error"
@@ -303,7 +303,7 @@ def failure(label: Label, code: str, message: str, detected_by: str, section: st
 
 
 def _events(solution: Solution, motion: Rollout | None, failures: Sequence[Failure]) -> Iterator[Event]:
-    """Before the motion, along the replay in simulated time, and after it."""
+    """Yield the events before the motion, along the replay in simulated time, and after it."""
     yield Event(t_s=None, kind="solver_started", message=f"{solution.method} with {solution.solver}")
     end = f"{solution.status.value} after {len(solution.iterations)} iterations: {solution.solver_message}"
     yield Event(t_s=None, kind="solver_ended", message=end)
@@ -315,7 +315,7 @@ def _events(solution: Solution, motion: Rollout | None, failures: Sequence[Failu
 
 
 def contact_events(motion: Rollout) -> Iterator[Event]:
-    """Each pair of bodies that begins or ceases to push each other."""
+    """Yield an event whenever a pair of bodies makes or breaks contact."""
     before: set[tuple[str, str]] = set()
     for time, contacts in zip(motion.times, motion.contacts, strict=False):
         now = {(c.body_a, c.body_b) for c in contacts}
@@ -327,7 +327,7 @@ def contact_events(motion: Rollout) -> Iterator[Event]:
 
 
 def _saturation_events(solution: Solution, motion: Rollout) -> Iterator[Event]:
-    """Each input that reaches or leaves a bound of the problem or the effort limit of its actuator."""
+    """Yield an event whenever an input reaches or leaves a bound of the problem or its actuator's effort limit."""
     bounds = solution.problem.bounds
     for i, coordinate in enumerate(solution.problem.model.contract.inputs):
         limits = (max(bounds.u_lower[i], coordinate.lower), min(bounds.u_upper[i], coordinate.upper))
@@ -355,10 +355,10 @@ def measured(
     reason: str = "not finite",
     t_s: float | None = None,
 ) -> Metric:
-    """A metric that is to be at most `tolerance`, or that informs; `reason` is why where `value` is not finite."""
+    """Make a metric of at most `tolerance`, or an "info" metric; `reason` explains a non-finite `value`."""
     known = math.isfinite(value)
     if tolerance is not None and not math.isfinite(tolerance):
-        tolerance = 0.0  # a part of a scale that is no number: of a plan that is not finite
+        tolerance = 0.0  # the tolerance is relative to the scale of a non-finite plan
     return Metric(
         name=name,
         definition=definition,
@@ -373,9 +373,9 @@ def measured(
 
 
 def invariants_of(vector: ParameterVector, motion: Rollout | None, unit: str, here: str) -> Iterator[Metric]:
-    """Each invariant along the replay; null with a reason where it does not apply.
+    """Yield each invariant along the replay; null with a reason if it does not apply.
 
-    `vector` has the parameters' values that the motion is of, `unit` is that of the positions, `here` says which it is.
+    `vector` has the parameter values of the motion, `unit` is the unit of the positions, `here` describes the motion.
     """
     if motion is None:
         for name, of_its_own in INVARIANTS.items():
@@ -383,9 +383,9 @@ def invariants_of(vector: ParameterVector, motion: Rollout | None, unit: str, he
         return
     positions, (lower, upper) = motion.xs[:, : vector.model.nq], vector.model.position_limits
     limits = (positions <= lower) | (positions >= upper)
-    # A limit is implicit: it acts in the step before it is met.
+    # Joint limits are implicit: a limit acts in the step before it is reached.
     held = np.array([bool(c) for c in motion.contacts]) | np.any(limits, axis=1)[1:]
-    free = int(np.argmax(held)) if held.any() else len(held)  # steps from the start with nothing in the way
+    free = int(np.argmax(held)) if held.any() else len(held)  # steps from the start without contact or limits
     yield from _energy(motion, free, here)
     yield from _momentum(vector, motion, free)
     yield _worst("penetration", f"largest overlap of two geometries {here}", "m", motion, motion.penetration)
@@ -401,7 +401,7 @@ def _worst(name: str, definition: str, unit: str, motion: Rollout, values: Array
 
 
 def _energy(motion: Rollout, free: int, here: str) -> Iterator[Metric]:
-    """Of the first, free part: what neither actuators nor damping explain, drift apart from oscillation."""
+    """Yield the drift and oscillation of the energy that neither actuators nor damping explain, in the free part."""
     error = motion.energy_error[: free + 1]
     where = f"over the {free} steps from the start without contact, {here}"
     lasting = swing = math.inf
@@ -415,7 +415,7 @@ def _energy(motion: Rollout, free: int, here: str) -> Iterator[Metric]:
 
 
 def _momentum(vector: ParameterVector, motion: Rollout, free: int) -> Iterator[Metric]:
-    """Of a system that nothing holds to the world: momentum less what gravity gave, and spin about the mass centre."""
+    """Yield the errors of the linear momentum, without gravity's impulse, and of the spin about the mass centre."""
     linear = angular = math.inf
     reason = _why_not_conserved(vector.model, free)
     if not reason:
@@ -429,7 +429,7 @@ def _momentum(vector: ParameterVector, motion: Rollout, free: int) -> Iterator[M
 
 
 def _why_not_conserved(model: Model, free: int) -> str:
-    """Why momentum is not conserved in this model; empty where it is."""
+    """Return the reason why the model does not conserve momentum, or "" if it does."""
     for joint in joints(model.plant):
         holds = model.plant.IsAnchored(joint.parent_body()) and not model.plant.IsAnchored(joint.child_body())
         if holds and joint.type_name() not in FLOATING:
@@ -457,7 +457,7 @@ def _momentum_errors(model: Model, motion: Rollout, free: int) -> tuple[float, f
 
 
 def _friction_cone(vector: ParameterVector, motion: Rollout, here: str) -> Metric:
-    """By how much a tangential contact force is larger than friction allows."""
+    """Compute the largest excess of a tangential contact force over the limit of Coulomb friction."""
     name, definition = "friction-cone excess", f"largest |f_t| - mu f_n of a contact's force {here}"
     if any(parameter.name.endswith(".friction") for parameter in vector.parameters):
         return measured(name, definition, np.inf, "N", reason="friction is a parameter here, not the contract's")

@@ -1,6 +1,6 @@
-"""The sentences of runs: what was asked of which robot, and what a record claims.
+"""Sentences about runs: the task and the robot, and the claims of a record.
 
-A weaker claim can be just as true as a stronger one, so a reader has to see it.
+A weaker claim can be just as true as a stronger one, so readers must see the claims.
 """
 
 import re
@@ -24,15 +24,15 @@ from drake_diff.runs.other_records import ComparisonRecord, FitRecord
 from drake_diff.runs.plan_record import PlanRecord
 from drake_diff.runs.sections import COSTS, LIMITS
 
-STILL = 1e-3  # [rad/s or m/s] what is no faster is at rest
-MOST = 8  # coordinates: of more the others are counted
-PARTS = ("fixed_contacts", "waypoints", "goals", "constraints", "couplings", *COSTS)  # of a problem, where it has them
+STILL = 1e-3  # [rad/s or m/s] largest speed that counts as rest
+MOST = 8  # largest number of listed coordinates; above it, zeros are only counted
+PARTS = ("fixed_contacts", "waypoints", "goals", "constraints", "couplings", *COSTS)  # optional parts of a problem
 
 
 def claims_of(record: SealedRecord) -> tuple[str, ...]:
-    """The lines: the verdict, the model and how it was loaded, and what was asked."""
+    """Return lines that state the verdict, the model and its options, and the task."""
     lines = [f"{record.verdict}: {record.sentence}"]
-    if record.subject != "phases":  # each phase has its own
+    if record.subject != "phases":  # each phase has its own model
         file, options = record.model.file, _table(record.model.options, "")
         source = "a user's own diagram or function" if file is None else f"{file.path} ({(file.sha256 or '')[:12]})"
         hashes = "".join(sorted(f"{named.path} {named.sha256}\n" for named in record.model.named if named.sha256))
@@ -99,7 +99,7 @@ def _of_a_problem(p: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _named(names: Any, values: Any) -> str:
-    """Values with their names where there is one: "hinge_q 3.14"; of many those that are not 0."""
+    """Format values with their names, such as "hinge_q 3.14"; above MOST values, only the nonzero ones."""
     if not isinstance(values, list) or not isinstance(names, list):
         return shown(values)
     given = [(str(name), v) for name, v in zip(names, values, strict=False) if v is not None]
@@ -110,12 +110,12 @@ def _named(names: Any, values: Any) -> str:
 
 
 def _table(values: Mapping[str, Any] | None, none: str = "arguments that are not recorded") -> str:
-    """A table on one line."""
+    """Format a table on one line."""
     return ", ".join(f"{name} {shown(v)}" for name, v in sorted((values or {}).items()) if v is not None) or none
 
 
 def asked_for(problem: Problem, times: Array) -> str:
-    """One sentence: the robot, where it was to get to by when, what it was to keep, and what was free to choose."""
+    """Describe the task in a sentence: the robot, its goals and constraints, the time, and the free variables."""
     size = f"{problem.nx} states"
     if problem.has_model:
         size = f"{problem.model.nv} degree{'s' * (problem.model.nv != 1)} of freedom"
@@ -142,7 +142,7 @@ def asked_for(problem: Problem, times: Array) -> str:
 
 
 def _end(problem: Problem) -> Iterator[str]:
-    """Where the last state has to be."""
+    """Describe the required final state."""
     goal = problem.goal
     given = ~np.isnan(goal)
     if not given.any():
@@ -160,7 +160,7 @@ def _end(problem: Problem) -> Iterator[str]:
 
 
 def _of_goal(goal: goals.Goal, problem: Problem, times: Array) -> str:
-    """A goal or an obstacle as what the robot was to do."""
+    """Describe a goal or an obstacle as a task of the robot."""
     if isinstance(goal, SelfCollision):
         return "keep its links clear of each other"
     if isinstance(goal, (SphereObstacle, BoxObstacle)):
@@ -189,7 +189,7 @@ def _act(goal: goals.Goal) -> str:
 
 
 def _when(knots: Any, problem: Problem, times: Array) -> str:
-    """At which times a goal holds, where it is not at the end."""
+    """Return the times at which a goal applies, or "" if that is the end."""
     if knots is None or not isinstance(knots, Sequence) or isinstance(knots, str):
         return ""
     indices = sorted({int(k) % (problem.num_steps + 1) for k in knots})

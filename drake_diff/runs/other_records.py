@@ -1,4 +1,4 @@
-"""The records of fits and of comparisons, and of panels, which are comparisons of many trials."""
+"""The records of fits and of comparisons, including panels, which are comparisons of many trials."""
 
 import re
 from collections.abc import Mapping
@@ -26,8 +26,8 @@ class Asked(Fields):
     motion: str
     max_iterations: int
     priors: dict[str, list[list[float]]] = Field(default_factory=dict)  # means, and standard deviations
-    bounds: dict[str, list[float | None]] = Field(default_factory=dict)  # lower and upper; null: none
-    sensors: dict[str, Mounted] = Field(default_factory=dict)  # where those sit that are no body's frame
+    bounds: dict[str, list[float | None]] = Field(default_factory=dict)  # lower and upper; null: no bound
+    sensors: dict[str, Mounted] = Field(default_factory=dict)  # mounts of the sensors that are not at a body's frame
 
 
 class RecordingEvidence(Fields):
@@ -43,7 +43,7 @@ class RecordingEvidence(Fields):
     path: str
     sha256: str | None
     samples: int
-    fitted_s: list[list[float]]  # from, to [s], each with a first state of its own
+    fitted_s: list[list[float]]  # intervals (from, to) [s], each with its own initial state
     held_out_s: list[list[float]]
 
 
@@ -82,11 +82,11 @@ class FitRecord(SealedRecord):
     estimates: list[Estimate] = Field(default_factory=list)
     unidentifiable: list[str] = Field(default_factory=list)
     noise: dict[str, float] = Field(default_factory=dict)
-    error_before: float | None = None  # in standard deviations of the noise; null where there was no motion to measure
+    error_before: float | None = None  # in standard deviations of the noise; null if there was no motion to measure
     error_after: float | None = None
     score: float | None = None
     count: int = 0
-    correlation: list[list[float | None]] = Field(default_factory=list)  # of the estimates; null where nothing is known
+    correlation: list[list[float | None]] = Field(default_factory=list)  # of the estimates; null if it is unknown
 
     @model_validator(mode="after")
     def _passes_only_what_is_explained(self) -> "FitRecord":
@@ -102,14 +102,14 @@ class FitRecord(SealedRecord):
         return self
 
     def facts(self) -> dict[str, str]:
-        """How many parameters, from how much data."""
+        """Return the number of known parameters, and the amount of data."""
         known = sum(e.lower is not None and e.upper is not None for e in self.estimates)
         used = f"{len(self.recordings)} recordings, {self.count} numbers"
         return {"data": used, "known": f"{known} of {len(self.estimates)} numbers", **super().facts()}
 
 
-TRIALS = "trials"  # the folder of the records of trials, in that of their panel
-TRIAL_PACKAGES = ("drake", "drake-diff", "numpy")  # whose versions two trials of one table share
+TRIALS = "trials"  # the folder of the trials' records, in the panel's directory
+TRIAL_PACKAGES = ("drake", "drake-diff", "numpy")  # packages whose versions must agree for two trials in one table
 NOT_JUDGED = "it ran, and does not say whether it is a success"
 Sameness = Literal["same", "other law", "other model", "unexplained"]
 Numbers = list[float | None]  # null: not finite
@@ -141,7 +141,7 @@ class JacobianEvidence(Fields):
     method: str
     gap: float
     jacobian: list[Numbers]
-    law: str  # of contact or limits, where one is at work there
+    law: str  # of contact or limits, if one is active
     own: str | None
     certificate: Certified | None
 
@@ -150,18 +150,18 @@ class FunctionEvidence(Fields):
     """A user's own equations: their code is not in the record, and cannot be run again from it."""
 
     name: str
-    sha256: str | None  # of the source; null where Python could not show it
+    sha256: str | None  # of the source; null if Python could not read it
     parameters: dict[str, float]
 
 
 class CauseEvidence(Fields):
     """The smallest change of the model that explains a recording, with 95 % intervals; or why nothing is named."""
 
-    names: list[str]  # what is changed, together
+    names: list[str]  # the quantities that are changed together
     values: dict[str, Numbers]
-    intervals: dict[str, list[Numbers]]  # by name, lower and upper of each of its numbers
-    alternatives: list[list[str]]  # changes that the recording cannot tell from this one
-    explained: bool  # by the model as it is, or with the change
+    intervals: dict[str, list[Numbers]]  # by name: lower and upper limits of its numbers
+    alternatives: list[list[str]]  # changes that explain the recording equally well
+    explained: bool  # whether the model explains the recording, unchanged or with the change
     sentence: str
 
 
@@ -170,7 +170,7 @@ class RecordedEvidence(Fields):
 
     name: str
     version: str
-    facts: dict[str, str]  # what is known of the engine's contract
+    facts: dict[str, str]  # the known parts of the engine's contract
     path: str
     samples: int
 
@@ -186,7 +186,7 @@ class EngineEvidence(Fields):
     contract: list[LineEvidence]
     status: str
     steps: int
-    largest_step_gap: float  # relative to the state where that is above 1
+    largest_step_gap: float  # relative to the state if that is above 1
     first_apart_s: float | None
     first: AttributionEvidence
     largest: AttributionEvidence
@@ -227,10 +227,10 @@ class PanelSection(Fields):
     trials: int
     errors: int | None  # null while trials are missing
     ranked_by: str = ""
-    ranking: list[FiniteTable] = Field(default_factory=list)  # a row for each cell, the best first
+    ranking: list[FiniteTable] = Field(default_factory=list)  # a row for each cell, in descending order
 
     def facts(self) -> dict[str, str]:
-        """How many trials, and the best cell."""
+        """Return the number of trials, and the best cell."""
         best = {"best": str(self.ranking[0]["name"])} if self.ranking else {}
         return {"trials": f"{self.trials}, {self.errors} errors", **best}
 
@@ -268,7 +268,7 @@ class ComparisonRecord(SealedRecord):
 
     @property
     def subject(self) -> str:
-        """What the record is of: "comparison", "panel" or "trial"."""
+        """The subject of the record: "comparison", "panel" or "trial"."""
         return "panel" if self.panel else "trial" if self.trial else self.kind
 
     @model_validator(mode="after")
@@ -286,7 +286,7 @@ class ComparisonRecord(SealedRecord):
         return self
 
     def facts(self) -> dict[str, str]:
-        """The verdict on each engine but the reference; of a panel its best cell, of a trial its result."""
+        """Return the verdict on each engine except the reference, a panel's best cell, or a trial's result."""
         if self.trial is not None:
             return {name: str(value) for name, value in self.trial.result.items()}
         if self.panel is not None:
@@ -300,7 +300,7 @@ class ComparisonRecord(SealedRecord):
 
 
 def judged(result: Mapping[str, Any]) -> tuple[Literal["pass", "fail"], str]:
-    """The verdict on a trial by its result, and why."""
+    """Return the verdict on a trial according to its result, and the reason."""
     if "error" in result:
         return "fail", f"it ended in an error: {result['error']}"
     if isinstance(result.get("success"), bool):
@@ -311,7 +311,7 @@ def judged(result: Mapping[str, Any]) -> tuple[Literal["pass", "fail"], str]:
 def trial_record(
     trial: str, name: str, cell: FiniteTable, inputs: FiniteTable, result: FiniteTable, conditions: Mapping[str, Any]
 ) -> ComparisonRecord:
-    """The sealed record of one trial; of the versions it has those that `conditions` have."""
+    """Return the sealed record of a trial, with the package versions in `conditions`."""
     verdict, sentence = judged(result)
     packages = {key: str(conditions[key]) for key in TRIAL_PACKAGES if conditions.get(key)}
     return ComparisonRecord(
@@ -332,5 +332,5 @@ def trial_record(
 
 
 def is_trial_file(path: Path) -> bool:
-    """Whether `path` can be the record of a trial of a panel: ID.json in trials/."""
+    """Return whether `path` can be the record of a trial of a panel: ID.json in trials/."""
     return path.parent.name == TRIALS and re.fullmatch(r"[0-9a-f]{16}\.json", path.name) is not None and path.is_file()

@@ -1,7 +1,6 @@
-"""The pages of a run, which open from a disk: the motion in 3D, and a report.
+"""The pages of a run, which open without a server: the motion in 3D, and a report.
 
-The first screen of the report says what was asked of which robot, and whether what was checked holds; plots and numbers
-follow.
+The first screen of the report states the task and the robot, and whether all checks hold. Plots and numbers follow.
 """
 
 import math
@@ -34,9 +33,9 @@ CONTROLS = {
 
 @dataclass(frozen=True)
 class PageCheck:
-    """One thing that was checked: its `title`, its `kind`, and what was found in words.
+    """A check: its `title`, its `kind`, and its result in words.
 
-    The kind is "pass", "fail", "undecided", "info", or "warn" where something fails that the verdict does not rest on.
+    The kind is "pass", "fail", "undecided", "info", or "warn" for a failure that does not affect the verdict.
     """
 
     title: str
@@ -45,7 +44,7 @@ class PageCheck:
 
 
 def checks_of(m: Measurement, record: Mapping[str, Any]) -> list[PageCheck]:
-    """What was checked of a run, in the order in which it was."""
+    """Return the checks of a run in the order in which they were made."""
     status, count = m.solution.status, record["solver"]["iterations"]
     rounds = f"{count} iteration{'s' * (count != 1)} of {record['solver']['solver']}"
     ended = "stopped at a solution" if status is Status.CONVERGED_NOT_VERIFIED else status.value.replace("_", " ")
@@ -65,14 +64,14 @@ def checks_of(m: Measurement, record: Mapping[str, Any]) -> list[PageCheck]:
         kind, content = (
             "pass",
             "that of the end is a slope of another integration",
-        )  # else the plan is none
+        )  # otherwise the status is not CONVERGED
     result.append(PageCheck("Gradients", kind, content))
     return result
 
 
 def _of_replays(m: Measurement, replays: Sequence[Mapping[str, Any]]) -> Iterator[PageCheck]:
     judged = m.solution.judged_replay
-    failed = judged is None and not m.solution.success  # each replay may hold by one of the two, and neither by both
+    failed = judged is None and not m.solution.success  # each replay may hold under one control, and no control in all
     for control in dict.fromkeys(r["control"] for r in replays):
         tried = [r for r in replays if r["control"] == control]
         lost = [r for r in tried if not r["holds"]]
@@ -84,20 +83,20 @@ def _of_replays(m: Measurement, replays: Sequence[Mapping[str, Any]]) -> Iterato
             text = f"holds in {len(tried) - len(lost)} of {len(tried)} replays; {lost[0]['variant']}: "
             text += lost[0]["failures"][0] if lost[0]["failures"] else "it fails"
         kind = "pass" if enough or not lost else "fail" if failed else "warn"
-        if lost and kind == "pass":  # the verdict rests on those that hold; a tick beside a failure reads as a slip
+        if lost and kind == "pass":  # the verdict depends on the replays that hold, so no failure is shown
             text = f"holds {joined([r['variant'] for r in tried if r['holds']])}; see Replays for other steps"
         yield PageCheck(CONTROLS.get(control, control), kind, text)
 
 
-SERIES_PER_PLOT = 6  # more lines cannot be told apart
+SERIES_PER_PLOT = 6  # more lines are hard to distinguish
 PHYSICS, SEARCH = "Energy and contact", "Search"
 
 
 def write_pages(replay: Path, report: Path, m: Measurement, record: Mapping[str, Any]) -> None:
     """Write the pages of a measurement, whose `record` is given as plain data.
 
-    Plain dynamics have nothing to draw in 3D, and so no page `replay`. The bytes are the same for the same solution,
-    but for the paragraph of wall-clock times.
+    Plain dynamics have no 3D scene and therefore no page `replay`. The same solution gives the same bytes, except for
+    the paragraph of wall-clock times.
     """
     plots, view, colours = list(plots_of(m)), "", list[Colour]()
     if m.solution.problem.has_model:
@@ -125,12 +124,12 @@ def write_pages(replay: Path, report: Path, m: Measurement, record: Mapping[str,
 
 
 def _colours_of(scene: Scene) -> list[Colour]:
-    """What is drawn in a replay beside the robot."""
+    """Return the colours of the objects that a replay shows in addition to the robot."""
     return colours_of(plan=bool(scene.ghosts), contacts=any(scene.contacts), thrusts=any(scene.thrusts))
 
 
 def alike(certificates: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """A row for each run of certificates that say the same; `power` is that of the one which would notice least."""
+    """Merge successive certificates of equal content into a row; `power` is the largest one, the least sensitive."""
     rows: list[dict[str, Any]] = []
     for number, c in enumerate(certificates):
         content = {name: c[name] for name in ("subject", "method", "verdict", "entries")} | {
@@ -146,7 +145,7 @@ def alike(certificates: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def plots_of(m: Measurement) -> Iterator[Plot]:
-    """What the report plots, over time and over the solver's iterations."""
+    """Yield the plots of the report, over time and over the solver's iterations."""
     yield from _state_plots(m, "Positions", 0, m.positions)
     yield from _state_plots(m, "Velocities", len(m.positions), m.velocities)
     yield from _input_plots(m)
@@ -167,7 +166,7 @@ def plots_of(m: Measurement) -> Iterator[Plot]:
 
 
 def _state_plots(m: Measurement, group: str, start: int, columns: Sequence[CoordinateTerms]) -> Iterator[Plot]:
-    """A plot for each column: the motion, and the plan where it is another. Plain dynamics have "states" alone."""
+    """Yield a plot for each column: the motion, and the plan if it differs. Plain dynamics have only "States"."""
     shown = m.shown[0]
     motion = m.integrated if shown is None else shown.xs[:: _parts(m)]
     differs = motion is not None and differ(motion, m.xs)
@@ -179,13 +178,13 @@ def _state_plots(m: Measurement, group: str, start: int, columns: Sequence[Coord
 
 
 def _parts(m: Measurement) -> int:
-    """How many steps of the motion that is shown make one of the plan's intervals."""
+    """Return the number of steps of the displayed motion per interval of the plan."""
     motion = m.shown[0]
     return 1 if motion is None else (len(motion.xs) - 1) // (len(m.xs) - 1)
 
 
 def _input_plots(m: Measurement) -> Iterator[Plot]:
-    """A plot for each input, as a part of its limit where it has one."""
+    """Yield a plot for each input, relative to its limit if it has one."""
     held, motion = len(m.us) < len(m.times), m.shown[0]
     for i, c in enumerate(m.inputs):
         planned = Line("plan", _as_long(m.us[:, i], m.times), held=held)
@@ -199,7 +198,7 @@ def _input_plots(m: Measurement) -> Iterator[Plot]:
 
 
 def _as_long(values: Array, times: Array) -> Array:
-    """`values` with as many entries as there are times, the last one held or missing ones NaN."""
+    """Extend `values` to the number of times: repeat the last value if one is missing, else append NaN."""
     missing = max(0, len(times) - len(values))
     return np.append(values, np.full(missing, values[-1] if missing == 1 and len(values) else np.nan))
 

@@ -1,4 +1,4 @@
-"""The record of a plan: one solve, in one phase or several, and what was certified or tried of a plan or its model."""
+"""The record of a plan: a solve in one phase or several, or the certificates or trials of a plan or its model."""
 
 from collections.abc import Iterator
 from typing import Any, ClassVar, Literal
@@ -51,7 +51,7 @@ CONTRACT_UNITS = {
 
 
 def units_of_keys(units: dict[str, str]) -> str:
-    """The description of a table of numbers in the JSON Schema."""
+    """Return the description of a table of numbers for the JSON Schema."""
     return f"Units: {'; '.join(f'{keys}: {unit}' for keys, unit in units.items())}."
 
 
@@ -61,7 +61,7 @@ class PhaseEvidence(Fields):
     name: str
     directory: str
     status: str
-    cost: float | None  # null where it is not finite
+    cost: float | None  # null if it is not finite
     duration: float  # [s], or steps of a map
 
 
@@ -76,7 +76,7 @@ class LinkEvidence(Fields):
     after: int
     told: str
     reset: FiniteTable | None
-    errors: list[float | None]  # of each state of the phase after, in its unit; null where one is not finite
+    errors: list[float | None]  # error of each state of the phase after, in its unit; null if it is not finite
     tolerance: float
     certificate: Certified | None
 
@@ -87,7 +87,7 @@ class ChainEvidence(Fields):
     holds: bool
     control: str
     told: str
-    worst: float | None  # distance from the plan or beyond a bound, as a part of the state's range
+    worst: float | None  # distance from the plan or beyond a bound, relative to the state's range
 
 
 class PhasesSection(Fields):
@@ -97,7 +97,7 @@ class PhasesSection(Fields):
     """
 
     horizon_s: list[float] | None  # (lower, upper) of the sum of all durations
-    counts_steps: bool  # of maps, whose time counts steps
+    counts_steps: bool  # for maps, whose time is a number of steps
     search: FiniteTable | None = None  # the arguments of `solve`
     initial_guess: str | None = None  # null: none was given
     cost: float | None = None
@@ -106,7 +106,7 @@ class PhasesSection(Fields):
     chain: ChainEvidence | None = None
 
     def broken(self) -> Iterator[str]:
-        """Why the plan is no success."""
+        """Yield the reasons why the plan is not a success."""
         yield from (f"{p.name} {p.status}" for p in self.phases if p.status != "converged")
         for link in self.links:
             if not all(error is not None and error <= link.tolerance for error in link.errors):
@@ -117,7 +117,7 @@ class PhasesSection(Fields):
             yield "the chain of all phases"
 
     def facts(self) -> dict[str, str]:
-        """The phases, and the cost of all of them."""
+        """Return the phases and their total cost."""
         unit = "steps" if self.counts_steps else "s"
         phases = ", ".join(f"{p.name} ({p.duration:.4g} {unit}, {p.status})" for p in self.phases)
         return {"phases": phases or "none yet", "cost": "none" if self.cost is None else f"{self.cost:.6g}"}
@@ -132,12 +132,12 @@ class CertifiedState(Fields):
     gradient: Certified | None
     refusal: str | None = None  # why there is no certificate
     largest: float | None = None  # the largest entry of the derivative
-    contact_modes: dict[str, str] = Field(default_factory=dict)  # of the pairs that push each other
+    contact_modes: dict[str, str] = Field(default_factory=dict)  # of the pairs in contact
     mode_changes: list[str] = Field(default_factory=list)  # within 1e-4 of the state
 
     @property
     def verdict(self) -> str:
-        """The certificate's, or "refused"."""
+        """The verdict of the certificate, or "refused"."""
         return self.gradient.verdict if self.gradient else "refused"
 
 
@@ -150,13 +150,13 @@ class CertificationSection(Fields):
     states: list[CertifiedState]
 
     def broken(self) -> Iterator[str]:
-        """The states whose certificate does not agree."""
+        """Yield the states whose certificate does not agree."""
         yield from (f"state {i} {s.verdict}" for i, s in enumerate(self.states) if s.verdict != "agree")
         if not self.states:
             yield "no state"
 
     def facts(self) -> dict[str, str]:
-        """How many states have which verdict."""
+        """Return the number of states with each verdict."""
         verdicts = [state.verdict for state in self.states]
         counts = ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in dict.fromkeys(verdicts))
         return {"states": counts or "none yet", "seed": str(self.seed), "method": self.method}
@@ -172,12 +172,12 @@ class RolloutSection(Fields):
     certificate: Certified
 
     def broken(self) -> Iterator[str]:
-        """The entries that do not agree."""
+        """Yield the entries that do not agree."""
         pairs = zip((*self.columns, "the certificate"), (*self.verdicts, self.certificate.verdict), strict=True)
         yield from (f"{column} {verdict}" for column, verdict in pairs if verdict != "agree")
 
     def facts(self) -> dict[str, str]:
-        """What was differentiated."""
+        """Return the names of the columns of the derivative."""
         return {"columns": ", ".join(self.columns)}
 
 
@@ -197,9 +197,9 @@ class CellEvidence(Fields):
     rate: float
     lower_95: float  # Wilson's interval
     upper_95: float
-    distinct: int  # how many of the trials end in a state of their own: 1 where nothing is drawn
+    distinct: int  # number of different final states of the trials: 1 without random numbers
     labels: dict[str, int]
-    controller_errors: dict[str, int]  # "Type: message" of what the controller raised, and in how many trials
+    controller_errors: dict[str, int]  # "Type: message" of the controller's exceptions, and the number of trials
     goal_error_median: float | None
     goal_error_worst: float | None
     displacement: float | None
@@ -219,7 +219,7 @@ class PerturbationEvidence(Fields):
 
 
 class EventEvidence(Fields):
-    """Something that happened in a loop, at simulated time."""
+    """An event in a closed loop, at simulated time."""
 
     t_s: float
     kind: str
@@ -227,9 +227,9 @@ class EventEvidence(Fields):
 
 
 class TrialEvidence(Fields):
-    """One trial, with all that it takes to run it again: `loop.panel_trial.evaluate` takes it as it is.
+    """One trial, with everything needed to repeat it: `loop.panel_trial.evaluate` accepts it unchanged.
 
-    `run` is null where the plan was not read from a run directory: the trial can be run again with it at hand alone.
+    `run` is null if the plan was not read from a run directory; to repeat the trial, the plan must then be given.
     """
 
     run: str | None
@@ -246,7 +246,7 @@ class TrialEvidence(Fields):
     ended: str
     plant_time_step_s: float
     controller_period_s: float
-    parameters: dict[str, float | list[float]]  # of the plant, where another than the model's
+    parameters: dict[str, float | list[float]]  # of the plant, if they differ from the model's
     start: list[float]
     events: list[EventEvidence]
 
@@ -301,13 +301,13 @@ class RobustnessSection(Fields):
     perturbations: list[PerturbationEvidence] = Field(default_factory=list)
 
     def broken(self) -> Iterator[str]:
-        """The perturbations that the plan does not survive."""
+        """Yield the perturbations that the plan does not survive."""
         yield from (p.name for p in self.perturbations if p.margin <= 0)
         if self.nominal is None or not self.nominal.success:
             yield "an unperturbed run that is no success"
 
     def facts(self) -> dict[str, str]:
-        """The margin of each perturbation."""
+        """Return the margin of each perturbation."""
         return {p.name: f"survived up to {p.margin:g} {p.unit}" for p in self.perturbations}
 
 
@@ -335,12 +335,12 @@ class ClosedLoopSection(Fields):
     controller_error: str
 
     def broken(self) -> Iterator[str]:
-        """Why the run is no success, but for the metrics."""
+        """Yield the reasons why the run is not a success, apart from the metrics."""
         if self.ended:
             yield "a run that broke off"
 
     def facts(self) -> dict[str, str]:
-        """The controller, and how long it ran."""
+        """Return the controller, and the duration of the run."""
         return {"controller": self.loop.controller, "steps": f"{self.loop.steps} of {self.loop.period_s:g} s"}
 
 
@@ -377,12 +377,12 @@ class PlanRecord(SealedRecord):
 
     @property
     def section(self) -> Section | None:
-        """The section that the record is of; None of a solve in one phase."""
+        """The section that the record is about, or None for a solve in one phase."""
         return next((getattr(self, name) for name in SECTIONS if getattr(self, name) is not None), None)
 
     @property
     def subject(self) -> str:
-        """What the record is of: "plan", or the name of its section."""
+        """The subject of the record: "plan", or the name of its section."""
         return next((name for name in SECTIONS if getattr(self, name) is not None), self.kind)
 
     @model_validator(mode="after")
@@ -400,7 +400,7 @@ class PlanRecord(SealedRecord):
         return self
 
     def as_row(self) -> dict[str, str]:
-        """The textbook's view of the record: section, tool, observation, action, metric, perturbation."""
+        """Return the record as a textbook's table row: section, tool, observation, action, metric, perturbation."""
         units = {c.name: c.unit for c in self.gradient.columns} if self.gradient else {}
         problem: dict[str, Any] = self.problem
         observed, commanded = (
@@ -417,7 +417,7 @@ class PlanRecord(SealedRecord):
         }
 
     def facts(self) -> dict[str, str]:
-        """The section's, or the cost; the solver and the failures."""
+        """Return the facts of the section, or the cost, and the solver and the failures."""
         cost = next((m.value for m in self.metrics if m.name == "cost"), None)
         facts = {"cost": "none" if cost is None else f"{cost:.6g}"} if self.section is None else self.section.facts()
         if self.solver is not None:

@@ -1,7 +1,7 @@
-"""Where a record comes from: packages, commit, command, and the model file with all files that it names.
+"""The provenance of a record: packages, commit, command, and the model file with all files that it names.
 
-Those files (meshes, included models, licences) are copied into the run directory, each under the hash of its content.
-A record calls them as the model file does, wherever they are: only its provenance says where that was.
+The named files (meshes, included models, licences) are copied into the run directory under the hashes of their
+contents. A record refers to them by the model file's names. Only its provenance contains the original paths.
 """
 
 import os
@@ -33,7 +33,7 @@ from drake_diff.runs.fields import (
     file_evidence,
 )
 
-MOST_BUNDLED = LARGEST_ANSWER  # bytes of such a file: as much as the process that reads it again may write
+MOST_BUNDLED = LARGEST_ANSWER  # [bytes] largest file to copy: the limit of the child process, which writes it again
 WRITERS = ("mcap", "mcap-protobuf-support", "protobuf", "foxglove-schemas-protobuf", "pydantic")
 TRACKED = ("--porcelain", "--untracked-files=no", "--ignore-submodules=all")
 LONGEST_PATH = 4096
@@ -41,7 +41,7 @@ PACKAGES = ("drake", "drake-diff", "numpy", "casadi", "pin", "numba", "mujoco", 
 
 
 def gradient_evidence(certificate: Certificate) -> Certified:
-    """A certificate as it stands in a record."""
+    """Convert a certificate to a section of a record."""
     return evidence(
         Certified,
         certificate,
@@ -52,10 +52,10 @@ def gradient_evidence(certificate: Certificate) -> Certified:
 
 
 def header(name: str, model: Model | None = None, seconds: float | None = None, **clock: Any) -> dict[str, Any]:
-    """The fields of every record: its name and model, the versions, when it was made, and how long that took.
+    """Return the fields of every record: its name and model, the versions, the time of writing, and the duration.
 
     Raises:
-        InputError: a name is no text: files and pages of a run are written in UTF-8.
+        InputError: A name cannot be encoded in UTF-8, the encoding of a run's files and pages.
     """
     return {
         "name": _checked_name("name", name),
@@ -66,7 +66,7 @@ def header(name: str, model: Model | None = None, seconds: float | None = None, 
 
 
 def model_input(model: Model | None) -> ModelInput:
-    """The model file with what it names, and the options it was loaded with."""
+    """Return the model file with the files that it names, and the options with which it was loaded."""
     if model is None or model.source is None or model.options is None:
         return ModelInput(file=None, options=None)
     options = {name: value for name, value in model.options.items() if name != "packages"}
@@ -86,7 +86,7 @@ def _checked_name(subject: str, name: str) -> str:
 
 
 def contract_of(model: Model | None) -> dict[str, Any]:
-    """The contract of a model as it stands in a record: files by their names, wherever they are."""
+    """Return the contract of a model for a record, with names of files instead of their paths."""
     if model is None:
         return {}
     contract = model.contract.to_dict()
@@ -111,7 +111,7 @@ def _files_of(model: Model) -> list[NamedFile]:
 
 
 def evidence_of(path: Path, packages: Mapping[str, str] | None) -> list[FileEvidence]:
-    """What the model file at `path` names, by the name it has there, sorted; `packages` as `load_model` takes them."""
+    """Return the files that the model file at `path` names, sorted by name; `packages` is as in `load_model`."""
     return [_evidence(file) for file in named_files(path, packages)]
 
 
@@ -126,9 +126,9 @@ def _evidence(file: NamedFile) -> FileEvidence:
 
 
 def write_bundle(folder: Path, *models: Model | None, meshes: bool = True) -> None:
-    """Copy what the files of `models` name into the run directory `folder`, its meshes only where they are wanted.
+    """Copy the files that `models` name into the run directory `folder`; meshes only if `meshes` is true.
 
-    What is larger than MOST_BUNDLED, or called by an absolute path, stays where it is.
+    Files that are larger than MOST_BUNDLED, or are named by an absolute path, are not copied.
     """
     for file in (file for model in models if model is not None for file in _files_of(model)):
         described = _evidence(file)
@@ -141,12 +141,12 @@ def write_bundle(folder: Path, *models: Model | None, meshes: bool = True) -> No
 
 
 def written_now() -> str:
-    """The wall clock, for the part of a record that differs from run to run."""
+    """Return the present time, for the wall clock of a record."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def packages_here() -> dict[str, str]:
-    """The versions of what is installed here."""
+    """Return the versions of the installed packages."""
     packages = {}
     for name in PACKAGES:
         with suppress(PackageNotFoundError):
@@ -155,7 +155,7 @@ def packages_here() -> dict[str, str]:
 
 
 def provenance_of(model: Model | None = None) -> Provenance:
-    """With which versions, from which commit and by which command something is made, and where its model is."""
+    """Return the versions, the commit and the command of this process, and the path of its model."""
     words = (Path(sys.argv[0]).name, *sys.argv[1:])
     source, options = (None, None) if model is None else (model.source, model.options)
     if source is not None and any(name.startswith(LAID_OUT) for name in source.parts):
@@ -172,14 +172,14 @@ def provenance_of(model: Model | None = None) -> Provenance:
 
 
 def _text(word: str) -> str:
-    return word.encode("utf-8", "replace").decode()  # a file's name may have bytes that are no text
+    return word.encode("utf-8", "replace").decode()  # file names may contain bytes that are not UTF-8
 
 
 def _git() -> dict[str, str | bool] | None:
-    """Commit of the working directory's checkout, and whether tracked files differ; None where git cannot tell.
+    """Return the commit of the working directory, and whether tracked files differ; None if git cannot be read.
 
-    Settings of a checkout can name commands (`core.fsmonitor`, filters, hooks). Git reads its references and objects
-    by way of a folder with settings of ours instead, and no settings from elsewhere.
+    Settings of a checkout can name commands (`core.fsmonitor`, filters, hooks). Git therefore reads the references and
+    objects through a folder with our own settings, and ignores all other settings.
     """
     here = Path.cwd()
     root = next((folder for folder in (here, *here.parents) if (folder / ".git").exists()), None)
@@ -194,7 +194,7 @@ def _git() -> dict[str, str | bool] | None:
 
 
 def _git_folder(root: Path, folder: Path) -> Callable[..., str]:
-    """Make `folder` a git folder of the checkout `root`, but for its settings, and return git's output there."""
+    """Make `folder` a git folder of the checkout `root` without its settings, and return a function that runs git."""
     source = root / ".git"
     if source.is_file():
         source = root / _short_text(source).removeprefix("gitdir:").strip()  # of a worktree or a submodule
@@ -216,7 +216,7 @@ def _git_folder(root: Path, folder: Path) -> Callable[..., str]:
 
 
 def _short_text(path: Path) -> str:
-    """The text of a small file, without line ends; "" where there is no plain file."""
+    """Return the text of a small file without line ends, or "" if it is not a regular file."""
     if not path.is_file():
         return ""
     with path.open(errors="replace") as file:

@@ -1,8 +1,8 @@
-"""A plan written to plan.npz, exact to the bit, and a solution rebuilt from its run directory alone.
+"""Write a plan to plan.npz without rounding, and rebuild a solution from its run directory.
 
-The model is built from the file that trace.mcap carries and from those in the folder `BUNDLE`, all of them copied into
-a folder of its own. Where one is missing there, it is built where it stood, and only if it and all that it names are
-still what the record says. As a record may name any file, this is only done below a folder that the caller gives.
+The model is built from the file in trace.mcap and the files in the folder `BUNDLE`, which are copied to a temporary
+folder. If a file is missing, the model is built from its original path, provided that it and all files that it names
+match the record. As a record may name any file, the path must be below a folder that the caller gives.
 """
 
 import io
@@ -40,27 +40,27 @@ from drake_diff.runs.plan_record import PhasesSection, PlanRecord
 from drake_diff.runs.provenance import MOST_BUNDLED, evidence_of
 from drake_diff.runs.sections import rebuild_problem
 
-ANYWHERE = Path("/")  # the folder of models of a directory that is one's own
+ANYWHERE = Path("/")  # permits any model file, for a trusted directory
 PLAN = "plan.npz"
 TRACE = "trace.mcap"
-REQUIRED, OPTIONAL = ("xs", "us", "parameters"), ("us_mid", "u_final", "mesh", "free_horizon")  # of a Solution
-ROWS = "iterations"  # the solver's table, of a run that is not measured yet: later trace.mcap has it
-COLUMNS = ("iteration", "objective", "primal_infeasibility", "dual_infeasibility", "step")  # of that
-START = "start_us"  # the first guess of the inputs that the problem has
-REMOVED = ("segments",)  # options of `solve` that records of before 3 have
-GUESS = "guess_"  # before the name of an array of the guess that `solve` was given
+REQUIRED, OPTIONAL = ("xs", "us", "parameters"), ("us_mid", "u_final", "mesh", "free_horizon")  # arrays of a Solution
+ROWS = "iterations"  # the solver's table of iterations in a run that is not measured yet; later it is in trace.mcap
+COLUMNS = ("iteration", "objective", "primal_infeasibility", "dual_infeasibility", "step")  # columns of that table
+START = "start_us"  # the problem's initial guess of the inputs
+REMOVED = ("segments",)  # options of `solve` in records before version 3
+GUESS = "guess_"  # prefix of the arrays of the initial guess of `solve`
 GUESSED = ("xs", "us", "us_mid", "u_final", "mesh", "horizon", "num_steps", "multipliers", "row_multipliers")
 
 
 def directory_of(i: int) -> str:
-    """The directory of a phase."""
+    """Return the name of the directory of a phase."""
     return f"phase_{i}"
 
 
 def write_plan(path: Path, solution: Solution, *, partial: bool = False) -> None:
-    """Write the arrays of `solution` and those that its search started from: the same ones give the same bytes.
+    """Write the arrays of `solution` and of its initial guess; the same arrays give the same bytes.
 
-    Of a `partial` run, of which nothing else has it yet, the table of the search's iterations too.
+    For a `partial` run, the table of iterations is written too, since no other file contains it yet.
     """
     problem = solution.problem
     given: dict[str, Any] = {"xs": solution.xs, "us": solution.us, "parameters": solution.vector.values}
@@ -84,7 +84,7 @@ def write_plan(path: Path, solution: Solution, *, partial: bool = False) -> None
 
 
 def read_plan(path: Path, *, partial: bool = False) -> dict[str, Array]:
-    """The arrays in `path`, of a `partial` run or a whole one, by name. ArtifactError where it is no such file."""
+    """Read the arrays of a `partial` or complete run by name; raise ArtifactError if `path` is no such file."""
     arrays, known = arrays_of(path), {*REQUIRED, *OPTIONAL, START, *(GUESS + name for name in GUESSED)}
     known |= {ROWS} if partial else set()
     unknown, missing = arrays.keys() - known, set(REQUIRED) - arrays.keys()
@@ -94,7 +94,7 @@ def read_plan(path: Path, *, partial: bool = False) -> dict[str, Array]:
 
 
 def rows_of(plan: dict[str, Array]) -> tuple[Iteration, ...]:
-    """The search's iterations in the plan of a partial run; none where it is not such a table."""
+    """Return the iterations in the plan of a partial run; raise ArtifactError if their table is malformed."""
     rows = plan.get(ROWS, np.zeros((0, len(COLUMNS))))
     if rows.shape[1:] != (len(COLUMNS),) or not np.isfinite(rows[:, 0]).all():
         raise ArtifactError(f"{PLAN}: {ROWS} is no table of iterations: its shape is {rows.shape}")
@@ -102,7 +102,7 @@ def rows_of(plan: dict[str, Array]) -> tuple[Iteration, ...]:
 
 
 def plan_fields(plan: dict[str, Array]) -> dict[str, Any]:
-    """Those of the arrays of a plan that are fields of a `Solution`."""
+    """Return the arrays of a plan that are fields of a `Solution`."""
     result: dict[str, Any] = {name: plan[name] for name in (*REQUIRED, *OPTIONAL) if name in plan}
     if "free_horizon" in result:
         result["free_horizon"] = float(result["free_horizon"])
@@ -111,11 +111,11 @@ def plan_fields(plan: dict[str, Array]) -> dict[str, Any]:
 
 @contextmanager
 def rebuilt(folder: Path, record: SealedRecord, models: Path | None) -> Iterator[Model]:
-    """The model of the record in `folder`, for as long as the block runs, from the files there.
+    """Yield the model of the record in `folder`, built from the files there, for the duration of the block.
 
-    Where one is missing, it is built where it was, if that is below the folder `models` and all files are unchanged.
+    If a file is missing, the original model is used, if it is below the folder `models` and all files are unchanged.
 
-    Raises ModelError, saying why, where it cannot be built again, ArtifactError where the artifact is damaged.
+    Raises ModelError with the reason if the model cannot be rebuilt, and ArtifactError if the artifact is damaged.
     """
     given = record.model
     if given.file is None or given.options is None:
@@ -146,12 +146,12 @@ def rebuilt(folder: Path, record: SealedRecord, models: Path | None) -> Iterator
 
 
 def _is_here(folder: Path, file: FileEvidence) -> bool:
-    """Whether the directory has what the model file names, if there was such a file."""
+    """Return whether the directory has a file that the model file names, or that file never existed."""
     return is_portable(file.path) and (file.sha256 is None or _place_of(folder, file.sha256) is not None)
 
 
 def _place_of(folder: Path, sha: str) -> Path | None:
-    """The file of that content; of a phase it may be in the directory above."""
+    """Return the path of the file with this hash, or None; for a phase it may be in the parent directory."""
     if not re.fullmatch("[0-9a-f]{64}", sha):
         raise ArtifactError(f"record.json: {sha!r} is no hash of a file")
     return next((p for f in (folder, folder.parent) if os.path.lexists(p := f / BUNDLE / sha)), None)
@@ -166,10 +166,10 @@ def _bundled(folder: Path, sha: str) -> bytes:
 
 
 def _source_if_unchanged(record: SealedRecord, lacking: list[str], models: Path | None) -> tuple[Path, dict[str, Any]]:
-    """The model file where it stood, and its options; ModelError where a file is not the recorded one."""
+    """Return the original model file and its options; raise ModelError if a file is not the recorded one."""
     given, was, options = record.model, record.provenance, dict(record.model.options or {})
     folders, location = options.pop("packages", was.model_packages), was.model_file
-    if location is None:  # before version 4.1, which has packages among the options too
+    if location is None:  # before version 4.1, whose options contain the packages
         location = record.model_dump()["contract"].get("source")
     if models is None:
         what = f"{lacking[0]}{f' and {len(lacking) - 1} more' * (len(lacking) > 1)}, which the artifact does not hold"
@@ -191,7 +191,7 @@ def _source_if_unchanged(record: SealedRecord, lacking: list[str], models: Path 
 
 
 def _below(models: Path, location: str, what: str) -> Path:
-    """A path that a record has, a relative one in `models` or else from here; ModelError where it is not below that."""
+    """Resolve a recorded path, relative to `models` if it exists there; raise ModelError if it is outside `models`."""
     path = models / location if (models / location).exists() else Path(location)
     if not path.resolve().is_relative_to(models.resolve()):
         raise ModelError(f"{what} {path} is not below {models}, the folder of models that was given")
@@ -201,16 +201,16 @@ def _below(models: Path, location: str, what: str) -> Path:
 def _load(path: Path, options: dict[str, Any]) -> Model:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ModelWarning)  # said when the model was loaded first
+            warnings.simplefilter("ignore", ModelWarning)  # was shown when the model was first loaded
             return load_model(path, **options)
     except (InputError, TypeError) as error:
         raise ArtifactError(f"record.json: the model cannot be loaded with the recorded options: {error}") from error
 
 
 def resolve(record: PlanRecord, model: Model, plan: dict[str, Array]) -> Solution:
-    """The solution of a record, to be measured again; what the search came to is as the record tells it.
+    """Build the solution of a record, to measure it again; the status and message are the recorded ones.
 
-    ArtifactError where plan and problem do not go together.
+    Raises ArtifactError if the plan does not fit the problem.
     """
     solver = record.solver
     if solver is None:
@@ -229,7 +229,7 @@ def resolve(record: PlanRecord, model: Model, plan: dict[str, Array]) -> Solutio
 
 
 def phase_records(folder: Path, record: PlanRecord) -> list[tuple[Path, PlanRecord]]:
-    """The folder and the record of each phase; of a solve in one phase its own."""
+    """Return the folder and the record of each phase, or of the run itself if it has one phase."""
     if record.phases is None:
         return [(folder, record)]
     for i, phase in enumerate(record.phases.phases):
@@ -241,7 +241,7 @@ def phase_records(folder: Path, record: PlanRecord) -> list[tuple[Path, PlanReco
 
 @contextmanager
 def recorded_solution(folder: Path, record: PlanRecord, models: Path | None) -> Iterator[Solution]:
-    """The solution in a run directory, its models built again for as long as the block runs; see `rebuilt`."""
+    """Yield the solution in a run directory, with its models rebuilt for the duration of the block; see `rebuilt`."""
     with ExitStack() as stack:
         phases = []
         for inner, phase in phase_records(folder, record):
@@ -258,7 +258,7 @@ def recorded_solution(folder: Path, record: PlanRecord, models: Path | None) -> 
 
 
 def _phased_problem(section: PhasesSection, solutions: Sequence[Solution]) -> PhasedProblem:
-    """The problem in phases of a record; a reset that is a user's function leads to zero."""
+    """Rebuild the problem in phases of a record; a zero matrix replaces a reset that is a user's function."""
     resets: list[Any] = []
     for link in section.links:
         system: Any = solutions[link.after].problem.system
@@ -271,7 +271,7 @@ def _phased_problem(section: PhasesSection, solutions: Sequence[Solution]) -> Ph
         elif reset["impact"]:
             model: Any = system.model if isinstance(system, FixedContacts) else system
             resets.append(Impact.from_dict(reset["impact"], model))
-        else:  # as records of 2.x say that it stops the fixed points
+        else:  # in records of 2.x: the impact stops the fixed points
             resets.append(system.impact)
     closing: Any = False
     if len(resets) == len(solutions):
@@ -287,9 +287,9 @@ def _phased_problem(section: PhasesSection, solutions: Sequence[Solution]) -> Ph
 
 
 def solve_again(record: PlanRecord, recorded: Solution, plan: dict[str, Array]) -> Solution:
-    """What `solve` comes to when it is called as the record says, from the guess that the plan has.
+    """Call `solve` with the recorded arguments, and with the initial guess in the plan.
 
-    It gets all the time that it needs. ArtifactError where that is no problem that can be solved.
+    There is no time limit. Raises ArtifactError if the recorded problem cannot be solved.
     """
     with _refusing_a_problem():
         arguments: dict[str, Any] = dict(search_of(record) or {})
@@ -304,13 +304,13 @@ def solve_again(record: PlanRecord, recorded: Solution, plan: dict[str, Array]) 
 
 
 def search_of(record: PlanRecord) -> dict[str, Any] | None:
-    """The arguments of `solve`; None where the record does not have them."""
+    """Return the recorded arguments of `solve`, or None if the record does not have them."""
     search = record.inputs.search if record.phases is None else record.phases.search
     return None if search is None else dict(search)
 
 
 def _rebuild_guess(problem: Problem, kind: Any, plan: dict[str, Array]) -> Any:
-    """The `initial_guess` whose kind a record tells; see `inputs.search`."""
+    """Rebuild the `initial_guess` of a recorded kind; see `inputs.search`."""
     given = {name: plan[GUESS + name] for name in GUESSED if GUESS + name in plan}
     if kind is None and not given:
         return None
@@ -348,7 +348,7 @@ def _check_shapes(record: PlanRecord, model: Model, plan: dict[str, Array]) -> N
 def _refusing_a_problem() -> Iterator[None]:
     try:
         yield
-    except ModelError:  # what the model cannot do: see `rebuilt`
+    except ModelError:  # the model does not support the problem; see `rebuilt`
         raise
     except (DrakeDiffError, ValueError, KeyError, TypeError, AttributeError) as error:
         message = f"{type(error).__name__}: {error}"

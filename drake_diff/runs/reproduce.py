@@ -1,8 +1,8 @@
-"""Reproduce a directory from what its record and its plan say was asked, to be compared with it.
+"""Reproduce a run directory from its plan and the inputs in its record, to compare the two.
 
-A search is run again too, as `solve` was called. Where its plan comes out to the last bit, everything but the wall
-clock and the machine that made the record is there again. On a machine that rounds otherwise the search may take other
-steps to the same end: then the recorded plan is measured, and what the search tells of itself is compared apart.
+The search is repeated too, with the recorded arguments of `solve`. If its plan is bitwise equal, everything except the
+wall clock and the machine data is reproduced. On a machine that rounds differently the search may take other steps to
+the same optimum. Then the recorded plan is measured, and the claims about the search are compared separately.
 """
 
 import re
@@ -43,27 +43,27 @@ from drake_diff.runs.save import RECOVERED, REPLAY, REPORT, fields_of, write_mea
 from drake_diff.runs.sections import COSTS, unknown_functions
 from drake_diff.runs.trace import read_trace
 
-# What a record says of itself and of where it was made: nothing can make it again.
+# Fields about the record itself and its machine, which cannot be reproduced.
 GIVEN = ("name", "provenance", "wall_clock")
-# What the search tells of itself: it rests on the search, and not on the plan that it found alone.
+# Fields that depend on the search, and not only on the plan that it found.
 SEARCHED = ("events", "failures", "gradient", "inputs", "sentence", "solver", "verdict")
 SEARCH_TOPICS = ("/solver/", "/gradient/", "/events", "/replays")
-# What a constraint that is a user's function decides, beside the search.
+# Keys that depend on constraints that are a user's functions, in addition to the search.
 CONSTRAINED = ("metrics[constraint violation]", "problem.constraints", "problem.couplings")
 JUDGED = ("holds", "failures")  # of each replay
-# Keys of a solve in phases that rest on its search, beside SEARCHED.
+# Keys of a record in phases that depend on its search, in addition to SEARCHED.
 SEARCHED_IN_PHASES = ("phases.search", "phases.initial_guess", "phases.phases")
-OFFSETS_SINCE = 4  # the version of records in whose replays TVLQR follows finer steps with an offset
-SAME_PLAN = 1e-6  # of the largest number of its array: plans that are no further apart are the same
+OFFSETS_SINCE = 4  # the first schema version whose replays under TVLQR have offsets for finer steps
+SAME_PLAN = 1e-6  # relative to the largest number of each array: plans within this distance count as equal
 OF_RECOVERED = (
     "the run was recovered from one that was killed or failed, so that the end of its search and the search's own "
     "statements cannot be checked"
 )
-ROUNDED = 1e-12  # of a number, and absolute: what the same sum may differ by on another machine
+ROUNDED = 1e-12  # relative and absolute rounding error of the same sum on another machine
 GIVEN_BY_USER = (
     "problem, model and inputs.search: they define the task, and a record of an easier task can be equally true"
 )
-# The modules of packages above this one whose function `reproduce` makes such a directory again.
+# By subject, the modules in higher-level packages whose function `reproduce` reproduces the directory.
 REPRODUCED_BY = {
     "fit": "drake_diff.identification.files",
     "comparison": "drake_diff.identification.recorded_causes",
@@ -79,9 +79,9 @@ NOT_REPEATED = {
 
 
 def reproduce(folder: Path, record: SealedRecord, models: Path | None) -> Reproduced | None:
-    """What of a directory comes out of its inputs again, `models` as in `rebuilt`; None where nothing does.
+    """Reproduce a directory from its inputs, or return None if nothing can be reproduced; `models` is as in `rebuilt`.
 
-    ArtifactError where what is in it does not go together, ModelError where its model cannot be built again.
+    Raises ArtifactError if its files contradict each other, and ModelError if its model cannot be rebuilt.
     """
     if record.subject in REPRODUCED_BY:
         made: Reproduced | None = import_module(REPRODUCED_BY[record.subject]).reproduce(folder, record, models)
@@ -94,9 +94,9 @@ def reproduce(folder: Path, record: SealedRecord, models: Path | None) -> Reprod
 
 
 def _solved(folder: Path, record: PlanRecord, models: Path | None) -> Reproduced:
-    """A solve, in one phase or several, whose search is run again where that can be done."""
+    """Reproduce a solve in one or several phases, and repeat its search if possible."""
     problems = tuple(contradictions(folder, record))
-    if problems and record.phases is not None:  # what does not fit together is no problem in phases
+    if problems and record.phases is not None:  # no problem in phases can be built from contradictory files
         return Reproduced({}, {}, problems=problems, written=tuple(record.files))
     return replace(_run_again(folder, record, models), problems=problems)
 
@@ -120,7 +120,7 @@ def _run_again(folder: Path, record: PlanRecord, models: Path | None) -> Reprodu
 
 
 def contradictions(folder: Path, record: PlanRecord) -> Iterator[str]:
-    """What the files of a run say otherwise than each other."""
+    """Yield the contradictions between the files of a run."""
     phases = phase_records(folder, record)
     for inner, phase in phases:
         plan = read_plan(inner / PLAN)
@@ -133,7 +133,7 @@ def contradictions(folder: Path, record: PlanRecord) -> Iterator[str]:
 
 
 def _certified(folder: Path, record: PlanRecord, section: CertificationSection, models: Path | None) -> Reproduced:
-    """The same states from the same seed, each certified again."""
+    """Sample the same states from the same seed, and certify each of them again."""
     carried = record.model.file.path if record.model.file is not None else ""
     asked = {name: getattr(section, name) for name in ("seed", "parameters", "method")}
     with rebuilt(folder, record, models) as model:
@@ -142,7 +142,7 @@ def _certified(folder: Path, record: PlanRecord, section: CertificationSection, 
 
 
 def odd_trace(folder: Path, plan: Mapping[str, Any], record: PlanRecord) -> Iterator[str]:
-    """What in the trace is not what record.json and plan.npz have."""
+    """Yield the contradictions between the trace and record.json or plan.npz."""
     trace = read_trace(folder / TRACE)
     if trace.attachments.get(record.FILE) != reproducible(read_fields(folder / record.FILE)).encode():
         yield f"{TRACE}: the record that it carries is not {record.FILE}"
@@ -153,7 +153,7 @@ def odd_trace(folder: Path, plan: Mapping[str, Any], record: PlanRecord) -> Iter
 
 
 def why_not_repeated(record: PlanRecord, records: Iterable[PlanRecord]) -> tuple[str, ...]:
-    """Why the search of a record cannot be run again, `records` being those of its phases; nothing where it can."""
+    """Return the reasons why a search cannot be repeated, if any; `records` are the record and those of its phases."""
     functions = [unknown_functions(inner) for inner in records]
     reasons = [f"{cost} is a user's function" for costs, _ in functions for cost in costs]
     reasons += [f"constraint {name} is a user's function" for _, constraints in functions for name in constraints]
@@ -172,7 +172,7 @@ def _unknown_resets(record: PlanRecord) -> list[str]:
 
 
 def _with_plan(solution: Solution, recorded: Solution) -> Solution:
-    """What a search came to, with the recorded plan."""
+    """Return the result of a search with the recorded plan."""
     if isinstance(solution, PhasedSolution):
         phases = tuple(_with_plan(s, r) for s, r in zip(solution.phases, recorded.phases, strict=True))
         return replace(solution, phases=phases, xs=recorded.xs, us=recorded.us)
@@ -180,7 +180,7 @@ def _with_plan(solution: Solution, recorded: Solution) -> Solution:
 
 
 def _distance(solution: Solution, other: Solution) -> float:
-    """Between two plans: the largest of each array, relative to its largest number; inf where their shapes differ."""
+    """Return the largest relative distance of the arrays of two plans, or inf if their shapes differ."""
     names, largest = ("xs", "us", "us_mid", "u_final", "mesh", "free_horizon"), 0.0
     pairs = [(getattr(solution, name), getattr(other, name)) for name in names]
     for first, second in (*pairs, (solution.vector.values, other.vector.values)):
@@ -197,7 +197,7 @@ def _distance(solution: Solution, other: Solution) -> float:
 
 
 def _written(solution: Solution, folder: Path, records: Mapping[Path, PlanRecord], apart: float) -> Reproduced:
-    """All files of `solution`, made in a folder of their own; `records` are those in `folder`, by their place there."""
+    """Write the files of `solution` to a temporary folder and read them; `records` are those in `folder` by path."""
     solver, unchecked = records[Path()].solver, list[str]()
     engines = None if solver is None else solver.options.get("cross_check")
     if isinstance(engines, list):
@@ -210,7 +210,7 @@ def _written(solution: Solution, folder: Path, records: Mapping[Path, PlanRecord
             again, lacking = _but_for_simulators(as_given(again, recorded), recorded)
             unchecked.extend(lacking)
             if recorded.is_before(OFFSETS_SINCE):
-                then = {metric.name: metric.tolerance for metric in recorded.metrics}  # some were absolute
+                then = {metric.name: metric.tolerance for metric in recorded.metrics}  # some tolerances were absolute
                 shared = [metric for metric in again.metrics if metric.name in then]
                 metrics = [metric.model_copy(update={"tolerance": then[metric.name]}) for metric in shared]
                 replays = _open_loop_alone(again.replays, recorded.replays)
@@ -225,7 +225,7 @@ def _written(solution: Solution, folder: Path, records: Mapping[Path, PlanRecord
             return as_written(fields_of(again), read_fields(folder / inner / PlanRecord.FILE))
 
         fields: dict[str, Any] = {}
-        if _unknown_resets(records[Path()]):  # what leads from one phase to the next is not here
+        if _unknown_resets(records[Path()]):  # the link between two phases is a function that is not stored
             for i, phase in enumerate(solution.phases):
                 write_measured(phase, location / directory_of(i), amend, dump)
         else:
@@ -238,7 +238,7 @@ def _written(solution: Solution, folder: Path, records: Mapping[Path, PlanRecord
 
 
 def _but_for_simulators(again: PlanRecord, record: PlanRecord) -> tuple[PlanRecord, tuple[str, ...]]:
-    """With what `record` says of simulators that are not installed here, or were not there, and which these are."""
+    """Copy the replays of simulators that were or are not installed from `record`, and name these simulators."""
     unchecked = list[str]()
     for name in SIMULATORS:
         sides = [[r for r in side.replays if r.variant.startswith(f"in {name}")] for side in (again, record)]
@@ -252,21 +252,21 @@ def _but_for_simulators(again: PlanRecord, record: PlanRecord) -> tuple[PlanReco
 
 
 def _open_loop_alone(again: Sequence[Any], recorded: Sequence[Any]) -> list[Any]:
-    """The replays that are taken again open loop, and the recorded ones under feedback."""
+    """Return the new open-loop replays and the recorded replays under feedback."""
     taken = {r.variant: r for r in again if r.control == OPEN_LOOP}
     return [taken.get(r.variant, r) if r.control == OPEN_LOOP else r for r in recorded]
 
 
 def as_given(again: PlanRecord, record: PlanRecord) -> PlanRecord:
-    """With what nothing can make again as `record` says it."""
+    """Return `again` with the fields that cannot be reproduced copied from `record`."""
     given = {name: getattr(record, name) for name in GIVEN}
-    if not record.is_before(OFFSETS_SINCE):  # an earlier minor version has no more than less
+    if not record.is_before(OFFSETS_SINCE):  # an earlier minor version only lacks fields
         given["schema_version"] = record.schema_version
     contract = contract_as(again.contract, record)
     made = again.model_copy(update={**given, "model": model_as(again.model, record), "contract": contract})
     if made.phases is None or record.phases is None:
         return made
-    links = [  # records of 2.x do not have the values of an impact
+    links = [  # records of 2.x lack the values of an impact
         link.model_copy(update={"reset": was.reset}) if was.reset == {"impact": {}} else link
         for link, was in zip(made.phases.links, record.phases.links, strict=True)
     ]
@@ -274,7 +274,7 @@ def as_given(again: PlanRecord, record: PlanRecord) -> PlanRecord:
 
 
 def contract_as(again: Mapping[str, Any], record: SealedRecord) -> dict[str, Any]:
-    """The contract of a model loaded again; before version 4.1 it and its notes had the path of the model file."""
+    """Return the contract of a reloaded model; before version 4.1 it and its notes contain the model file's path."""
     recorded = record.model_dump().get("contract") or {}
     source = recorded.get("source")
     if not record.is_before(4, 1) or not again or source is None:
@@ -286,7 +286,7 @@ def contract_as(again: Mapping[str, Any], record: SealedRecord) -> dict[str, Any
 
 
 def as_written(fields: Any, recorded: Any) -> Any:
-    """What a record would be in the version that wrote another: without empty fields that it does not have."""
+    """Remove the empty fields that the version of the recorded fields does not have."""
     if not (isinstance(fields, dict) and isinstance(recorded, dict)):
         return fields
     known = {key: value for key, value in fields.items() if key in recorded or value not in (None, [], {}, "")}
@@ -294,14 +294,14 @@ def as_written(fields: Any, recorded: Any) -> Any:
 
 
 def model_as(again: ModelInput, record: SealedRecord) -> ModelInput:
-    """The input of a model loaded again; of earlier records, which list fewer files, theirs, which `rebuilt` checks."""
+    """Return a reloaded model's input; before version 4.1, which lists fewer files, the one that `rebuilt` checks."""
     return record.model if record.is_before(4, 1) else again
 
 
 def _without_the_search(
     recorded: Solution, folder: Path, records: Mapping[Path, PlanRecord], unrepeated: tuple[str, ...]
 ) -> Reproduced:
-    """What can be made of the plan alone; what rests on the search is left out of the comparison."""
+    """Reproduce a directory from its plan alone, without the parts that depend on the search."""
     again = _written(recorded, folder, records, 0.0)
     missing = [*SEARCHED, *SEARCHED_IN_PHASES]
     for record in records.values():
@@ -317,12 +317,12 @@ def _without_the_search(
 
 
 def is_below(key: str, sections: Sequence[str]) -> bool:
-    """Whether a key of a record is one of `sections`, or in one."""
+    """Return whether a key of a record is one of `sections`, or below one of them."""
     return any(key == section or key.startswith((f"{section}.", f"{section}[")) for section in sections)
 
 
 def _turned(record: PlanRecord, x: Array, wanted: Array) -> Array:
-    """A state x (nx,) whose quaternions have the lengths and signs of those that are `wanted`: the same orientation."""
+    """Return x (nx,) with quaternions of the norms and signs in `wanted`; the orientations are unchanged."""
     contract: dict[str, Any] = dict(record.contract)
     turned, positions = np.array(x), contract.get("positions", ())
     for i in (i for i, position in enumerate(positions) if position["name"].endswith("_qw")):
@@ -333,7 +333,7 @@ def _turned(record: PlanRecord, x: Array, wanted: Array) -> Array:
 
 
 def odd_metrics(record: PlanRecord, plan: dict[str, Array]) -> Iterator[str]:
-    """Where the metrics of a record are not those of its plan, as far as that can be told without the dynamics."""
+    """Yield the metrics that contradict the plan, as far as that can be checked without the dynamics."""
     p: dict[str, Any] = dict(record.problem)
     metrics = {metric.name: metric.value for metric in record.metrics}
     xs = plan["xs"]
@@ -356,12 +356,12 @@ def odd_metrics(record: PlanRecord, plan: dict[str, Array]) -> Iterator[str]:
     beyond += [numbers("x_lower", -np.inf) - later, later - numbers("x_upper", np.inf)]
     least = max(float(np.max(excess, initial=0.0)) for excess in beyond)
     recorded = metrics.get("bound violation")
-    if recorded is not None and not recorded >= least - ROUNDED:  # midpoint states are no part of the plan
+    if recorded is not None and not recorded >= least - ROUNDED:  # the plan does not contain the midpoint states
         yield f"{record.FILE}: metrics[bound violation] is {recorded}, and the plan's is at least {least:.6g}"
 
 
 def _odd_phases(section: PhasesSection, records: Sequence[PlanRecord], plans: Sequence[Array]) -> Iterator[str]:
-    """What the record of all phases says otherwise than those of its phases and their plans, dynamics apart."""
+    """Yield contradictions between the record of all phases, those of its phases, and their plans, without dynamics."""
     file, count, links = PlanRecord.FILE, len(records), [(link.before, link.after) for link in section.links]
     if links not in ([(i, i + 1) for i in range(count - 1)], [(i, (i + 1) % count) for i in range(count)]):
         yield f"{file}: its links are {links}, which is no chain of {count} phases"

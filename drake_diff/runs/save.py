@@ -1,7 +1,7 @@
-"""Write the directory of a solve: what was asked, what came out, what was measured again, and with which versions.
+"""Write the directory of a solve: the task, the solution, its measurement, and the versions.
 
-It is written beside its place and moved there whole. record.json is complete last, so that a run that is killed leaves
-a record that says so. Of a solve in phases each phase has a directory phase_0, phase_1, ... in it.
+The directory is written next to its final place and then moved there. record.json is completed last, so the record of
+a killed run says that it is incomplete. A solve in phases has a directory phase_0, phase_1, ... for each phase.
 """
 
 import json
@@ -62,7 +62,7 @@ from drake_diff.runs.sections import asked, found, solver_of, unknown_functions
 
 
 def unfinished_record(folder: Path, problem: Problem | PhasedProblem, sentence: str, **fields: Any) -> PlanRecord:
-    """The record of a run that has no measured solution."""
+    """Return the record of a run that has no measured solution."""
     if isinstance(problem, PhasedProblem):
         fields |= {"phases": PhasesSection(**_asked_of_all(problem)), **header(name_of(folder))}
         return PlanRecord(verdict="incomplete", sentence=sentence, **fields)
@@ -75,7 +75,7 @@ def _asked_of_all(problem: PhasedProblem) -> dict[str, Any]:
 
 
 def record_of_phases(folder: Path, solution: PhasedSolution) -> PlanRecord:
-    """The record of a solution in phases, but for the files; `folder` is where they are written."""
+    """Return the record of a solution in phases without its files, which are written to `folder`."""
     given = None if solution.search is None else solution.search.guess
     return PlanRecord(
         verdict="pass" if solution.success else "fail",
@@ -126,7 +126,7 @@ def _reset(switch: Switch, problem: PhasedProblem) -> dict[str, Any] | None:
 
 
 def chain_evidence(chain: Check) -> ChainEvidence:
-    """The chain of all phases as it stands in a record."""
+    """Convert the check of the chain of all phases to a section of a record."""
     control = chain.feedback or "open loop"
     return ChainEvidence(
         holds=chain.passes, control=control, told=f"{under(control)} {chain}", worst=finite(chain.value)
@@ -134,17 +134,17 @@ def chain_evidence(chain: Check) -> ChainEvidence:
 
 
 REPLAY, REPORT = "replay.html", "report.html"
-# Of packages above this one, which are not loaded to save a solve.
+# Modules of higher-level packages, which are not loaded to save a solve.
 SAVED_BY = {"Identification": "drake_diff.identification.files", "ClosedLoop": "drake_diff.loop.files"}
 UNDER_WAY = "the run has started and not finished: it is still running, or it was killed or broke off"
 BEFORE_THE_SEARCH = "the run was interrupted before the search began: there is no plan"
 NOT_MEASURED = "the search has ended, and its plan is not measured yet"
-RECOVERED = "recovered from what a run left that did not end: its search is not made again"  # of such a run's sentence
-FILES = (PLAN, TRACE, REPLAY, REPORT)  # what `save` writes besides the record and its schema
+RECOVERED = "recovered from what a run left that did not end: its search is not made again"  # end of its sentence
+FILES = (PLAN, TRACE, REPLAY, REPORT)  # the files that `save` writes besides the record and its schema
 
 
 def begin(folder: Path, problem: Problem | PhasedProblem, sentence: str = UNDER_WAY) -> None:
-    """Mark `folder` as a run that is under way: whatever happens next, its record says "incomplete"."""
+    """Mark `folder` as a run in progress: its record says "incomplete" until the run ends."""
     unfinished_record(folder, problem, sentence).begin(folder)
 
 
@@ -155,33 +155,33 @@ def save(solution: Any, directory: str | Path, *, meshes: bool = True) -> Any: .
 def save(solution: Any, directory: str | Path, *, meshes: bool = True) -> Any:
     """Measure a solution and write its directory: record, plan, trace, replay and report.
 
-    All of it is written beside `directory`, in a folder that is called `directory`.partial-..., and takes its place at
-    the end: at any moment a run that was there before is there whole, or the new one is. What breaks off leaves that
-    folder, with the plan.
+    The files are written to a folder `directory`.partial-... next to `directory`, which is moved to `directory` at the
+    end. At any moment, `directory` contains a complete run, either the earlier or the new one. If the save fails, that
+    folder remains, with the plan.
 
     Args:
-        solution: A result of `solve`, of any status. Of one in phases, record.json says how they are linked, and each
-            phase has a directory phase_0, phase_1, ... of its own with all these files; there is no page of the whole.
-            Or a result of `identify`: record.json, the recordings, the model file, trace.mcap and report.html
-            are written, and "pass" says that the values found explain the recordings. Or one of `closed_loop`, whose
-            record says what was around the controller, and whose trace has what was measured, estimated, commanded and
-            applied, and when; "pass" says that it ran to its end, that every row follows from those before, and
-            that goal and bounds of an MPC's problem are kept.
-        directory: Where to write record.json, record.schema.json, plan.npz, trace.mcap, replay.html and report.html.
-            It is made where there is none, and replaced where a run wrote it. Plain dynamics have nothing to draw in
-            3D, and so no replay.html. What the model file names (meshes, included files, their licences) is copied to
+        solution: A result of `solve`, of any status. For a solution in phases, record.json describes the links, and
+            each phase has its own directory phase_0, phase_1, ... with all these files; there is no page for the whole
+            solution. A result of `identify` is also accepted: record.json, the recordings, the model file, trace.mcap
+            and report.html are written, and "pass" means that the estimated values explain the recordings. For a result
+            of `closed_loop`, the record describes the loop around the controller, and the trace contains all measured,
+            estimated, commanded and applied values with their times. "pass" then means that it ran to its end, that
+            every row follows from those before, and that the goal and bounds of an MPC problem are satisfied.
+        directory: Directory for record.json, record.schema.json, plan.npz, trace.mcap, replay.html and report.html. It
+            is created if necessary, and an earlier run in it is replaced. Plain dynamics have no 3D scene and therefore
+            no replay.html. The files that the model file names (meshes, included files, their licences) are copied to
             `directory`/model, so that `verify` needs nothing else.
-        meshes: False leaves the meshes where they are.
+        meshes: False does not copy the meshes.
 
     Returns:
-        The record that was written. Its verdict is "pass" only where the solver converged and every metric keeps its
+        The record that was written. Its verdict is "pass" only if the solver converged and every metric satisfies its
         tolerance.
 
     Raises:
-        InputError: It is none of these, or `directory` holds what no run wrote.
-        ArtifactError: Somebody else is writing `directory`, or the file of a recording has changed since `identify`
-            read it.
-        WriteError: The disk is full, or does not let a file be written; the message says where the plan is.
+        InputError: `solution` is none of these, or `directory` contains files that no run wrote.
+        ArtifactError: Another run is being written to `directory`, or the file of a recording has changed since
+            `identify` read it.
+        WriteError: A file cannot be written, for example because the disk is full; the message states the plan's path.
 
     Example:
         >>> from tempfile import mkdtemp
@@ -205,8 +205,8 @@ def _save_other(result: Any, directory: str | Path, meshes: bool) -> Any:
 
 
 def write_run(solution: Solution | PhasedSolution, folder: Path, *, meshes: bool = True) -> PlanRecord:
-    """Write what `save` does into `folder`, which `written_whole` gave."""
-    keep_plan(solution, folder)  # what is measured next may take long
+    """Write the files of `save` into `folder`, which `written_whole` gave."""
+    keep_plan(solution, folder)  # the measurement may take long
     phases = solution.phases if isinstance(solution, PhasedSolution) else (solution,)
     write_bundle(folder, *(phase.problem.moved for phase in phases), meshes=meshes)
     return write_measured(solution, folder)
@@ -218,9 +218,9 @@ def write_measured(
     amend: Callable[[PlanRecord, Path], PlanRecord] = lambda record, folder: record,
     dump: Callable[[PlanRecord, Path], dict[str, Any]] = lambda record, folder: fields_of(record),
 ) -> PlanRecord:
-    """Measure `solution` and write it to `folder`; `amend` changes each record before anything has it.
+    """Measure `solution` and write it to `folder`; `amend` changes each record before it is used.
 
-    `dump` gives the fields of a record as pages and trace have them.
+    `dump` returns the fields of a record for the pages and the trace.
     """
     if isinstance(solution, PhasedSolution):
         for i, phase in enumerate(solution.phases):
@@ -234,7 +234,7 @@ def write_measured(
 
 
 def record_without_problem(name: str, sentence: str) -> PlanRecord:
-    """The record of a run that ended before there was a problem: it says that, when and with which versions."""
+    """Return the record of a run that ended before there was a problem, with the reason, the time and the versions."""
     return PlanRecord(
         verdict="incomplete",
         sentence=sentence,
@@ -244,9 +244,9 @@ def record_without_problem(name: str, sentence: str) -> PlanRecord:
 
 
 def keep_plan(solution: Solution | PhasedSolution, folder: Path) -> None:
-    """Write the plan, with a record that says "incomplete", into `folder`: `recover` measures it from there.
+    """Write the plan with an "incomplete" record into `folder`, from which `recover` can measure it.
 
-    A signal waits until both are there.
+    Signals are deferred until both are written.
     """
     with held_interrupts():
         sentence = f"{NOT_MEASURED}: {solution.message}"
@@ -264,7 +264,7 @@ def keep_plan(solution: Solution | PhasedSolution, folder: Path) -> None:
 
 @contextmanager
 def plan_kept(solution: Solution | PhasedSolution, name: str, folder: Path | None = None) -> Iterator[None]:
-    """Where a WriteError leaves no plan in `folder`, or where it says that files were kept, it is kept elsewhere."""
+    """Save the plan to another folder after a WriteError, unless `folder` or the error's folder contains it."""
     try:
         yield
     except WriteError as error:
@@ -285,28 +285,28 @@ def _has_plan(folder: Path, solution: Solution | PhasedSolution) -> bool:
 
 
 def _kept_elsewhere(solution: Solution | PhasedSolution, name: str) -> str:
-    """Keep the plan in the first folder that takes it; a sentence says which."""
+    """Save the plan in the first writable folder; return a sentence with its path."""
     places: tuple[Callable[[], Path], ...] = (lambda: Path(gettempdir()), Path.cwd, Path.home)
     for location in places:
         try:
             folder = partial_of(location() / name)
             keep_plan(solution, folder)
-        except OSError:  # the next one, and the sentence says where it was
+        except OSError:  # try the next one; the sentence contains the path
             continue
         return f"the plan is in {folder}"
     return "the plan could not be saved: no temporary folder can be written"
 
 
 def fields_of(record: PlanRecord) -> dict[str, Any]:
-    """The fields of a record in the order in which it is written."""
+    """Return the fields of a record in the order in which they are written."""
     fields: dict[str, Any] = json.loads(canonical(record.model_dump(mode="json")))
     return fields
 
 
 def write_files(folder: Path, measurement: Measurement, fields: dict[str, Any]) -> None:
-    """Write `FILES`, all but the record and its schema, of a record with these `fields`."""
+    """Write `FILES`, that is, all files except the record with these `fields` and its schema."""
     from drake_diff.runs.page import write_pages
-    from drake_diff.runs.trace import write_trace  # what a script that saves nothing need not load
+    from drake_diff.runs.trace import write_trace  # only loaded to save
 
     write_plan(folder / PLAN, measurement.solution)
     write_trace(folder / TRACE, measurement, {PlanRecord.FILE: ("application/json", reproducible(fields).encode())})
@@ -314,7 +314,7 @@ def write_files(folder: Path, measurement: Measurement, fields: dict[str, Any]) 
 
 
 def begin_interrupted(folder: Path, problem: Problem | PhasedProblem) -> None:
-    """Say in the record of a run in `folder` that it was interrupted, before the search where there is none yet."""
+    """Mark the run in `folder` as interrupted, before the search if it has no record yet."""
     if record_path(folder) is None:
         begin(folder, problem, BEFORE_THE_SEARCH)
         return
@@ -323,7 +323,7 @@ def begin_interrupted(folder: Path, problem: Problem | PhasedProblem) -> None:
 
 
 def begin_failure(error: BaseException, folder: Path, problem: Problem | PhasedProblem) -> None:
-    """Say in the record of a run that is under way in `folder` that `error` ended it before there was a solution."""
+    """Mark the run in progress in `folder` as ended by `error` before there was a solution."""
     failure = failure_of(error)
     event = Event(t_s=None, kind="failure", message=failure.message)
     sentence = f"the run ended with an error: {failure.message}"
@@ -331,7 +331,7 @@ def begin_failure(error: BaseException, folder: Path, problem: Problem | PhasedP
 
 
 def record_of(m: Measurement, folder: Path) -> PlanRecord:
-    """The record of a measurement, but for the files; `folder` is where they are written."""
+    """Return the record of a measurement without its files, which are written to `folder`."""
     replays = [replay_evidence(r) for r in (*m.replays, *m.solution.cross_checks)]
     return _record(
         folder,
@@ -354,23 +354,23 @@ def _record(folder: Path, problem: Problem, duration: float | None = None, /, **
 
 
 def recover(directory: str | Path, out: str | Path | None = None) -> SealedRecord:
-    """Complete a run from the directory NAME.partial-... that it left, as far as that can be done.
+    """Complete an unfinished run from the directory NAME.partial-... that it left, as far as possible.
 
-    What was written whole takes its place. Of a solve whose plan is there, the plan is measured again and all files are
-    written. Its search is not made again, by `verify` either: whoever ran it had not told all that it came to.
+    A complete run is moved to its place. If a solve has left its plan, the plan is measured again and all files are
+    written. The search is not repeated, not even by `verify`, since its results were not recorded completely.
 
     Args:
-        directory: What the run left.
-        out: Where the run is to be; NAME where not given. No run is replaced.
+        directory: The directory that the run left.
+        out: The directory for the run, NAME by default. An existing run is not replaced.
 
     Returns:
         The record.
 
     Raises:
-        InputError: `directory` is no such directory, or `out` is not empty.
-        ArtifactError: There is nothing in it that could be completed, or the run is still being written.
-        ModelError: The model's file is not what it was.
-        WriteError: The disk is full, or does not let a file be written.
+        InputError: `directory` is not such a directory, or `out` is not empty.
+        ArtifactError: It contains nothing that can be completed, or the run is still being written.
+        ModelError: The model's file has changed.
+        WriteError: A file cannot be written, for example because the disk is full.
 
     Example:
         >>> from tempfile import mkdtemp
@@ -408,7 +408,7 @@ def recover(directory: str | Path, out: str | Path | None = None) -> SealedRecor
 
 
 def _measured(folder: Path, record: PlanRecord, target: Path) -> PlanRecord:
-    """The plan in `folder` measured, and written to `target`."""
+    """Measure the plan in `folder` and write the run to `target`."""
     costs, constraints = unknown_functions(record)
     if costs or constraints:
         names = ", ".join((*costs, *constraints))
@@ -426,7 +426,7 @@ def _measured(folder: Path, record: PlanRecord, target: Path) -> PlanRecord:
 
 
 def _with_the_search(made: PlanRecord, record: PlanRecord) -> PlanRecord:
-    """With what `record` says of the search, which only who ran it knew."""
+    """Return `made` with the facts about the search from `record`, which cannot be reproduced."""
     content: dict[str, Any] = {
         "sentence": f"{made.sentence}; {RECOVERED}",
         "solver": record.solver,

@@ -1,6 +1,6 @@
-"""The problem, its solver and its gradient in a record; and the problem read back from there.
+"""Write the problem, its solver and its gradient to a record, and rebuild the problem from a record.
 
-A problem is written as plain numbers and names, and comes back from them: all of it but the user's own functions.
+A problem is stored as numbers and names, from which everything except a user's functions is rebuilt.
 """
 
 from collections.abc import Mapping
@@ -49,13 +49,13 @@ from drake_diff.runs.provenance import contract_of, gradient_evidence
 
 COSTS = ("running_cost", "final_cost", "trajectory_cost", "parameter_cost")
 LIMITS = ("x_lower", "x_upper", "u_lower", "u_upper")
-MISSING = {"lower": -np.inf, "upper": np.inf}  # what null is, of a bound
+MISSING = {"lower": -np.inf, "upper": np.inf}  # the meaning of null in a bound
 GUESS = ("initial_guess", "initial_guess_sha256")
 KINDS_OF_GOALS = (FrameGoal, FrameVelocityGoal, JointGoal, CenterOfMassGoal, KeepLevel, Dwell, TerminalSet)
 KINDS_OF_OBSTACLES = (ContactSchedule, SphereObstacle, BoxObstacle, SelfCollision)
 GOALS: dict[str, Any] = {kind.__name__: kind for kind in (*KINDS_OF_GOALS, *KINDS_OF_OBSTACLES)}
 COUPLINGS: dict[str, Any] = {kind.__name__: kind for kind in (Periodic, InputRate, Jerk)}
-# Costs by their attributes, which are the arguments that make them.
+# Costs with their attributes, which are also the arguments of their constructors.
 KINDS_OF_COSTS: dict[str, tuple[Any, tuple[str, ...]]] = {
     "ConstantCost": (ConstantCost, ("rate",)),
     "QuadraticCost": (QuadraticCost, ("Q", "R", "x_ref", "u_ref")),
@@ -64,7 +64,7 @@ KINDS_OF_COSTS: dict[str, tuple[Any, tuple[str, ...]]] = {
 
 
 def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
-    """The sections that are known when a run begins; with its `solution` those of the search too."""
+    """Return the sections that are known when a run begins; with a `solution`, also those of its search."""
     options = {} if solution is None else solution.options
     seed = options.get("seed")
     return {
@@ -80,7 +80,7 @@ def asked(problem: Problem, solution: Solution | None = None) -> dict[str, Any]:
 
 
 def _search(solution: Solution) -> dict[str, Any] | None:
-    """What `solve` was called with; its guess by kind: null for none, "arrays", or the scheme of a solution."""
+    """Return the arguments of `solve`; the guess by kind: null for none, "arrays", or the scheme of a solution."""
     if solution.search is None:
         return None
     guess = solution.search.guess
@@ -89,7 +89,7 @@ def _search(solution: Solution) -> dict[str, Any] | None:
 
 
 def found(solution: Solution, *, measured: bool = True) -> dict[str, Any]:
-    """The sections that say how a solution was found; norms of gradients take time, and are of what is `measured`."""
+    """Return the sections on how a solution was found; the gradients' norms are only computed if `measured`."""
     gradient = (
         _gradient(solution) if measured else GradientEvidence(reason="not measured yet", columns=_columns(solution))
     )
@@ -102,7 +102,7 @@ def found(solution: Solution, *, measured: bool = True) -> dict[str, Any]:
 
 
 def solver_of(solution: Solution, *, measured: bool = True) -> Solver:
-    """What solved the problem, and how it ended; an option that is no finite number is null."""
+    """Return the solver's section with the result of the solve; non-finite options are null."""
     options = {name: value for name, value in solution.options.items() if name not in GUESS}
     return evidence(
         Solver,
@@ -129,7 +129,7 @@ def _parameters(solution: Solution) -> list[ParameterEvidence]:
 
 
 def _gradient(solution: Solution) -> GradientEvidence:
-    """The settings of the derivatives and the norms."""
+    """Return the settings of the derivatives, and the norms."""
     problem = solution.problem
     contact = problem.model.contract.contact if problem.has_model else None
     regularization = "none"
@@ -150,7 +150,7 @@ def _gradient(solution: Solution) -> GradientEvidence:
 
 
 def _columns(solution: Solution) -> list[GradientColumn]:
-    """What the derivatives are by; states and inputs have the source of the certificates."""
+    """Return the variables of the derivatives; states and inputs have the source of the certificates."""
     problem, vector = solution.problem, solution.vector
     methods = "; ".join(dict.fromkeys(c.method for c in solution.certificates)) or "no certificate was reached"
     if problem.motion != STEPS:
@@ -162,7 +162,7 @@ def _columns(solution: Solution) -> list[GradientColumn]:
 
 
 def describe_problem(problem: Problem) -> dict[str, Any]:
-    """The problem for a record; functions by their names."""
+    """Describe the problem for a record; functions are described by their names."""
     return {
         "system": problem.name,
         "num_steps": problem.num_steps,
@@ -200,7 +200,7 @@ def _constraint(problem: Problem, c: Constraint) -> dict[str, Any]:
 
 
 def _cost(cost: Any) -> Any:
-    """{kind: values}; of a user's function its name."""
+    """Return {kind: values}, or the name of a user's function."""
     if isinstance(cost, SumOfCosts):
         result = [_cost(entry) for entry in cost.costs]
         unknown = [entry for entry in result if isinstance(entry, str)]
@@ -215,7 +215,7 @@ def _cost(cost: Any) -> Any:
 
 
 def unknown_functions(record: PlanRecord) -> tuple[list[str], list[str]]:
-    """(costs, constraints) of a record's problem that are the user's functions: their code is not in it."""
+    """Return the (costs, constraints) of a recorded problem that are a user's functions, whose code is not recorded."""
     p: dict[str, Any] = dict(record.problem)
     costs = [f"{name} {p[name]}" for name in COSTS if isinstance(p.get(name), str)]
     listed = p.get("constraints")
@@ -226,10 +226,10 @@ def unknown_functions(record: PlanRecord) -> tuple[list[str], list[str]]:
 
 
 def rebuild_problem(record: PlanRecord, model: Model, us: Array, start_us: Array | None) -> Problem:
-    """The problem of a record on `model`, without the user's functions.
+    """Rebuild the problem of a record on `model`, without the user's functions.
 
-    `us` (N, nu) are the inputs of the plan, which the problem has where they are not optimized; `start_us` (N, nu) its
-    first guess of them where they are, if it has one.
+    `us` (N, nu) are the inputs of the plan, which the problem uses if they are not optimized. `start_us` (N, nu) is its
+    initial guess of optimized inputs, if it has one.
     """
     p: dict[str, Any] = dict(record.problem)
     starts = np.array([entry.start for entry in record.parameters])
@@ -247,7 +247,7 @@ def rebuild_problem(record: PlanRecord, model: Model, us: Array, start_us: Array
         "couplings": [_rebuild("coupling", COUPLINGS, c) for c in p.get("couplings", ()) if "Coupling" not in c],
     }
     if not any(requests.values()) and np.all(np.isnan(goal)):
-        requests["final_cost"] = QuadraticCost(Q=np.zeros((model.nx, model.nx)))  # a Problem wants something asked
+        requests["final_cost"] = QuadraticCost(Q=np.zeros((model.nx, model.nx)))  # a Problem needs a cost or goal
     return Problem(
         system,
         x0=_numbers(p["x0"], np.nan),
@@ -282,13 +282,13 @@ def _rebuild_constraint(c: dict[str, Any], system: Model | FixedContacts) -> Con
 
 
 def rebuild_goal(described: Any) -> Goal:
-    """A goal from what a record has of it; InputError where that is none."""
+    """Rebuild a goal from its description in a record; raise InputError if that is not a goal."""
     goal: Goal = _rebuild("goal", GOALS, described)
     return goal
 
 
 def _rebuild(subject: str, kinds: Mapping[str, Any], described: Any) -> Any:
-    """One of `kinds` with its values; InputError where `described` is none."""
+    """Rebuild one of `kinds` from its values; raise InputError if `described` is not one of them."""
     if not (isinstance(described, dict) and len(described) == 1 and next(iter(described)) in kinds):
         raise InputError(subject, got=repr(described)[:80], expected=f"one of {', '.join(kinds)} with its values")
     ((kind, values),) = described.items()
@@ -298,13 +298,13 @@ def _rebuild(subject: str, kinds: Mapping[str, Any], described: Any) -> Any:
 
 
 def _numbers(values: Any, missing: float) -> Array:
-    """(n,) numbers, `missing` where there is none."""
+    """Convert `values` to an array (n,) with `missing` in place of None."""
     return np.array([missing if v is None else v for v in values], dtype=float)
 
 
 def _rebuild_cost(cost: Any) -> Any:
     if not isinstance(cost, dict):
-        return None  # none, or the user's function
+        return None  # no cost, or a user's function
     ((kind, values),) = cost.items()
     if kind == "SumOfCosts":
         return [_rebuild_cost(entry) for entry in values]

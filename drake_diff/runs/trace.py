@@ -1,7 +1,7 @@
-"""trace.mcap: the plant's motion and the plan in simulated time, and how the plan was found; and a ROS 2 bag of it.
+"""trace.mcap: the plant's motion and the plan in simulated time, and the search for the plan; and its ROS 2 bag.
 
-Tables that have no simulated time are logged at 1 ms per row: wall time would make no two files alike. The bag has the
-trace's own channels in ROS 2's messages and encoding, as `ros2 bag` reads them.
+Tables without simulated time are logged at 1 ms per row, since wall-clock times would make every file different. The
+bag contains the trace's own channels in ROS 2's messages and encoding, as `ros2 bag` reads them.
 """
 
 import json
@@ -39,15 +39,15 @@ from drake_diff.runs.measurement import Measurement, gradient_norms
 ROW_PERIOD = 1_000_000  # [ns] of log time per row of a table
 CONFIGURATION = "configuration.json"
 MEDIA_TYPES = {".urdf": "application/xml", ".sdf": "application/xml", ".xml": "application/xml"}
-# What `read_trace` needs; a trace has more channels than these.
+# The channels that `read_trace` needs; a trace has more channels.
 CHANNELS = {"/state", "/input", "/planned/state", "/planned/input", "/planned/plan", "/diagnostics"}
 
 
 def write_trace(path: Path, m: Measurement, attachments: Mapping[str, tuple[str, bytes]]) -> None:
-    """Write the trace of a measurement; `attachments` are name: (media type, data).
+    """Write the trace of a measurement; `attachments` maps names to (media type, data).
 
-    The configuration and the model file are attached beside them. The frames are those of the plant with the
-    solution's parameters.
+    The configuration and the model file are attached too. The frames are those of the plant with the solution's
+    parameters.
     """
     solution = m.solution
     problem = solution.problem
@@ -57,7 +57,7 @@ def write_trace(path: Path, m: Measurement, attachments: Mapping[str, tuple[str,
         "scheme": solution.scheme,
         "num_steps": problem.num_steps,
         "time_step_s": problem.time_step,
-        # A number that is not finite is text here, as JSON has none.
+        # Non-finite numbers are stored as text, since JSON has none.
         "options": json.loads(json.dumps(solution.options, default=str), parse_constant=str),
     }
     files = {CONFIGURATION: ("application/json", canonical(configuration).encode()), **attachments}
@@ -73,7 +73,7 @@ def write_trace(path: Path, m: Measurement, attachments: Mapping[str, tuple[str,
         "verdict_rests_on": m.shown[1],
     }
     shown = Shown(problem.model, solution.time_step, m.xs, m.motion) if problem.has_model else None
-    # The solver's tables and the plan are made before the parameters are applied: its replays use the plant too.
+    # The tables and the plan are made before the parameters are applied, since the replays use the plant too.
     channels = [*_solver_channels(m), *_plan_channels(m), _event_channel(m)]
     with applied(solution.vector) if shown else nullcontext():
         write_mcap(path, [*(motion_channels(shown) if shown else _no_motion(m)), *channels], metadata, files)
@@ -87,7 +87,7 @@ def _told_of_motion(m: Measurement) -> str:
 
 
 def _no_motion(m: Measurement) -> Iterator[Channel]:
-    """The channels of a motion on the plant, empty: plain dynamics have no plant."""
+    """Yield the channels of the plant's motion without rows, since plain dynamics have no plant."""
     nothing = np.zeros((0, len(m.positions)))
     yield state_channel("/state", nothing[:, 0], nothing, m.positions, m.velocities)
     yield input_channel("/input", nothing[:, 0], nothing, m.inputs)
@@ -96,7 +96,7 @@ def _no_motion(m: Measurement) -> Iterator[Channel]:
 
 
 def _plan_channels(m: Measurement) -> Iterator[Channel]:
-    """All that a Solution's numbers are made of: states, inputs at knots and midpoints, horizon, parameters."""
+    """Yield the channels of a Solution's numbers: states, inputs at knots and midpoints, horizon, parameters."""
     solution, times = m.solution, m.solution.times
     inputs = solution.inputs_at_knots
     yield state_channel("/planned/state", times, solution.xs, m.positions, m.velocities)
@@ -121,7 +121,7 @@ def _plan_channels(m: Measurement) -> Iterator[Channel]:
 
 
 def _solver_channels(m: Measurement) -> Iterator[Channel]:
-    """The solver's own table, a row per certificate, the gradient's norm at each step, a row per replay."""
+    """Yield the tables of the solver's iterations, certificates and replays, and the gradient's norm at each step."""
     solution = m.solution
     kind = TYPES["SolverIteration"]
     yield _table("/solver/iterations", kind, [_fields(kind, row) for row in solution.iterations], "iteration")
@@ -141,7 +141,7 @@ def _solver_channels(m: Measurement) -> Iterator[Channel]:
 
 
 def _fields(kind: MessageType, value: Any) -> Any:
-    """The message of a value that has an attribute for each of its fields."""
+    """Convert a value with an attribute for each field of the message to the message."""
     return kind.cls(**{field.name: getattr(value, field.name) for field in kind.cls.DESCRIPTOR.fields})
 
 
@@ -151,7 +151,7 @@ def _table(topic: str, kind: MessageType, rows: Sequence[Any], row: str) -> Chan
 
 
 def _gradient_check(c: Certificate) -> Any:
-    worst = c.worst if c.codes.size else None  # a derivative by nothing has no entry
+    worst = c.worst if c.codes.size else None  # an empty derivative has no entry
     derivative, difference = c.derivative.ravel(), c.difference.ravel()
     lengths = float(np.linalg.norm(derivative) * np.linalg.norm(difference))
     return TYPES["GradientCheck"].cls(
@@ -171,7 +171,7 @@ def _gradient_check(c: Certificate) -> Any:
 
 
 def _event_channel(m: Measurement) -> Channel:
-    """The events and failures of the record: what is before the motion at 0 s, failures at its end."""
+    """Return the channel of the record's events and failures: those before the motion at 0 s, failures at its end."""
     kind = TYPES["Event"]
     before = [event for event in m.events if event.kind != "failure"]
     rows = [kind.cls(time=event.t_s or 0.0, kind=event.kind, message=event.message) for event in before]
@@ -185,8 +185,8 @@ def _event_channel(m: Measurement) -> Channel:
 class Trace(ShowsItsRepr):
     """The motions in a trace; arrays are read-only. All numbers of the plan are in plan.npz.
 
-    `xs` (N+1, nx) under `us` (N, nu) is the open-loop motion of the discrete plant, without rows where it could not
-    be taken; `planned_xs` (N+1, nx) and `planned_us` (N or N+1, nu) are the solver's.
+    `xs` (N+1, nx) under `us` (N, nu) is the open-loop motion of the discrete plant, without rows if it could not be
+    computed; `planned_xs` (N+1, nx) and `planned_us` (N or N+1, nu) are the solver's.
 
     Example:
         >>> from drake_diff.runs import read_trace
@@ -210,7 +210,7 @@ class Trace(ShowsItsRepr):
 
 
 def read_trace(path: str | Path) -> Trace:
-    """Read the numbers of a trace back, bit for bit as they were written.
+    """Read the numbers of a trace, bit for bit as they were written.
 
     Args:
         path: A trace.mcap that `save` wrote.
@@ -256,17 +256,17 @@ def _states(columns: dict[str, Any]) -> Array:
 
 
 TRACE, STATE = "trace.mcap", "/state"
-QUATERNION_POSE = ("qw", "qx", "qy", "qz", "x", "y", "z")  # of a free body's coordinates, by the ends of their names
-INFO, ERROR = 20, 40  # of rcl_interfaces/Log
-BAG_VERSION = 8  # of metadata.yaml: the one that Humble and everything newer reads
+QUATERNION_POSE = ("qw", "qx", "qy", "qz", "x", "y", "z")  # suffixes of a free body's coordinates
+INFO, ERROR = 20, 40  # levels of rcl_interfaces/Log
+BAG_VERSION = 8  # version of metadata.yaml that Humble and all newer releases read
 Convert = Callable[[dict[str, Any], int, Any, dict[str, Any]], Any]  # ROS types, time [ns], message, channel metadata
 
 
 def export_ros2(run: str | Path, out: str | Path) -> dict[str, int]:
-    """Write the bag directory `out` from the trace of the run directory `run`; gives messages by topic.
+    """Write the bag directory `out` from the trace of the run directory `run`; return the number of messages by topic.
 
-    Each free body is nav_msgs/Odometry in /odometry/BODY. Times are simulated, from 0. Raises ArtifactError where the
-    trace is missing, damaged or without joints, InputError where `out` exists, MissingDependencyError without the
+    Each free body is nav_msgs/Odometry in /odometry/BODY. Times are simulated, from 0. Raises ArtifactError if the
+    trace is missing, damaged or without joints, InputError if `out` exists, and MissingDependencyError without the
     `rosbags` package.
     """
     try:
@@ -298,7 +298,7 @@ def export_ros2(run: str | Path, out: str | Path) -> dict[str, int]:
 
 
 def _free_bodies(metadata: dict[str, Any]) -> dict[str, tuple[str, str, Convert]]:
-    """By topic the channel, the type and the conversion of each free body, known by the names of its coordinates."""
+    """Map topics to the channel, type and conversion of each free body, recognized by its coordinates' names."""
     names: dict[str, list[str]] = metadata.get("names", {})
     q, v = names.get("q", []), names.get("v", [])
     result: dict[str, tuple[str, str, Convert]] = {}
@@ -311,7 +311,7 @@ def _free_bodies(metadata: dict[str, Any]) -> dict[str, tuple[str, str, Convert]
 
 
 def _odometry(types: dict[str, Any], time: int, message: Any, _: dict[str, Any], *, body: str, i: int, j: int) -> Any:
-    """nav_msgs/Odometry, as REP 105 has it: the twist in the body's frame. `i` and `j` are its places in q and v."""
+    """Return nav_msgs/Odometry with the twist in the body's frame (REP 105); `i` and `j` are its indices in q and v."""
     w, x, y, z, *p = message.q[i : i + 7]
     turn = rotation(np.array([w, x, y, z])).T
     angular, linear = (turn @ np.array(message.v[k : k + 3]) for k in (j, j + 3))
@@ -329,7 +329,7 @@ def _odometry(types: dict[str, Any], time: int, message: Any, _: dict[str, Any],
 
 
 def _joint_state(types: dict[str, Any], time: int, message: Any, _: dict[str, Any]) -> Any:
-    """sensor_msgs/JointState; NaN for the effort of a joint that nothing drives, no efforts where none is known."""
+    """Return sensor_msgs/JointState; the effort is NaN for an unactuated joint, and empty if no effort is known."""
     joints = message.joints
     efforts = [j.effort if j.HasField("effort") else np.nan for j in joints]
     return types["sensor_msgs/msg/JointState"](
@@ -355,7 +355,7 @@ def _transforms(types: dict[str, Any], time: int, message: Any, _: dict[str, Any
 
 
 def _input(types: dict[str, Any], _: int, message: Any, metadata: dict[str, Any]) -> Any:
-    """std_msgs/Float64MultiArray, the inputs' names as the label of its dimension."""
+    """Return std_msgs/Float64MultiArray; the label of its dimension lists the names of the inputs."""
     count = len(message.u)
     dimension = types["std_msgs/msg/MultiArrayDimension"](", ".join(metadata["names"]["u"]), count, count)
     layout = types["std_msgs/msg/MultiArrayLayout"](dim=[dimension], data_offset=0)
@@ -363,7 +363,7 @@ def _input(types: dict[str, Any], _: int, message: Any, metadata: dict[str, Any]
 
 
 def _diagnostics(types: dict[str, Any], time: int, message: Any, metadata: dict[str, Any]) -> Any:
-    """diagnostic_msgs/DiagnosticArray: every number as text that reads back to the same bits, its unit beside it."""
+    """Return diagnostic_msgs/DiagnosticArray with all numbers as text without rounding, and with their units."""
     units = metadata["units"]
     pair = types["diagnostic_msgs/msg/KeyValue"]
     names = [field.name for field in message.DESCRIPTOR.fields]
@@ -374,7 +374,7 @@ def _diagnostics(types: dict[str, Any], time: int, message: Any, metadata: dict[
 
 
 def _contacts(types: dict[str, Any], time: int, message: Any, metadata: dict[str, Any]) -> Any:
-    """diagnostic_msgs/DiagnosticArray: a status for each contact, body a on body b; numbers as in `_diagnostics`."""
+    """Return diagnostic_msgs/DiagnosticArray with a status for each contact, body a on body b, as in `_diagnostics`."""
     units, pair = metadata["units"], types["diagnostic_msgs/msg/KeyValue"]
     names = [field.name for field in message.DESCRIPTOR.fields if field.name not in ("body_a", "body_b")]
     result = [
@@ -388,7 +388,7 @@ def _contacts(types: dict[str, Any], time: int, message: Any, metadata: dict[str
 
 
 def _event(types: dict[str, Any], time: int, message: Any, _: dict[str, Any]) -> Any:
-    """rcl_interfaces/Log: a failure is an error, anything else information; its kind is the name."""
+    """Return rcl_interfaces/Log: an error for a failure, else information; its name is the event's kind."""
     content = message.kind if not message.failure_label else f"{message.kind}: {message.failure_label}"
     return types["rcl_interfaces/msg/Log"](
         stamp=_header(types, time).stamp, level=ERROR if message.kind == "failure" else INFO, name=content,

@@ -1,4 +1,4 @@
-"""`verify`: make a directory again and compare all of it. `recalled` takes a run up again."""
+"""Verify run directories with `verify`, which reproduces them, and load their solutions with `recalled`."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -46,20 +46,20 @@ from drake_diff.runs.reproduce import (
 )
 from drake_diff.runs.trace import CONFIGURATION
 
-MOST = 16  # lines of a kind that are printed
-SAME_VALUES = ("3.1.", "4.0.", SCHEMA_VERSION)  # versions of the schema whose values are those of this one
-WORDS = ("sentence", "message", "statement", "definition", "reason", "told")  # which versions choose
+MOST = 16  # printed lines of each kind
+SAME_VALUES = ("3.1.", "4.0.", SCHEMA_VERSION)  # schema versions whose values are those of the present one
+WORDS = ("sentence", "message", "statement", "definition", "reason", "told")  # fields with version-dependent wording
 OLD_SCHEMAS = tuple(name.replace(".json", ".schema.json") for name in OLD_FILES)
-MADE_APART = ("complaints", "undecided", "unchecked", "rounded")  # of a verification: told by the process apart
-# What nothing can make again, in every record, by key.
+MADE_APART = ("complaints", "undecided", "unchecked", "rounded")  # results of the child process
+# What cannot be reproduced in any record, by key.
 UNCHECKED = (
     "wall_clock: when the record was made, and how long that took",
     "provenance: the versions, the commit, the machine and the command that made it, and where the model file was",
     "name: what it was called",
 )
 UNREAD = "hashes match, contents not checked"
-WAITED = 60.0  # [s] for a run to be made again, where nobody says else
-HASHED = ("schema_version", "files", "record_sha256")  # of a record
+WAITED = 60.0  # [s] default time limit for reproducing a run
+HASHED = ("schema_version", "files", "record_sha256")  # record fields that `compare_fields` does not compare
 OF_FUNCTIONS = (
     "all that rests on the functions: only the plan's first and last state and its bounds were compared with the "
     "metrics, and the plan with the trace"
@@ -75,23 +75,23 @@ NOT_RERUN = {
 
 @dataclass(frozen=True, repr=False)
 class Verification(ShowsItsRepr):
-    """What `verify` found in a directory.
+    """The result of `verify` for a directory.
 
-    `verdict` is "holds" where every file is as it was written and all of it came out again; "intact" where every file
-    is as it was written, and nothing, or only what rests on recordings, was made again; "undecided" where what the
-    record's verdict rests on could not be made again; "broken" where something is not what it was.
+    `verdict` is "holds" if every file is unchanged and everything was reproduced. It is "intact" if every file is
+    unchanged, and nothing, or only what depends on recordings, was reproduced. It is "undecided" if the basis of the
+    record's verdict could not be reproduced, and "broken" if something was changed.
 
-    That a record holds says that it is true, not that the run was a success: that is `record.verdict`.
+    The verdict "holds" means that the record is true, not that the run was a success. See `record.verdict` for that.
 
     Attributes:
-        directory: What was verified.
-        record: The record in it; None where it cannot be read.
-        complaints: A sentence for each file that is not as it was written, and for each value that did not come out.
-        undecided: Why what the record's verdict rests on could not be made again.
-        claimed: What the record says was asked and came out. A weaker claim can be just as true.
-        unchecked: What was not checked, by key.
-        rounded: What differs by no more than machines round differently.
-        checked: How many values of record, trace and pages were compared with those made again.
+        directory: The verified directory.
+        record: Its record, or None if it cannot be read.
+        complaints: A sentence for each file that was changed, and for each value that was not reproduced.
+        undecided: The reasons why the basis of the record's verdict could not be reproduced.
+        claimed: The task and the result according to the record. A weaker claim can be just as true.
+        unchecked: The parts that were not checked, by key.
+        rounded: The differences within the rounding differences between machines.
+        checked: Number of values of record, trace and pages that were compared with reproduced values.
         notes: Versions that differ from those of the record.
 
     Example:
@@ -112,7 +112,7 @@ class Verification(ShowsItsRepr):
 
     @property
     def verdict(self) -> Literal["holds", "intact", "undecided", "broken"]:
-        """What can be said of the directory as a whole."""
+        """The verdict on the directory as a whole."""
         if self.complaints:
             return "broken"
         if self.undecided:
@@ -127,7 +127,7 @@ class Verification(ShowsItsRepr):
 
     @property
     def sentence(self) -> str:
-        """What the verdict rests on."""
+        """The reason for the verdict."""
         if self.verdict == "holds":
             return f"run again, all {self.checked} values came out" + (" but for rounding" if self.rounded else "")
         if self.verdict == "intact":
@@ -138,7 +138,7 @@ class Verification(ShowsItsRepr):
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """What was found, for a reader: what was claimed, what was not checked, what is wrong."""
+        """The findings as lines of text: the claims, the unchecked parts, and the problems."""
         groups = {
             "claimed": self.claimed,
             "not checked": self.unchecked,
@@ -154,7 +154,7 @@ class Verification(ShowsItsRepr):
         return tuple(content)
 
     def require(self) -> "Verification":
-        """This verification where it holds; ArtifactError, with what does not, where it does not."""
+        """Return this verification if it holds, else raise an ArtifactError with the problems."""
         if not self.holds:
             raise ArtifactError(f"{self.directory}: {self}")
         return self
@@ -172,40 +172,39 @@ class Verification(ShowsItsRepr):
 def verify(
     directory: str | Path, *, models: str | Path | None = None, time_limit: float = WAITED, memory_limit: float = 1.0
 ) -> Verification:
-    """Check a directory's schema, hashes and files, then make it again and compare all of it.
+    """Check the schema, hashes and files of a directory, then reproduce it and compare all of it.
 
-    A solve is run again as its record says `solve` was called; its plan is measured again, and record, trace and pages
-    are written again and compared, texts exactly and numbers as far as machines round alike. A certification is taken
-    again. Each part of a closed loop is given its recorded inputs again: the plant, the sensor, the estimator, the
-    actuator, and MPC of a recorded problem; what a user's code made is data, and is not executed. So whoever changes a
-    value and all hashes with it is found, and the message names the value. A record of an easier task is as true as
-    any: `claimed` says what was asked.
+    A solve is repeated with the recorded arguments of `solve`. Its plan is measured again, and record, trace and pages
+    are written again and compared, texts exactly and numbers up to rounding. A certification is repeated. The parts of
+    a closed loop (plant, sensor, estimator, actuator, and MPC of a recorded problem) run again on their recorded
+    inputs. The results of a user's code are data, and the code is not executed. A changed value is therefore found even
+    if all hashes were changed with it, and the message names the value. A record of an easier task is as true as any;
+    `claimed` states the task.
 
-    Comparisons, robustness trials, panels and rollouts' certificates are not run again: their verdict is at best
-    "intact". But recordings that were compared are compared again, and their causes looked for; table, summary and
-    ranking of a panel are made again from its trials. What cannot be run again (a model that came from a diagram, a
-    user's functions, a search that a time limit ended) makes the verdict "undecided", and so does another version of
-    Drake where numbers differ. It takes as long as the solve or the search for causes did, of which it waits for 60
-    seconds where `time_limit` says nothing else.
+    Comparisons, robustness trials, panels and rollouts' certificates are not repeated, so their verdict is at best
+    "intact". However, compared recordings are compared again, and their causes are searched again. The table, summary
+    and ranking of a panel are computed again from its trials. The verdict is "undecided" if something cannot be
+    repeated (a model from a diagram, a user's functions, a search that a time limit ended), or if numbers differ and
+    the version of Drake is another. The run time is that of the solve or of the search for causes, up to `time_limit`.
 
-    The directory may be a stranger's. Its model is read and run in a child process with limits of time and memory, and
-    with the rights of this one (see docs/verification.md). Where that process crashes the verdict is "broken", where it
-    reaches a limit "undecided".
+    The directory may be untrusted. Its model is read and run in a child process with limits of time and memory, and
+    with the rights of this process (see docs/verification.md). The verdict is "broken" if the child process crashes,
+    and "undecided" if it reaches a limit.
 
     Args:
-        directory: What `save`, `save_comparison`, `save_robustness`, `certify_model` or `run_panel` wrote;
+        directory: A directory written by `save`, `save_comparison`, `save_robustness`, `certify_model` or `run_panel`,
             or trials/ID.json of a panel.
-        models: A folder below which the model file and the meshes that it names may be read, where the directory does
-            not hold them: the one in which the model stood when the run was made. Without it none of them is read.
-        time_limit: How long it may take to make the run again, in seconds. Give more for a solve that took longer.
-        memory_limit: How much memory that may take, in GiB.
+        models: Folder in which the model file and its meshes may be read if the directory does not contain them, that
+            is, the model's folder when the run was made. None of them is read if it is None.
+        time_limit: Time limit for reproducing the run, in seconds. Increase it for a solve that took longer.
+        memory_limit: Memory limit for reproducing the run, in GiB.
 
     Returns:
-        A `Verification`: the verdict, what was claimed, what was not checked, and what does not hold.
+        A `Verification`: the verdict, the claims, the unchecked parts, and the problems.
 
     Raises:
         ArtifactError: There is no such directory.
-        InputError: A limit is not positive, or `models` is no folder.
+        InputError: A limit is not positive, or `models` is not a folder.
 
     Example:
         >>> found = dd.verify("artifacts/pendulum_swing_up")
@@ -220,7 +219,7 @@ def verify(
     result = _looked_at(folder)
     if result.complaints or result.undecided or result.record is None:
         return result
-    if result.record.subject in ("trial", "rollout"):  # which have neither a page nor a model
+    if result.record.subject in ("trial", "rollout"):  # these have neither a page nor a model
         return _run_again(result, result.record, None)
     answer = call_with_limits("drake_diff.runs.verify:_apart", folder, models, float(time_limit), float(memory_limit))
     if answer.is_limit:
@@ -235,7 +234,7 @@ def verify(
 def call_with_limits(
     function: str, folder: Path, models: str | Path | None, seconds: float = WAITED, memory: float = 1.0
 ) -> CallOutcome:
-    """Call `function(directory, models)` in a child process; InputError if `models` is no folder."""
+    """Call `function(directory, models)` in a child process; raise InputError if `models` is not a folder."""
     if models is not None and not Path(models).is_dir():
         raise InputError("models", got=str(models), expected="a folder that exists")
     given = {"directory": str(folder.resolve()), "models": None if models is None else str(Path(models).resolve())}
@@ -243,14 +242,14 @@ def call_with_limits(
 
 
 def require_readable(function: str, folder: Path, models: str | Path | None) -> None:
-    """Call `function` in a child process first; ArtifactError where that does not survive it."""
+    """Call `function` in a child process first; raise ArtifactError if that process fails."""
     answer = call_with_limits(function, folder, models)
     if answer.error:
         raise ArtifactError(f"{folder}: {answer.error}")
 
 
 def verify_own(directory: Path) -> Verification:
-    """What `verify` finds in a directory that this process has just made: here, without limits, its model anywhere."""
+    """Verify a directory that this process just wrote, in this process, without limits, and with its model anywhere."""
     result = _looked_at(directory)
     if result.complaints or result.undecided or result.record is None:
         return result
@@ -258,7 +257,7 @@ def verify_own(directory: Path) -> Verification:
 
 
 def _apart(directory: str, models: str | None) -> dict[str, Any]:
-    """What `verify` finds, of a directory whose files are as they were written, in a process of its own."""
+    """Verify a directory whose files are unchanged; `verify` calls this in a child process."""
     result = _looked_at(Path(directory))
     if result.record is not None and not (result.complaints or result.undecided):
         result = _run_again(result, result.record, None if models is None else Path(models))
@@ -266,7 +265,7 @@ def _apart(directory: str, models: str | None) -> dict[str, Any]:
 
 
 def _looked_at(folder: Path) -> Verification:
-    """What can be said of a directory without making anything again."""
+    """Check a directory without reproducing it."""
     path = record_path(folder)
     if is_partial(folder):
         return _of_a_part(folder)
@@ -286,7 +285,7 @@ def _looked_at(folder: Path) -> Verification:
 
 
 def _of_a_part(folder: Path) -> Verification:
-    """What can be said of a run that was not moved to its place."""
+    """Verify a run that was not moved to its final directory."""
     try:
         record: SealedRecord | None = load_record(folder)
     except ArtifactError:
@@ -296,7 +295,7 @@ def _of_a_part(folder: Path) -> Verification:
 
 
 def _run_again(verification: Verification, record: SealedRecord, models: Path | None) -> Verification:
-    """The directory beside the same reproduced, where it can be."""
+    """Compare a directory with its reproduction, if it can be reproduced."""
     try:
         made = reproduce(verification.directory, record, models)
         if made is None:
@@ -307,17 +306,17 @@ def _run_again(verification: Verification, record: SealedRecord, models: Path | 
     except ArtifactError as error:
         return _judged(verification, [str(error)], [])
     except (ArithmeticError, AttributeError, DrakeDiffError, LookupError, RuntimeError, TypeError, ValueError) as error:
-        # what a forger put together need not fit in any way
+        # the files of a forged directory may contradict each other in any way
         return _judged(verification, [f"it cannot be made again: {type(error).__name__}: {error}"], [])
 
 
 def has_recordings(record: SealedRecord) -> bool:
-    """Whether it is a comparison with recordings that can be compared again."""
+    """Return whether `record` is a comparison with recordings, which can be compared again."""
     return isinstance(record, ComparisonRecord) and bool(record.recordings)
 
 
 def _without_its_model(verification: Verification, record: SealedRecord, error: Exception) -> Verification:
-    """What the files of a run that cannot be made again say of each other."""
+    """Check the files of a run that cannot be reproduced against each other."""
     content, folder = (f"not run again: {error}",), verification.directory
     if not isinstance(record, PlanRecord) or record.subject not in ("plan", "phases"):
         return replace(verification, undecided=content, unchecked=("everything but the hashes",))
@@ -332,13 +331,13 @@ def _without_its_model(verification: Verification, record: SealedRecord, error: 
 
 @contextmanager
 def recalled(directory: str | Path, *, models: str | Path | None = None, trusted: bool = False) -> Iterator[Solution]:
-    """The solution in a run directory, its model rebuilt from there, for as long as the block runs.
+    """Yield the solution in a run directory, with its model rebuilt for the duration of the block.
 
-    The model is read by a process of its own first, with the limits of `verify`, unless it is `trusted`; `models` is as
-    there.
+    The model is read in a child process first, with the limits of `verify`, unless it is `trusted`. `models` is as in
+    `verify`.
 
-    ArtifactError where there is none, it is damaged or it did not end, or that process does not survive it; ModelError
-    where it cannot be built again.
+    Raises ArtifactError if there is no solution, if it is damaged or incomplete, or if the child process fails, and
+    ModelError if the model cannot be rebuilt.
     """
     folder = Path(directory)
     if not trusted:
@@ -352,7 +351,7 @@ def _recalled_apart(directory: str, models: str | None) -> None:
         with _recalled(Path(directory), None if models is None else Path(models)) as solution:
             step(solution.problem.model, solution.xs[0], solution.us[0])
     except DrakeDiffError:
-        return  # which it is again where it is read for use
+        return  # the caller's process raises the same error when it reads the directory
 
 
 @contextmanager
@@ -372,13 +371,13 @@ def _refuse(folder: Path, problems: Sequence[str]) -> None:
 
 
 def _compared(verification: Verification, record: SealedRecord, again: Reproduced) -> Verification:
-    """Record and files of a directory beside the same made again."""
+    """Compare the record and files of a directory with the reproduced ones."""
     converted = record.schema_version != SCHEMA_VERSION
     fields = FileDifferences(record.FILE)
     if again.fields:
         recorded = record.model_dump(mode="json")
         made = dict(again.fields)
-        if converted and "metrics" in made:  # of which it has no more than its version knew
+        if converted and "metrics" in made:  # an older record has only the metrics of its version
             names = {metric["name"] for metric in recorded["metrics"]}
             made["metrics"] = [metric for metric in made["metrics"] if metric["name"] in names]
         _compare_records(fields, again.recorded or {key: recorded[key] for key in again.fields}, made)
@@ -406,7 +405,7 @@ def _compared(verification: Verification, record: SealedRecord, again: Reproduce
 
 
 def _compare_records(compared: FileDifferences, recorded: Mapping[str, Any], again: Mapping[str, Any]) -> None:
-    """Two records, but for their version, and the hashes of files, which are compared by themselves."""
+    """Compare two records except for their versions and the hashes of files, which are checked separately."""
     old, new = ({key: v for key, v in side.items() if key not in HASHED} for side in (recorded, again))
     compare_fields(compared, old, new)
 
@@ -428,14 +427,14 @@ def _compared_file(folder: Path, name: str, again: Reproduced) -> FileDifference
 
 
 def _others(record: SealedRecord, known: Sequence[str]) -> Iterator[str]:
-    """Files that were in the directory and are none that drake_diff writes there."""
+    """Yield the recorded files that drake_diff does not write."""
     for name in sorted(record.files.keys() - {*known, record.SCHEMA_FILE, *OLD_SCHEMAS}):
         if not name.startswith(f"{BUNDLE}/"):  # see `_odd_bundle`
             yield f"{name}: drake_diff does not write such a file"
 
 
 def _odd_bundle(folder: Path, record: SealedRecord) -> Iterator[str]:
-    """What is beside the files that the model names, or is not what its name says."""
+    """Yield files of the model folder that the model does not name, or whose name is not their hash."""
     phases = phase_records(folder, record) if isinstance(record, PlanRecord) else []
     named = {file.sha256 for _, phase in phases for file in phase.model.named} | {f.sha256 for f in record.model.named}
     mpc = record.closed_loop.mpc if isinstance(record, PlanRecord) and record.closed_loop is not None else None
@@ -446,7 +445,7 @@ def _odd_bundle(folder: Path, record: SealedRecord) -> Iterator[str]:
 
 
 def _odd_schema(record: SealedRecord) -> Iterator[str]:
-    """A schema that is not the record's; that of an earlier version is not here to compare with."""
+    """Yield a problem if the schema file is not the record's schema; those of earlier versions are not available."""
     described = record.files.get(record.SCHEMA_FILE)
     published = sha256(record.published_schema()).hexdigest()
     here = record.schema_version == SCHEMA_VERSION and record.subject != "trial"
@@ -461,7 +460,7 @@ def _told_of_a_solve(
     compared: Sequence[FileDifferences],
     unchecked: list[str],
 ) -> Verification:
-    """The verdict on what differs, by what it rests on."""
+    """Derive the verdict from the differences and from what they depend on."""
     undecided = [*again.undecided, *(f"the search was not run again: {why}" for why in again.unrepeated)]
     if again.missing:
         unchecked.append(f"what rests on the search: {', '.join(again.missing)}")
@@ -492,7 +491,7 @@ def _told_of_a_solve(
 
 
 def _is_searched(d: Difference) -> bool:
-    """Whether a difference is in what the search tells of itself, or in a page, which shows that too."""
+    """Return whether a difference is in the claims about the search, or in a page, which shows them too."""
     if d.file.endswith(SealedRecord.FILE):
         return is_below(d.key, (*SEARCHED, *SEARCHED_IN_PHASES))
     if d.key.startswith(DRAWN):
@@ -501,7 +500,7 @@ def _is_searched(d: Difference) -> bool:
 
 
 def _judged(verification: Verification, problems: Sequence[str], undecided: Sequence[str]) -> Verification:
-    """With problems, which are none but a reason for doubt where other versions made the record."""
+    """Add the problems; if other versions made the record, they are only reasons for an undecided verdict."""
     if verification.notes and problems:
         why = f"{'; '.join(verification.notes)}: that may be why {len(problems)} things differ"
         return replace(verification, undecided=(*undecided, why, *problems))
@@ -509,7 +508,7 @@ def _judged(verification: Verification, problems: Sequence[str], undecided: Sequ
 
 
 def _odd_contract(record: PlanRecord, again: dict[str, Any]) -> Iterator[str]:
-    """Where the rebuilt model is another than the recorded contract; its file's name, and notes, do not matter."""
+    """Yield differences between the rebuilt model's contract and the recorded one, except for file names and notes."""
     apart = ("source", "notes")
     old, new = ({key: value for key, value in c.items() if key not in apart} for c in (record.contract, again))
     compared = FileDifferences(record.FILE)
@@ -524,8 +523,8 @@ def _other_versions(record: SealedRecord) -> tuple[str, ...]:
         engines = record.solver.options.get("cross_check")
         used += map(str, engines) if isinstance(engines, list) else ()
     if isinstance(record, FitRecord) or has_recordings(record):
-        used.append("numba")  # by which the motions are computed, where it is there
-    used = [n for n in used if n in was] if record.subject == "trial" else used  # it has those of its panel
+        used.append("numba")  # the motions are computed with numba if it is installed
+    used = [n for n in used if n in was] if record.subject == "trial" else used  # a trial has the packages of its panel
     names = [n for n in used if was.get(n) != now.get(n)]
     content = [f"recorded with {name} {was.get(name)}, run again with {now.get(name)}" for name in names]
     if not record.schema_version.startswith(SAME_VALUES):

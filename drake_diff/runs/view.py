@@ -1,4 +1,4 @@
-"""Runs for a reader: a list of them, one served by Meshcat, what differs between two, and both plans on one page."""
+"""List runs, serve a run in Meshcat, compare two runs, and write a page with both plans."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -26,23 +26,23 @@ from drake_diff.runs.save import REPLAY
 from drake_diff.runs.trace import read_trace
 from drake_diff.runs.verify import recalled
 
-PLAN, WITHOUT = "plan", "without_feedback"  # the names of ghosts
+PLAN, WITHOUT = "plan", "without_feedback"  # names of ghosts
 OPEN_LOOP = "open loop"
 LOOPBACK = "127.0.0.1"
 UNDER_FEEDBACK = "what moves is the plan, near which feedback keeps the robot; blue: the robot without feedback"
 CONFIGURATION = ("problem", "contract", "model", "inputs", "solver")
-# What nobody chose, of the configuration: where a file was, what the solver said.
+# Entries of the configuration that are results of the solve.
 RESULTS = ("status", "message", "solver_message", "notes", "plant", "feedback", "iterations")
 NO_CHOICE = tuple(f"solver.{name}" for name in RESULTS)
 
 
 @dataclass(frozen=True)
 class RunLine:
-    """One directory: what its record says, unverified; `verdict` is "unreadable" where it says nothing.
+    """One directory according to its unverified record; `verdict` is "unreadable" if the record cannot be read.
 
-    It is "incomplete" of what was not moved to its place, whatever it says. `kind` is what the record is of, as "plan",
-    "comparison" or "trial"; only a solve has a status, and only a solve and a trial of a panel a cost. A trial is
-    called by its cell.
+    `verdict` is "incomplete" for a run that was not moved to its place. `kind` is the subject of the record, such as
+    "plan", "comparison" or "trial". Only a solve has a status, and only a solve and a trial of a panel have a cost. The
+    name of a trial is that of its cell.
 
     Example:
         >>> from drake_diff.runs import list_runs
@@ -63,7 +63,7 @@ class RunLine:
 
 @dataclass(frozen=True)
 class ChangedEntry:
-    """One entry that differs between two records; None stands for an entry that is not there."""
+    """One entry that differs between two records; None stands for a missing entry."""
 
     key: str
     a: Any
@@ -72,13 +72,13 @@ class ChangedEntry:
 
 @dataclass(frozen=True)
 class RunComparison:
-    """What differs between two solves.
+    """The differences between two solves.
 
     Attributes:
-        configuration: Entries of what was asked that differ.
-        versions: Packages and commits that differ.
-        metrics: Metrics and invariants whose value or verdict differs.
-        refused: Metrics that cannot be compared, as they are defined in other words, units or tolerances.
+        configuration: Differing entries of the configuration.
+        versions: Differing packages and commits.
+        metrics: Metrics and invariants with a different value or verdict.
+        refused: Metrics that cannot be compared because their definitions, units or directions differ.
 
     Example:
         >>> from drake_diff.runs import compare_runs
@@ -103,13 +103,13 @@ class RunComparison:
 
 
 def list_runs(directory: str | Path) -> list[RunLine]:
-    """List the directories in `directory` that have a record, by name, without verifying them.
+    """List the directories in `directory` that have a record, sorted by name, without verifying them.
 
     Args:
-        directory: Where the directories are. Of a panel's own directory its trials are listed.
+        directory: The parent directory of the runs. For the directory of a panel, its trials are listed.
 
     Returns:
-        A `RunLine` for each.
+        A `RunLine` for each directory or trial.
 
     Raises:
         ArtifactError: There is no such directory.
@@ -148,7 +148,7 @@ def _line(path: Path) -> RunLine:
 
 
 def compare_runs(a: str | Path, b: str | Path) -> RunComparison:
-    """Compare what the records of two solves say: configuration, versions, metrics.
+    """Compare the records of two solves: configuration, versions, metrics.
 
     Args:
         a: The directory of the first run.
@@ -158,7 +158,7 @@ def compare_runs(a: str | Path, b: str | Path) -> RunComparison:
         A `RunComparison`.
 
     Raises:
-        ArtifactError: One of them has no record that can be read.
+        ArtifactError: One of them has no readable record.
 
     Example:
         >>> from drake_diff.runs import compare_runs
@@ -182,7 +182,7 @@ def compare_runs(a: str | Path, b: str | Path) -> RunComparison:
             continue
         if (item.value, item.verdict) != (other.value, other.verdict):
             result.append(ChangedEntry(f"{name} [{item.unit}]", item.value, other.value))
-        if item.tolerance != other.tolerance:  # some follow from the motion
+        if item.tolerance != other.tolerance:  # some tolerances depend on the motion
             result.append(ChangedEntry(f"tolerance of {name} [{item.unit}]", item.tolerance, other.tolerance))
     return RunComparison(
         configuration=_differences(first, second, CONFIGURATION, NO_CHOICE),
@@ -205,9 +205,9 @@ def _differences(
 
 
 def serve(directory: str | Path, *, models: str | Path | None = None) -> tuple[Meshcat, tuple[str, ...]]:
-    """A Meshcat that shows a run, for browsers on this machine alone, as long as it is referenced; and remarks on it.
+    """Show a run in a Meshcat server for browsers on this machine; return the server, which must be kept, and remarks.
 
-    ArtifactError where the run is damaged, has no motion, or its model cannot be rebuilt. `models` is as in `verify`.
+    Raises ArtifactError if the run is damaged, has no motion, or its model cannot be rebuilt. `models`: see `verify`.
     """
     scene = scene_of_run(directory, models=models)
     meshcat = Meshcat(MeshcatParams(host=LOOPBACK, show_stats_plot=False))
@@ -216,9 +216,9 @@ def serve(directory: str | Path, *, models: str | Path | None = None) -> tuple[M
 
 
 def scene_of_run(directory: str | Path, *, models: str | Path | None = None) -> Scene:
-    """The scene in a run directory; the model's source file need not exist any more, unless it names other files.
+    """Return the scene of a run directory; the model's source file is only needed if it names other files.
 
-    A child process reads the run first: ArtifactError where it does not survive that.
+    A child process reads the run first. Raises ArtifactError if that process fails.
     """
     folder = Path(directory)
     if not load_plan_record(folder).contract:
@@ -236,7 +236,7 @@ def scene_of_run(directory: str | Path, *, models: str | Path | None = None) -> 
         raise ArtifactError(f"{folder}: {error}. {REPLAY} in it shows the motion without the model") from error
 
 
-SECOND = Rgba(0.85, 0.4, 0.05, 0.45)  # near the colour of its lines
+SECOND = Rgba(0.85, 0.4, 0.05, 0.45)  # similar to the colour of its lines
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,10 +250,10 @@ class _Curve:
 
 
 def write_runs_page(path: Path, a: str | Path, b: str | Path, *, models: str | Path | None = None) -> None:
-    """Write the page that compares the plans of the runs in the directories `a` and `b`; `models` as in `verify`.
+    """Write a page that compares the plans of the runs in the directories `a` and `b`; for `models` see `verify`.
 
     Raises:
-        ArtifactError: One of them has no record or no trace that can be read.
+        ArtifactError: One of them has no readable record or trace.
     """
     result, folders = compare_runs(a, b), (Path(a), Path(b))
     records = [load_plan_record(folder) for folder in folders]
@@ -275,7 +275,7 @@ def write_runs_page(path: Path, a: str | Path, b: str | Path, *, models: str | P
 
 
 def _curves(record: PlanRecord, folder: Path) -> tuple[dict[str, _Curve], dict[str, _Curve]]:
-    """The states and the inputs of a run's plan, by name."""
+    """Return the states and the inputs of a run's plan, by name."""
     log, p = read_mcap(folder / TRACE, links=False), dict[str, Any](record.problem)
     if not log.messages.get("/planned/state"):
         raise ArtifactError(f"{folder / TRACE} has no plan")
@@ -294,7 +294,7 @@ def _curves(record: PlanRecord, folder: Path) -> tuple[dict[str, _Curve], dict[s
 
 
 def _plots(group: str, names: Sequence[str], both: Sequence[dict[str, _Curve]], held: bool = False) -> Iterator[Plot]:
-    """A plot for each column of either run; their limits where they are the same."""
+    """Yield a plot for each column of either run, with limits if they agree."""
     for title in dict.fromkeys([*both[0], *both[1]]):
         curves = [item.get(title) for item in both]
         known = [c for c in curves if c is not None]
@@ -311,7 +311,7 @@ def _plots(group: str, names: Sequence[str], both: Sequence[dict[str, _Curve]], 
 
 
 def _curve_values(times: Array, curve: _Curve, held: bool) -> Array:
-    """A curve at other times: along straight lines between its knots, or held from each; NaN after its end."""
+    """Interpolate a curve at other times, linearly or as a step function (`held`); NaN after its end."""
     if held:
         result = curve.values[np.searchsorted(curve.times, times, side="right") - 1]
     else:
@@ -320,7 +320,7 @@ def _curve_values(times: Array, curve: _Curve, held: bool) -> Array:
 
 
 def _sentence(names: Sequence[str], states: Sequence[dict[str, _Curve]]) -> str:
-    """Where the plans are furthest apart, of the states that both have and as a part of what the first one moves."""
+    """State where the plans are furthest apart, in their common states and relative to the states' largest value."""
     shared = [name for name in states[0] if name in states[1]]
     worst, sentence = -1.0, "the two plans have no state in common"
     for name in shared:
@@ -338,7 +338,7 @@ def _sentence(names: Sequence[str], states: Sequence[dict[str, _Curve]]) -> str:
 
 
 def _replay(folders: Sequence[Path], names: Sequence[str], models: str | Path | None) -> tuple[str, str]:
-    """The page with both plans, and what is seen in it; "" and why where one has none."""
+    """Return the page with both plans and its caption, or "" and the reason if one plan cannot be drawn."""
     try:
         scenes = [scene_of_run(folder, models=models) for folder in folders]
     except ArtifactError as error:
@@ -355,7 +355,7 @@ def _replay(folders: Sequence[Path], names: Sequence[str], models: str | Path | 
 
 
 def _together(first: Scene, second: Scene) -> Scene:
-    """Both plans at the same times; the one that ends first waits. No contact forces: those are of the motions."""
+    """Merge both plans on common times; the shorter one stays at its end. Contact forces are of motions, so omitted."""
     end = max(float(first.times[-1]), float(second.times[-1]))
     step = min(float(np.min(np.diff(scene.times))) for scene in (first, second))
     times = np.linspace(0.0, end, max(2, round(end / step) + 1))
@@ -369,7 +369,7 @@ def _together(first: Scene, second: Scene) -> Scene:
 
 
 def _resampled(scene: Scene, times: Array) -> Poses:
-    """The poses of a run's plan, which is a ghost where the motion is another, at the nearest of its times."""
+    """Return the poses of a run's plan at the nearest of its times; the plan is a ghost if the motion differs."""
     poses = next((ghost.poses for ghost in scene.ghosts if ghost.name == PLAN), scene.poses)
     middles = (scene.times[:-1] + scene.times[1:]) / 2
     nearest = np.searchsorted(middles, times)
