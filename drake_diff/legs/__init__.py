@@ -1,1 +1,1 @@
-"""Robots on legs: their feet, postures by inverse kinematics, forces that carry them, and motions."""
+"""Legged robots: their feet, postures by inverse kinematics, contact forces, and motions."""

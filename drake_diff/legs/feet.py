@@ -1,4 +1,4 @@
-"""The feet of a robot whose base floats: which limbs can carry it, and the points that it stands on."""
+"""Feet of a robot with a floating base: the limbs that can carry it, and the points that it stands on."""
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,27 +19,27 @@ from drake_diff.model.plant import FLOATING, bodies, joints, proximity_property
 from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
 
-FEWEST = 2  # feet: what stands on one is held by no posture of ours
-LEVEL = 0.15  # of the height of the centre of mass: limbs whose ends are within that of the lowest are legs
-SOLE = 5e-3  # [m] points of a foot that are within that of its lowest one are its sole
-TRAVEL = 0.1  # of that height: how far an end has to move up and down for its limb to be a leg
-DRAWN = 60  # postures in which that is looked at
-GRAVITY = 9.81  # [m/s^2] of the weight, a scale
-Shapes = dict[int, list[Any]]  # geometries by the index of their body
+FEWEST = 2  # feet; none of our postures balances a robot on one foot
+LEVEL = 0.15  # of the centre of mass's height: ends of legs are at most this far above the lowest end of a limb
+SOLE = 5e-3  # [m] the sole has the points of a foot that are at most this far above its lowest point
+TRAVEL = 0.1  # of the centre of mass's height: least vertical travel of the end of a leg
+DRAWN = 60  # random postures for the travel
+GRAVITY = 9.81  # [m/s^2] for the weight, which is used as a scale
+Shapes = dict[int, list[Any]]  # geometries, keyed by the index of their body
 
 
 @dataclass(frozen=True, eq=False)
 class Foot:
-    """What a leg ends in: spheres and corners of boxes, which are fixed to a body, and those that it stands on.
+    """The end of a leg: spheres and corners of boxes that are fixed to a body, and those that the robot stands on.
 
     Attributes:
-        bodies: The names of the bodies that are fixed to each other there.
-        frame: The frame of one of them, of the twin's plant.
-        centres: (k, 3) [m] of the spheres in that frame.
-        radii: (k,) [m], 0 of a corner.
-        friction: The coefficient, the least of all shapes.
-        joints: Where the joints between the base and it are in v.
-        sole: Which of the spheres it stands on; one or two of them cannot carry a torque about the foot.
+        bodies: The names of the foot's bodies, which are welded to each other.
+        frame: The frame of one of these bodies in the double plant.
+        centres: (k, 3) [m] the centres of the spheres in that frame.
+        radii: (k,) [m] the radii, 0 for a corner.
+        friction: The smallest friction coefficient of all shapes.
+        joints: The indices in v of the joints between the base and the foot.
+        sole: The indices of the spheres that the robot stands on. One or two cannot carry a torque about the foot.
     """
 
     bodies: tuple[str, ...]
@@ -52,26 +52,26 @@ class Foot:
 
     @property
     def name(self) -> str:
-        """That of the body whose frame it is."""
+        """The name of the body that `frame` belongs to."""
         return str(self.frame.body().name())
 
     @property
     def is_flat(self) -> bool:
-        """Whether the sole is a face, which turns the foot as it lies on the ground."""
+        """Whether the sole is a face, which aligns the foot with the ground."""
         middle = self.centres[self.sole] - np.mean(self.centres[self.sole], axis=0)
         return len(middle) > 2 and bool(np.linalg.svd(middle, compute_uv=False)[1] > SOLE)
 
 
 class Legs:
-    """A model on a floating base, the feet that it stands on, and where its joints may be, `lower` and `upper` (nq,).
+    """A model on a floating base, its feet, and the joint limits `lower` and `upper` (nq,).
 
-    The soles are those of `feet`: `owners` (n,) are the feet that their points belong to.
+    The sole points of all `feet` are numbered together. `owners` (n,) are the feet that they belong to.
     """
 
     def __init__(self, model: Model, feet: Sequence[Foot], lower: Array, upper: Array):
         self.model, self.twin, self.space = model, model.double, tangent_space(model)
         self.feet, self.lower, self.upper = tuple(feet), lower.copy(), upper.copy()
-        self.base_q = self.base_v = self.space.quaternions[0]  # a quaternion, then a position; a turn, then a velocity
+        self.base_q = self.base_v = self.space.quaternions[0]  # q: quaternion, position; v: angular velocity, velocity
         base, count = slice(self.base_q, self.base_q + 7), np.arange(model.nq)
         self.lower[base], self.upper[base] = -np.inf, np.inf
         self.joint_q: Indices = count[(count < self.base_q) | (count >= self.base_q + 7)]
@@ -84,10 +84,9 @@ class Legs:
 
     @classmethod
     def named(cls, model: Model, names: Sequence[str], q: Array) -> "Legs":
-        """Those whose feet are the bodies of these names, on soles that are lowest in posture q (nq,).
+        """Return legs whose feet are the bodies of these names. Their soles are the lowest points in posture q (nq,).
 
-        Raises InputError where the base does not float, or a foot has no shape; UnknownNameError where none is called
-        so.
+        Raises InputError if the base does not float or a foot has no shape, UnknownNameError for an unknown body.
         """
         quaternions = tangent_space(model).quaternions
         if len(quaternions) != 1 or model.coupling is not None:
@@ -109,7 +108,7 @@ class Legs:
         return cls(model, feet, *model.position_limits)
 
     def on_lowest(self, q: Array) -> "Legs":
-        """The same, where a foot that is no face stands on its point that is lowest in posture q (nq,)."""
+        """Return legs on which a foot without a face stands on its lowest point in posture q (nq,)."""
         self.put(q)
         lowest = [np.argmin(_bottoms(self.model, foot)[:, 2]) for foot in self.feet]
         feet = [f if f.is_flat else replace(f, sole=np.array([i])) for f, i in zip(self.feet, lowest, strict=True)]
@@ -117,7 +116,7 @@ class Legs:
 
     @cached_property
     def frictions(self) -> Array:
-        """(feet,) the coefficients with the ground, the least of it, by Drake's rule for two of them."""
+        """(feet,) the friction coefficients with the ground's smallest one, combined by Drake's rule."""
         plant, inspector = self.model.plant, self.twin.inspector
         shapes, fixed = _shapes(self.model), plant.GetBodiesWeldedTo(plant.world_body())
         ground = [geometry for body in fixed for geometry in shapes.get(int(body.index()), ())]
@@ -128,26 +127,26 @@ class Legs:
         return np.asarray(2 * coefficients * least / np.maximum(coefficients + least, 1e-12))
 
     def put(self, q: Array, v: Array | None = None) -> None:
-        """Put posture q (nq,), at rest or moving with v (nv,), into the twin."""
+        """Set the double plant to posture q (nq,), at rest or with velocity v (nv,)."""
         set_state(self.twin, np.concatenate([q, np.zeros(self.model.nv) if v is None else v]))
 
     def moved(self, q: Array, d: Array) -> Array:
-        """Posture q (nq,) moved by d (nv,)."""
+        """Return posture q (nq,) moved by d (nv,)."""
         still = np.zeros(self.model.nv)
         return self.space.plus(np.concatenate([q, still]), np.concatenate([d, still]))[: self.model.nq]
 
     def apart(self, q: Array, origin: Array) -> Array:
-        """(nv,) the way from `origin` to q, both (nq,)."""
+        """Return (nv,) the displacement from `origin` to q, both (nq,)."""
         still = np.zeros(self.model.nv)
         return self.space.minus(np.concatenate([q, still]), np.concatenate([origin, still]))[: self.model.nv]
 
     def read(self, x: Array) -> tuple[Array, Array]:
-        """What `soles` needs of a state x (nx,)."""
+        """Read the poses and Jacobians that `soles` needs in a state x (nx,)."""
         self.put(x[: self.model.nq], x[self.model.nq :])
         return self._read()
 
     def soles(self, read: Sequence[tuple[Array, Array]]) -> "Soles":
-        """The soles in K states, of each what `read` told."""
+        """Compute the soles in K states, from the results of `read` in these states."""
         poses, moving = (np.array(values)[:, self.owners] for values in zip(*read, strict=True))
         jacobian = moving.swapaxes(2, 3)
         arms = (poses[..., :3] @ self.centres[..., None])[..., 0]
@@ -157,28 +156,28 @@ class Legs:
         return Soles(self.base_v, down, poses[..., 3] + arms + down, turns, centres)
 
     def points(self) -> Array:
-        """(n, 3) [m] the lowest points of the soles in the twin's state."""
+        """Return (n, 3) [m] the lowest points of the soles in the double plant's state."""
         return self._now().places[0]
 
     def points_in(self, q: Array) -> Array:
-        """(n, 3) [m] the same in posture q (nq,)."""
+        """Return (n, 3) [m] the lowest points of the soles in posture q (nq,)."""
         self.put(q)
         return self.points()
 
     def heights(self) -> Array:
-        """(feet,) [m] of the lowest point of each foot in the twin's state."""
+        """Return (feet,) [m] the height of each foot's lowest point in the double plant's state."""
         heights = self.points()[:, 2]
         return np.array([np.min(heights[self.owners == i]) for i in range(len(self.feet))])
 
     def jacobian(self) -> Array:
-        """(n, 3, nv) how the material at the lowest points moves in the twin's state."""
+        """Return (n, 3, nv) the Jacobian of the material points that are lowest in the double plant's state."""
         return self._now().moves[0].swapaxes(1, 2)
 
     def _now(self) -> "Soles":
         return self.soles([self._read()])
 
     def _read(self) -> tuple[Array, Array]:
-        """(feet, 3, 4) the poses of their frames in the twin's state, and (feet, 6, nv) how these turn and move."""
+        """Return (feet, 3, 4) the poses of the feet's frames, and (feet, 6, nv) their spatial Jacobians."""
         plant, context, world = self.twin.plant, self.twin.context, self.twin.plant.world_frame()
         kind, origin, frames = JacobianWrtVariable.kV, np.zeros(3), [foot.frame for foot in self.feet]
         poses = [frame.CalcPoseInWorld(context).GetAsMatrix34() for frame in frames]
@@ -186,11 +185,11 @@ class Legs:
         return np.array(poses), _of_model(self.model, np.array(moving))
 
     def center_of_mass(self) -> Array:
-        """(3,) [m] in the twin's state."""
+        """Return (3,) [m] the centre of mass in the double plant's state."""
         return np.asarray(self.twin.plant.CalcCenterOfMassPositionInWorld(self.twin.context))
 
     def center_of_mass_velocity(self, v: Array) -> Array:
-        """(3,) [m/s] in the twin's posture, under v (nv,)."""
+        """Return (3,) [m/s] the velocity of the centre of mass in the double plant's posture under v (nv,)."""
         plant, context, world = self.twin.plant, self.twin.context, self.twin.plant.world_frame()
         kind = JacobianWrtVariable.kV
         jacobian = plant.CalcJacobianCenterOfMassTranslationalVelocity(context, kind, world, world)
@@ -199,10 +198,10 @@ class Legs:
     def at(
         self, positions: Array, tolerance: Any, rolls: Collection[int] = (), unit: Any = np.inf
     ) -> list[PointTarget]:
-        """That the lowest points of the soles are at `positions` (n, 3) [m], of a face three of them.
+        """Return targets for the lowest points of the soles at `positions` (n, 3) [m]; three points for a face.
 
-        Those of `rolls` stay where they touch in the twin's posture, whatever their position says sideways. Of a foot
-        that is no face the material at the lowest point stays, and the centre of its sphere moves as a wheel's does.
+        The points of `rolls` stay where they touch in the double plant's posture, for any horizontal position. For a
+        foot without a face, the lowest material point stays, and the centre of its sphere moves as that of a wheel.
         """
         targets = list[PointTarget]()
         for i, owner in enumerate(self.owners):
@@ -222,7 +221,7 @@ class Legs:
 
     @cached_property
     def _spare(self) -> frozenset[int]:
-        """The points of faces that three others of the face tell."""
+        """The points of faces that three other points of the face determine."""
         spare = set[int]()
         for i, foot in enumerate(self.feet):
             of_foot = np.flatnonzero(self.owners == i)
@@ -237,35 +236,35 @@ class Legs:
 
 @dataclass(frozen=True, eq=False)
 class Soles:
-    """The n lowest points of feet in K states: where they are, and how each degree of freedom turns and moves them."""
+    """The n lowest points of feet in K states, and the rotations and motions of these by each degree of freedom."""
 
-    base: int  # where the base's turn, then its place, are among the velocities
-    down: Array  # (n, 3) [m] from the centre of a sphere to its lowest point, 0 of a corner
+    base: int  # index in v of the base's angular velocity, which is followed by its velocity
+    down: Array  # (n, 3) [m] from the centre of a sphere to its lowest point, 0 for a corner
     places: Array  # (K, n, 3) [m]
-    turns: Array  # (K, n, nv, 3) of the body
-    centres: Array  # (K, n, nv, 3) of the sphere's centre
+    turns: Array  # (K, n, nv, 3) rotation of the body by each degree of freedom
+    centres: Array  # (K, n, nv, 3) motion of the sphere's centre by each degree of freedom
 
     @property
     def moves(self) -> Array:
-        """(K, n, nv, 3) of the material at the lowest point."""
+        """(K, n, nv, 3) the motion of the lowest material point by each degree of freedom."""
         return self.centres + cross(self.turns, self.down[:, None])
 
     def velocities(self, v: Array) -> Array:
-        """(K, n, 3) [m/s] of the material at the lowest points under v (K, nv)."""
+        """Return (K, n, 3) [m/s] the velocities of the lowest material points under v (K, nv)."""
         return np.asarray((v[:, None, None] @ self.moves)[:, :, 0])
 
     def slopes(self, v: Array) -> Array:
-        """(K, n, nv, 3) how `velocities` change with the posture, where all joints move by themselves.
+        """Return (K, n, nv, 3) the derivatives of `velocities` with respect to the posture, for independent joints.
 
-        How a column of a Jacobian turns: that of a joint with all joints before it, and none of them with a later one.
+        A joint's column of a Jacobian rotates with all joints before it. It does not rotate with a later joint.
         """
         b, nv = self.base, v.shape[1]
         joints, base = np.r_[:b, b + 6 : nv], slice(b, b + 3)
         rates = v[:, None, joints, None]
         turn, move, base_turn = self.turns[:, :, joints], self.centres[:, :, joints], self.turns[:, :, base]
-        turning, moving = rates * turn, rates * move  # each joint's part
+        turning, moving = rates * turn, rates * move  # the contribution of each joint
         later, after = _from_here_on(turning), _from_here_on(moving)
-        spin = (v[:, None, None, base] @ base_turn)[:, :, 0]  # (K, n, 3) of the base
+        spin = (v[:, None, None, base] @ base_turn)[:, :, 0]  # (K, n, 3) angular velocity of the base
         before = spin[:, :, None] + turning.cumsum(axis=2) - turning
         turned, slopes = np.zeros(self.turns.shape), np.zeros(self.turns.shape)
         turned[:, :, joints] = cross(turn, later - turning)
@@ -276,12 +275,12 @@ class Soles:
 
 
 def _from_here_on(parts: Array) -> Array:
-    """(K, n, joints, 3) the sum of a joint's part and those of all later ones."""
+    """Return (K, n, joints, 3) the sum of the parts of a joint and all later joints."""
     return parts[:, :, ::-1].cumsum(axis=2)[:, :, ::-1]
 
 
 def find_feet(model: Model, q: Array) -> tuple[Foot, ...] | Refusal:
-    """The feet of a robot whose base floats, as it stands upright in the file's posture q (nq,); or why it has none."""
+    """Return the feet of a floating-base robot that stands upright in the file's posture q (nq,), or a Refusal."""
     if len(model.plant.GetFloatingBaseBodies()) != 1:
         return Refusal(f"{len(model.plant.GetFloatingBaseBodies())} bodies float")
     set_state(model.double, np.concatenate([q, np.zeros(model.nv)]))
@@ -311,7 +310,7 @@ def find_feet(model: Model, q: Array) -> tuple[Foot, ...] | Refusal:
 
 
 def _limbs(model: Model, shapes: Shapes) -> list[Foot]:
-    """The last bodies with shapes of the chains of joints, from the base out."""
+    """Return the outermost bodies with shapes of all chains of joints from the base."""
     plant = model.double.plant
     group = {int(b.index()): frozenset(int(w.index()) for w in plant.GetBodiesWeldedTo(b)) for b in bodies(plant)}
     moving = [joint for joint in joints(plant) if joint.num_velocities() and joint.type_name() not in FLOATING]
@@ -336,9 +335,9 @@ def _limbs(model: Model, shapes: Shapes) -> list[Foot]:
 
 
 def _foot(model: Model, shapes: Shapes, body: Any, rigid: Iterable[int]) -> Foot | None:
-    """The spheres and corners on the bodies `rigid`, in the frame of `body`; its sole is what is lowest now.
+    """Return the spheres and corners of the bodies `rigid` in the frame of `body`, with the lowest ones as the sole.
 
-    None where there are none.
+    The result is None if the bodies have no sphere and no box.
     """
     plant, context, inspector = model.double.plant, model.double.context, model.double.inspector
     centres, radii, frictions, names = list[Array](), list[float](), list[float](), list[str]()
@@ -358,7 +357,7 @@ def _foot(model: Model, shapes: Shapes, body: Any, rigid: Iterable[int]) -> Foot
 
 
 def _points(model: Model, shapes: Shapes, body: int) -> Iterable[tuple[Any, list[Array], float]]:
-    """Of each sphere and box on a body its geometry, its centre or its corners in the body's frame, and its radius."""
+    """Yield the geometry, centre or corners in the body's frame, and radius of each sphere and box of a body."""
     inspector = model.double.inspector
     for geometry in shapes.get(body, ()):
         shape, pose = inspector.GetShape(geometry), inspector.GetPoseInFrame(geometry)
@@ -370,7 +369,7 @@ def _points(model: Model, shapes: Shapes, body: int) -> Iterable[tuple[Any, list
 
 
 def _shapes(model: Model) -> Shapes:
-    """The geometries that can touch."""
+    """Return the geometries that can touch."""
     shapes: Shapes = {}
     if model.double.inspector is not None:
         for body, geometry in collision_geometries(model.double.plant, model.double.scene_graph):
@@ -379,7 +378,7 @@ def _shapes(model: Model) -> Shapes:
 
 
 def _bottoms(model: Model, foot: Foot) -> Array:
-    """(k, 3) [m] the lowest points of all spheres of a foot in the twin's state."""
+    """Return (k, 3) [m] the lowest points of all spheres of a foot in the double plant's state."""
     points = foot.frame.CalcPoseInWorld(model.double.context).multiply(foot.centres.T).T
     return np.asarray(points - np.outer(foot.radii, [0.0, 0.0, 1.0]))
 
@@ -389,7 +388,7 @@ def _lowest(model: Model, foot: Foot) -> float:
 
 
 def _travel(model: Model, q: Array, limb: Foot) -> float:
-    """[m] how far the end of a limb moves up and down where its joints move alone, in postures at random."""
+    """Return [m] the vertical travel of a limb's end in random postures of the limb's own joints."""
     random, space = np.random.default_rng(0), tangent_space(model)
     x, heights = np.concatenate([q, np.zeros(model.nv)]), []
     for _ in range(DRAWN):
@@ -401,5 +400,5 @@ def _travel(model: Model, q: Array, limb: Foot) -> float:
 
 
 def _of_model(model: Model, jacobian: Array) -> Array:
-    """A Jacobian by the velocities of the model, of which the plant may have more."""
+    """Convert a Jacobian from the plant's velocities to the model's, which may be fewer."""
     return np.asarray(jacobian if model.double.coupling is None else jacobian @ model.double.coupling.spread)

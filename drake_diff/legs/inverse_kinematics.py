@@ -27,7 +27,7 @@ OPTIONS.SetOption(SnoptSolver.id(), "Major feasibility tolerance", 1e-9)
 
 @dataclass(frozen=True, eq=False)
 class PointTarget:
-    """The wanted position (3,) [m] in the world of a point (3,) [m] of a frame; a NaN leaves that coordinate free.
+    """The target position (3,) [m] in the world of a point (3,) [m] of a frame. NaN leaves a coordinate free.
 
     `tolerance` [m], a number or (3,), bounds the distance; infinity bounds nothing. The cost is (distance / `unit`)^2,
     with `unit` in [m]; infinity means no cost.
@@ -47,8 +47,8 @@ class Wish:
     Attributes:
         q: (nq,) the nominal posture.
         unit: (nv,) in the tangent space, the distance from q that costs 1; infinite for a free coordinate.
-        center_of_mass: (3,) [m] its wanted position, NaN for a free coordinate; None for no such cost.
-        balance: [m] the distance from there that costs 1.
+        center_of_mass: (3,) [m] its target position, NaN for a free coordinate; None for no such cost.
+        balance: [m] the distance from that position that costs 1.
     """
 
     q: Array
@@ -60,11 +60,11 @@ class Wish:
 def inverse_kinematics(
     model: Model, first: Array, targets: Sequence[PointTarget], wish: Wish, lower: Array, upper: Array
 ) -> Array:
-    """The posture (nq,) of least cost with the points at their targets, by SNOPT from the posture `first` (nq,).
+    """Return the posture (nq,) of least cost with the points at their targets, by SNOPT from the posture `first` (nq,).
 
-    It keeps joint limits, `lower` and `upper` (nq,), closed loops and mimic joints. If no such posture exists, the last
-    iterate is returned, and `miss` measures it. The double plant of the model is left in this posture. ModelError if
-    Drake cannot express a constraint of the plant.
+    It satisfies the joint limits `lower` and `upper` (nq,), closed loops and mimic joints. If no such posture exists,
+    the last iterate is returned, and `miss` measures its error. The double plant of the model is left in this posture.
+    Raises ModelError if Drake cannot express a constraint of the plant.
     """
     twin, program = model.double, MathematicalProgram()
     plant, context, world, coupling = twin.plant, twin.context, twin.plant.world_frame(), twin.coupling
@@ -94,8 +94,8 @@ def inverse_kinematics(
         program.AddQuadraticErrorCost(np.diag(weights), middle, variables)
         for variable, counts in zip(variables, weights, strict=True):
             if counts > 0:
-                program.SetVariableScaling(variable, counts**-0.5)  # so that the cost's second derivative is even
-    for start in (first, goal):  # numerical difficulties, a singular basis above all, are those of one start
+                program.SetVariableScaling(variable, counts**-0.5)  # scales the cost to a uniform second derivative
+    for start in (first, goal):  # numerical difficulties, such as a singular basis, usually belong to a single start
         plant.SetPositions(context, start if coupling is None else coupling.positions(start))
         guess = [*plant.GetPositions(context), *plant.CalcCenterOfMassPositionInWorld(context)]
         result = SnoptSolver().Solve(program, np.array(guess[: program.num_vars()]), OPTIONS)
@@ -107,7 +107,7 @@ def inverse_kinematics(
 
 
 def miss(model: Model, targets: Sequence[PointTarget]) -> float:
-    """The largest distance [m] of a point from its target beyond the tolerance, in the state of the double plant."""
+    """Return the largest distance [m] of a point from its target beyond the tolerance, in the double plant's state."""
     off = [0.0]
     for target in targets:
         there = target.frame.CalcPoseInWorld(model.double.context).multiply(target.point)
@@ -116,11 +116,11 @@ def miss(model: Model, targets: Sequence[PointTarget]) -> float:
 
 
 def _nearness(model: Model, first: Array, wish: Wish) -> tuple[Array, Array]:
-    """(nq,) twice: what each coordinate is to be near, a quaternion on the side of `first`, and how much it counts."""
+    """Return (nq,) the nominal coordinates, with quaternions on the side of `first`, and (nq,) their weights."""
     goal, starts = np.array(wish.q), tangent_space(model).quaternions
     weight = np.array([wish.unit[i - int(np.searchsorted(starts, i))] for i in range(model.nq)]) ** -2.0
     for number, start in enumerate(starts):
         turn = slice(start, start + 4)
         goal[turn] *= -1.0 if goal[turn] @ first[turn] < 0 else 1.0
-        weight[turn] = (2 / wish.unit[start - number]) ** 2  # a unit quaternion changes by half of its body's turn
+        weight[turn] = (2 / wish.unit[start - number]) ** 2  # a unit quaternion changes by half of its body's rotation
     return goal, weight

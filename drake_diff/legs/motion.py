@@ -1,14 +1,14 @@
-"""A motion in which the feet stand as scheduled: states and inputs that nearly obey the model's steps.
+"""Motions for a schedule of contacts: states and inputs that nearly obey the model's steps.
 
-The feet go smoothly from where they stand to where they stand next, over the ground by a clearance. The centre of mass
-goes where forces at the feet can bring it, so that it flies where no foot stands. Inverse kinematics puts the joints
-there, inverse dynamics makes the inputs. What the steps make of it is a little off, above all where a foot lands: it is
-a guess for a search, which starts with what is missing from state to state.
+The feet move smoothly from one stance to the next, with a clearance over the ground. The centre of mass moves as forces
+at the feet allow, so that it flies while no foot stands. Inverse kinematics computes the joints, and inverse dynamics
+the inputs. The model's steps deviate slightly, mostly where a foot lands. The motion is an initial guess for a search,
+which starts with the gaps from state to state.
 
-The way of the centre of mass and the forces are a quadratic program in its positions at the knots and the forces at the
-standing points in each step. Newton's law holds exactly; forces are in a pyramid of friction, alike, and change little
-from step to step; their moment about the centre of mass is small, so that the robot keeps its turn. That moment is
-bilinear, so it is taken about the way of the program before, and there are a few of them.
+The path of the centre of mass and the forces are the solution of a quadratic program. Its variables are positions at
+the knots and forces at the contact points in each step. Newton's law holds exactly. Forces lie in a friction pyramid,
+are even, and change little between steps. Their moment about the centre of mass is small to keep the robot's
+orientation. The moment is bilinear, so that a few programs are solved, each about the previous path.
 """
 
 from collections.abc import Collection, Sequence
@@ -25,42 +25,42 @@ from drake_diff.legs.feet import Legs
 from drake_diff.legs.inverse_kinematics import Wish, inverse_kinematics
 from drake_diff.model.model import Model
 
-LANDS = 1e-3  # [m] how much deeper than it stands a foot lands: one that misses the ground meets it a step later
-LEVELLED = 6  # steps in which the soles become alike in depth
-# A phase on some feet is slow where it lasts so many times as long as a fall, the square root of height over gravity;
-# how far the centre of mass goes then from its way to the middle of these feet, and a sole in a step to its depth.
+LANDS = 1e-3  # [m] additional depth of a landing foot; a foot that misses the ground touches it a step later
+LEVELLED = 6  # steps in which the soles reach a common depth
+# A phase on some feet is slow if it lasts FALLS times a fall, sqrt(height / gravity). The centre of mass then moves by
+# the fraction INWARD to the middle of these feet, and a sole moves by the fraction SINKS to its depth in each step.
 FALLS, INWARD, SINKS = 2.0, 0.75, 0.3
-RUNS_OUT = 0.4  # [s] in which a first spin of the base does
-RISE = 2.0  # the power of a swing's arc: a foot that leaves and lands slowly
-BY_INPUT, BY_FORCE, BY_BASE = 1e3, 1.0, 1e-3  # how willingly inputs, forces and the base's acceleration give way
+RUNS_OUT = 0.4  # [s] until an initial spin of the base has decayed
+RISE = 2.0  # exponent of a swing's arc, so that a foot lifts off and lands slowly
+BY_INPUT, BY_FORCE, BY_BASE = 1e3, 1.0, 1e-3  # scales of changes in inputs, forces and the base's acceleration
 
-# A posture: [m] how far a foot may be off; what counts as 1 of the centre of mass [m], of the base's turn [rad], of
-# joints; and [rad or m] how far inside its limits a joint stays.
+# Postures: foot tolerance [m]; deviations that cost 1 for the centre of mass [m], the base's rotation [rad] and joints;
+# and the distance of joints from their limits [rad or m].
 AT_PLACE, OVER, TURNED, POSED, INSIDE = 1e-5, 1e-3, 0.02, 0.5, 1e-3
 ROUNDS = 3
-ALIKE, CHANGE, MOMENT, NEAR = 1e-2, 1.0, 100.0, 0.1  # of forces in weights of the robot, lengths in its size
+ALIKE, CHANGE, MOMENT, NEAR = 1e-2, 1.0, 100.0, 0.1  # forces in weights of the robot, lengths in its size
 EASES = 0.2  # [s] in which a point is unloaded before a slow phase without it
-STEP = 0.02  # [s] of which these weights are; they are rates, so that they say the same in steps of another length
-SHARES = 0.5, 0.2, 0.02  # of an even share of the weight: what a standing point carries at least; the first that can be
+STEP = 0.02  # [s] time step for which the weights are given; they are rates, so that they suit steps of another length
+SHARES = 0.5, 0.2, 0.02  # least load of a contact point, as a fraction of an even share; the first feasible one is used
 Mask = NDArray[np.bool_]
 
 
 def scheduled_motion(
     model: Model, legs: Legs, x0: Array, end: Array, stands: Mask, clearance: float, friction: float
 ) -> tuple[Array, Array]:
-    """States xs (N+1, nx) and inputs us (N, nu) from x0 (nx,) to about posture `end` (nq,), at rest.
+    """Return states xs (N+1, nx) and inputs us (N, nu) from x0 (nx,) to approximately posture `end` (nq,) at rest.
 
     Args:
         model: The model.
         legs: Its feet.
         x0: The first state.
-        end: The last posture; its base and joints are what those on the way go to.
-        stands: (N, feet) whether a foot carries in a step.
-        clearance: [m] how high a foot is in the middle of its way, over where it stood.
-        friction: The largest sideways force, as a part of the upright one.
+        end: The last posture, to which the base and the joints move.
+        stands: (N, feet) whether a foot carries load in a step.
+        clearance: [m] the height of a foot in the middle of its swing, over its stance.
+        friction: The largest tangential force, as a fraction of the normal force.
 
     Raises:
-        InputError: No forces at the feet bring the robot there.
+        InputError: No forces at the feet move the robot to this posture.
     """
     h, first = model.time_step, x0[: model.nq]
     carries = stands[:, legs.owners]
@@ -101,9 +101,9 @@ def scheduled_motion(
 
 
 def posture(legs: Legs, first: Array, near: Array, mass: Array, places: Array, rolls: Collection[int] = ()) -> Array:
-    """(nq,) from posture `first` (nq,) to where the soles and the centre of mass are to be, near another one (nq,).
+    """Return the posture (nq,) for positions of soles and centre of mass, from posture `first` and near posture `near`.
 
-    `places` (n, 3) are those of the lowest points, `mass` (3,) that of the centre of mass; `rolls` as in `Legs.at`.
+    `places` (n, 3) are the positions of the lowest points, `mass` (3,) of the centre of mass; `rolls` as in `Legs.at`.
     """
     unit, base, margin = np.full(legs.model.nv, POSED), legs.base_v, np.zeros(legs.model.nq)
     unit[base : base + 3], unit[base + 3 : base + 6] = TURNED, np.inf
@@ -115,24 +115,24 @@ def posture(legs: Legs, first: Array, near: Array, mass: Array, places: Array, r
 
 
 def touching(stands: Mask) -> Mask:
-    """(N+1, n) at which knots what `stands` (N, n) in the steps is on the ground: before and after each of them."""
+    """Return (N+1, n) the contacts at knots, from those of the steps before and after, `stands` (N, n)."""
     return np.vstack([stands, stands[-1:]]) | np.vstack([stands[:1], stands])
 
 
 def smooth(s: Array) -> Array:
-    """From 0 to 1, at rest at both ends."""
+    """Return the smooth transition from 0 to 1 that is at rest at both ends."""
     return np.asarray(10 * s**3 - 15 * s**4 + 6 * s**5)
 
 
 def swings(on: Mask) -> list[tuple[int, int]]:
-    """The knots, on the ground or the ends of the motion, between which what is `on` (N+1,) the ground is off it."""
+    """Return the first and last knot of each swing, from contacts `on` (N+1,). The motion's ends can be such knots."""
     off = np.concatenate([[False], ~on, [False]])
     edges = np.flatnonzero(off[1:] != off[:-1]).reshape(-1, 2)
     return [(max(int(a) - 1, 0), min(int(b), len(on) - 1)) for a, b in edges]
 
 
 def _foot_ways(first: Array, last: Array, on: Mask, clearance: float) -> tuple[Array, Array]:
-    """(N+1, n, 3) [m] where the points are, each way an even part of that from first to last, and (N+1, n) its arc."""
+    """Return (N+1, n, 3) [m] the points, in equal swings from `first` to `last`, and (N+1, n) [m] their arcs."""
     places = np.repeat(first[None], len(on), axis=0)
     arcs = np.zeros(on.shape)
     for i in range(on.shape[1]):
@@ -148,7 +148,7 @@ def _foot_ways(first: Array, last: Array, on: Mask, clearance: float) -> tuple[A
 
 
 def _run_out(legs: Legs, v: Array, h: float, count: int) -> Array:
-    """(N+1, nv) how a first spin of the base, of v (nv,), goes on for a while and comes back."""
+    """Return (N+1, nv) the displacement by the base's initial spin in v (nv,), which returns to zero after a while."""
     spin = np.zeros(legs.model.nv)
     turn, times = slice(legs.base_v, legs.base_v + 3), h * np.arange(float(count))
     spin[turn] = v[turn]
@@ -156,9 +156,9 @@ def _run_out(legs: Legs, v: Array, h: float, count: int) -> Array:
 
 
 def _level(heights: Array, count: int) -> Array:
-    """(N+1, n) [m] of soles that first are at `heights` (n,), and soon all as deep as they are on average.
+    """Return (N+1, n) [m] the heights of soles, from `heights` (n,) at first to their average depth soon after.
 
-    Some of a robot that stands on four feet hardly touch, and would soon not touch at all.
+    Some feet of a robot on four feet hardly touch the ground, and would soon lose contact otherwise.
     """
     sink = -float(np.mean(np.maximum(-heights, 0.0)))
     s = smooth(np.clip(np.arange(count) / LEVELLED, 0.0, 1.0))[:, None]
@@ -166,7 +166,7 @@ def _level(heights: Array, count: int) -> Array:
 
 
 def _slow_phases(carries: Mask, h: float, height: float, pull: float) -> list[tuple[int, int]]:
-    """The knots from a to b, inside the motion, between which it stands on the same few points for long."""
+    """Return (first, last) of long phases inside the motion in which the robot stands on the same few points."""
     changes = np.flatnonzero(np.any(carries[1:] != carries[:-1], axis=1)) + 1
     long = FALLS * np.sqrt(max(height, 0.0) / pull) if pull else np.inf
     phases = [(int(a), int(b)) for a, b in pairwise(changes)]
@@ -174,9 +174,9 @@ def _slow_phases(carries: Mask, h: float, height: float, pull: float) -> list[tu
 
 
 def _sunk(depth: float, shares: Array, landing: Mask) -> Array:
-    """(N+1, n) [m] how much deeper than `depth`, that of an even share, soles are for shares (N, n) of the weight.
+    """Return (N+1, n) [m] the additional depth of soles, relative to `depth` of an even share, for shares (N, n).
 
-    One that carries nothing comes up to the ground; where it lands it is a little deeper.
+    A sole without load rises to the ground. A sole that lands is slightly deeper.
     """
     wanted = depth * (shares.shape[1] * shares - 1)
     sunk = np.zeros(landing.shape)
@@ -186,7 +186,7 @@ def _sunk(depth: float, shares: Array, landing: Mask) -> Array:
 
 
 def _lifts(heights: Array, on: Mask) -> Array:
-    """(N+1, 1) [m] by how much feet rise with the body while none stands; they leave and land more slowly than it."""
+    """Return (N+1, 1) [m] the rise of the feet with the body in flight. They lift off and land more slowly than it."""
     lift = np.zeros((len(on), 1))
     for a, b in swings(np.any(on, axis=1)):
         straight = np.interp(np.arange(a, b + 1), [a, b], heights[[a, b]])
@@ -197,7 +197,7 @@ def _lifts(heights: Array, on: Mask) -> Array:
 
 
 def _inputs(legs: Legs, x: Array, v_next: Array, forces: Array, carries: Array) -> Array:
-    """(nu,) what makes the velocity v_next (nv,) of the state x (nx,), with about the forces (n, 3) of the points."""
+    """Return (nu,) the inputs from state x (nx,) to velocity v_next (nv,), with about the forces (n, 3) of points."""
     model, twin, base = legs.model, legs.twin, legs.base_v
     legs.put(x[: model.nq], x[model.nq :])
     change = v_next - x[model.nq :]
@@ -222,18 +222,18 @@ def plan_forces(
     friction: float,
     slow: Sequence[tuple[int, int]] = (),
 ) -> tuple[Array, Array] | Refusal:
-    """Positions (N+1, 3) [m] of the centre of mass, and forces (N, n, 3) [N]; or why there are none.
+    """Return positions (N+1, 3) [m] of the centre of mass and forces (N, n, 3) [N], or a Refusal.
 
     Args:
         mass: [kg]
         gravity: (3,) [m/s^2]
         time_step: [s]
-        start: Place and velocity (3,) of the centre of mass at first.
-        way: (N+1, 3) [m] what it is to be near; it ends there, at rest.
-        places: (N+1, n, 3) [m] of the points.
-        stands: (N, n) whether a point carries in a step.
-        friction: The largest sideways force, as a part of the upright one.
-        slow: First steps of phases, and of those after them, into and out of which points are unloaded bit by bit.
+        start: The initial position and velocity (3,) of the centre of mass.
+        way: (N+1, 3) [m] the reference path of the centre of mass, at whose end it is at rest.
+        places: (N+1, n, 3) [m] the positions of the points.
+        stands: (N, n) whether a point carries load in a step.
+        friction: The largest tangential force, as a fraction of the normal force.
+        slow: First steps of slow phases and of the phases after them. Points are gradually unloaded and loaded there.
     """
     size = max(float(np.max(np.ptp(places[0], axis=0))) / 2, 1e-3)
     eased, unloaded = _eased(stands, slow, round(EASES / time_step))
@@ -260,11 +260,11 @@ class _Program:
         self.program = MathematicalProgram()
         self.at = self.program.NewContinuousVariables(len(stands) + 1, 3)
         self.carries = np.argwhere(stands)  # (m, 2): step and point
-        self.forces = self.program.NewContinuousVariables(max(len(self.carries), 1), 3)  # in weights
+        self.forces = self.program.NewContinuousVariables(max(len(self.carries), 1), 3)  # in units of the weight
         self.of_step = [np.flatnonzero(self.carries[:, 0] == k) for k in range(len(stands))]
 
     def follow(self, start: tuple[Array, Array], way: Array) -> None:
-        """Newton's law by the step's own rule, the given first state, and rest at the end of the way."""
+        """Add Newton's law by the model's step, the first state, rest at the end, and a cost of leaving `way`."""
         program, positions, h = self.program, self.at, self.h
         first, speed = start
         program.AddBoundingBoxConstraint(first, first, positions[0])
@@ -287,7 +287,7 @@ class _Program:
         program.Add2NormSquaredCost(near, near @ way.ravel(), positions.ravel())
 
     def share(self, friction: float, least: Array, unloaded: Mask) -> None:
-        """Forces within friction, upwards, alike among the points and from step to step; small where unloaded."""
+        """Add the friction pyramid, least normal forces, and costs of uneven, changing and unloaded forces."""
         program, steps = self.program, {(int(k), int(i)): j for j, (k, i) in enumerate(self.carries)}
         sides = np.array([[1, 0, -friction], [-1, 0, -friction], [0, 1, -friction], [0, -1, -friction]])
         up, alike = -self.gravity / self.pull, np.sqrt(ALIKE * self.part) * np.eye(3)
@@ -305,7 +305,7 @@ class _Program:
                 program.Add2NormSquaredCost(change, np.zeros(3), force)
 
     def keep_turn(self, places: Array, way: Array) -> None:
-        """No moment about the way (N+1, 3) of the centre of mass, as nearly as may be."""
+        """Add a cost of the moment about the path `way` (N+1, 3) of the centre of mass."""
         for k, carrying in enumerate(self.of_step):
             if len(carrying):
                 arms = (places[k, self.carries[carrying, 1]] - way[k]) / self.size
@@ -324,7 +324,7 @@ class _Program:
 
 
 def _eased(stands: Mask, slow: Sequence[tuple[int, int]], steps: int) -> tuple[Array, Mask]:
-    """(N, n) parts of the least share; and whether a step is a point's last before a slow phase, or its first after."""
+    """Return (N, n) factors on the least share, and a mask of last steps before and first steps after slow phases."""
     shares, last = np.ones(stands.shape), np.zeros(stands.shape, dtype=bool)
     for a, b in slow:
         leaves, lands = stands[a - 1] & ~stands[a], stands[b] & ~stands[b - 1]

@@ -1,8 +1,8 @@
-"""Robots on their feet: the forces that carry a posture, states at rest, and motions in which no foot moves.
+"""Standing robots: the forces that carry a posture, states at rest, and motions in which no foot moves.
 
-A posture comes from inverse kinematics, with the soles on the ground and the centre of mass over them. Forces at the
-soles and inputs that hold it are a small quadratic program. From there Gauss and Newton lead to a state that a step of
-the model does not change: an equilibrium of the steps and not of a formula.
+Inverse kinematics computes a posture with the soles on the ground and the centre of mass over them. A small quadratic
+program computes forces at the soles and inputs that hold it. From there, Gauss-Newton finds a state that a step of the
+model does not change. It is an equilibrium of the steps and not of a formula.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -26,39 +26,39 @@ from drake_diff.model.step import advance, set_state
 from drake_diff.motion.policy import TVLQR
 
 # Forces and inputs that hold a posture.
-FOOT_SHARE = 0.1  # of an even share of the weight: what each foot carries at least, so that none lifts off
-OF_FRICTION, OF_EFFORT = 0.7, 0.8  # of the friction that is possible, and of an effort limit: what a posture may need
-SIDES = 8  # of the pyramid that stands for a cone of friction
-SIDEWAYS = 100.0  # how much a sideways force of a foot costs against an upright one: it lets the foot creep
-# A posture to stand in.
-ON_GROUND = 2e-5  # [m] how far soles may be off the ground
-BALANCED, LEVEL, TALL, ASIDE, POSED = 5e-3, 0.03, 0.01, 0.02, 0.5  # [m or rad] what counts as 1
-BENT = 0.88  # of its height on straight legs
-INSIDE = 0.08  # of a joint's range: how far from its limits a posture stays
-DEEP = 5e-5  # [m] how deep feet are in the ground
-STARTS, SPREAD = 6, 0.5  # first postures, and how far [rad or m] they are drawn from the file's
-ROUNDS = 3  # in which the lowest points of round feet are looked for
-# A state at rest. What counts as 1 of a turn, a height, any coordinate, and an input as a part of the weight times 1 m.
+FOOT_SHARE = 0.1  # least load of a foot, as a fraction of an even share of the weight, so that no foot lifts off
+OF_FRICTION, OF_EFFORT = 0.7, 0.8  # largest fractions of the available friction and of an effort limit
+SIDES = 8  # of the pyramid that approximates a friction cone
+SIDEWAYS = 100.0  # cost of a tangential force relative to a normal one, because it lets the foot creep
+# A standing posture.
+ON_GROUND = 2e-5  # [m] largest distance of soles from the ground
+BALANCED, LEVEL, TALL, ASIDE, POSED = 5e-3, 0.03, 0.01, 0.02, 0.5  # [m or rad] deviations that cost 1
+BENT = 0.88  # height of the base, as a fraction of its height on straight legs
+INSIDE = 0.08  # distance of a posture from joint limits, as a fraction of a joint's range
+DEEP = 5e-5  # [m] depth of the feet in the ground
+STARTS, SPREAD = 6, 0.5  # random first postures, and their largest distance [rad or m] from the file's posture
+ROUNDS = 3  # iterations to find the lowest points of round feet
+# A state at rest. Units of a rotation, a height, any coordinate, and an input, as a fraction of the weight times 1 m.
 TURN, HEIGHT, ANY, EFFORT = 1e-2, 1e-3, 1e-3, 1e-3
-ITERATIONS, HALVINGS, FARTHEST = 40, 8, 5e-3  # [rad or m] of one iteration
-AT_REST = 1e-7  # [rad/s or m/s] after a step
-# A foot is as soft as searches get on with: how deep an even share of the weight presses it is [m/s] times the step,
-# and its contact relaxes in so many steps. Drake's own dissipation would cut a foot's force off as it leaves.
-SINK, RELAXES, DISSIPATION, NEAR_RIGID = 0.0625, 2.5, 0.5, 0.1  # the third in s/m
-FIRST_SINK = 1e-4  # [m] at least, with which it is begun: a sole that is in the air has no derivative
+ITERATIONS, HALVINGS, FARTHEST = 40, 8, 5e-3  # [rad or m] largest change per iteration
+AT_REST = 1e-7  # [rad/s or m/s] largest velocity after a step
+# The softness of feet that suits searches. SINK [m/s] times the step is a foot's depth under an even share of the
+# weight, and contact relaxes in RELAXES steps. Drake's own dissipation would cut off a foot's force as it lifts off.
+SINK, RELAXES, DISSIPATION, NEAR_RIGID = 0.0625, 2.5, 0.5, 0.1  # DISSIPATION is in s/m
+FIRST_SINK = 1e-4  # [m] least initial depth, because a sole in the air has no derivative
 # A motion from rest to rest.
-DURATIONS, HOLDING = (0.6, 1.0), 0.2  # [s] of it, and of holding its end
-SIZES = ((1.0, 1.0), (1.0, 0.2), (0.5, 0.2), (0.25, 0.1), (0.12, 0.0))  # of a random shift of the base and of the arms
-TURNED, SHIFTED, LOWERED = 0.1, 0.06, 0.12  # [rad], and shares of the height of the centre of mass: of the base
-MOVED = 0.1  # of the range of a joint that is no leg's
-ARRIVED, SLOW_ENOUGH = 0.01, 0.02  # [rad or m] off the rest that was to be reached, [rad/s or m/s] there
-FEET_STAY, STILL = 1e-3, 1e-7  # [m] how far a foot may be from where it stood, and from knot to knot: 4 mm/s^2
-FREE_BASE, FREE_JOINT, ALONG = 0.1, 0.3, 0.05  # [rad or m] that counts as 1, the last on the way
-BASE_TURN, BASE_PLACE = 0.003, 0.001  # the same of a base whose pose is asked for
-OVER_FEET = 0.02  # [m] the same of the centre of mass
-CORRECTIONS, FRAME_MISS, JOINT_MISS = 3, 3e-4, 1e-3  # [m], [rad or m]: what needs no other try
-NEAR, SLOW = 0.02, 0.5  # [rad or m], [rad/s or m/s] off that count as 1 of a regulator
-EFFORT_SHARE = 0.2  # of what an input holds (of the largest at least a tenth): the same of it
+DURATIONS, HOLDING = (0.6, 1.0), 0.2  # [s] of the motion, and of holding its end
+SIZES = ((1.0, 1.0), (1.0, 0.2), (0.5, 0.2), (0.25, 0.1), (0.12, 0.0))  # factors on a random shift of base and arms
+TURNED, SHIFTED, LOWERED = 0.1, 0.06, 0.12  # of the base: [rad], and fractions of the centre of mass's height
+MOVED = 0.1  # fraction of a joint's range, for joints outside the legs
+ARRIVED, SLOW_ENOUGH = 0.01, 0.02  # [rad or m] largest distance from the target rest, [rad/s or m/s] largest velocity
+FEET_STAY, STILL = 1e-3, 1e-7  # [m] largest distance of a foot from its stance, and between knots (4 mm/s^2)
+FREE_BASE, FREE_JOINT, ALONG = 0.1, 0.3, 0.05  # [rad or m] deviations that cost 1; ALONG applies on the way
+BASE_TURN, BASE_PLACE = 0.003, 0.001  # the same for a base whose pose is required
+OVER_FEET = 0.02  # [m] the same for the centre of mass
+CORRECTIONS, FRAME_MISS, JOINT_MISS = 3, 3e-4, 1e-3  # [m], [rad or m] errors that need no further correction
+NEAR, SLOW = 0.02, 0.5  # [rad or m], [rad/s or m/s] deviations that cost 1 in a regulator
+EFFORT_SHARE = 0.2  # the same for an input, as a fraction of its holding effort (at least a tenth of the largest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,7 @@ class Shift:
 
 
 def stand(model: Model, lower: Array, upper: Array) -> tuple[Legs, Rest] | Refusal:
-    """The robot on its feet, at rest, joints within lower and upper (nq,); or why it cannot stand.
+    """Return the legs of a robot and the state in which it stands at rest, within lower and upper (nq,), or a Refusal.
 
     The base floats, z is up, and the ground is at z = 0.
     """
@@ -105,7 +105,7 @@ def stand(model: Model, lower: Array, upper: Array) -> tuple[Legs, Rest] | Refus
 
 
 def standing_posture(legs: Legs, file: Array) -> Stance | Refusal:
-    """On bent legs, the feet about where they are in the file's posture (nq,) and the centre of mass over them."""
+    """Find a stance on bent legs, with feet near those of the file's posture (nq,) and the centre of mass over them."""
     model, legs = legs.model, legs.on_lowest(file)
     q, base = file.copy(), legs.base_v
     q[legs.base_q + 6] -= float(np.min(legs.points_in(file)[:, 2]))
@@ -144,22 +144,22 @@ def standing_posture(legs: Legs, file: Array) -> Stance | Refusal:
 
 
 def _margin(legs: Legs, share: float) -> Array:
-    """(nq,) a share of the range of joints, 0 of the base."""
+    """Return (nq,) a share of the range of each joint, and 0 for the base."""
     margin = np.zeros(legs.model.nq)
     margin[legs.joint_q] = share * (legs.upper - legs.lower)[legs.joint_q]
     return margin
 
 
 def _unevenness(points: Array) -> float:
-    """[m] how far points (k, 3) are off the plane through them, at most."""
+    """Return [m] the largest distance of points (k, 3) from the plane through them."""
     middle = points - np.mean(points, axis=0)
     return float(np.max(np.abs(middle @ np.linalg.svd(middle)[2][2]))) if len(points) > 3 else 0.0
 
 
 def hold(legs: Legs, q: Array, needed: Array | None = None) -> Stance | Refusal:
-    """The least forces and inputs that hold posture q (nq,); or that there are none.
+    """Return the least forces and inputs that hold posture q (nq,), or a Refusal.
 
-    `needed` (nv,) is the generalized force that they are to make in place of what holds the weight, for a motion.
+    `needed` (nv,) is the generalized force that they must produce, for a motion. By default, they balance the weight.
     """
     model, owners = legs.model, legs.owners
     points = legs.points_in(q)
@@ -169,8 +169,8 @@ def hold(legs: Legs, q: Array, needed: Array | None = None) -> Stance | Refusal:
     count, share = len(points), legs.weight / len(legs.feet)
     scale = np.where(np.isfinite(limits), limits, legs.weight)
     program = MathematicalProgram()
-    f = program.NewContinuousVariables(3 * count)  # in shares of the weight
-    u = program.NewContinuousVariables(model.nu)  # in parts of the limits
+    f = program.NewContinuousVariables(3 * count)  # in even shares of the weight
+    u = program.NewContinuousVariables(model.nu)  # as fractions of the limits
     balance = np.hstack([share * legs.jacobian().reshape(-1, model.nv).T, model.actuation * scale])
     program.AddLinearEqualityConstraint(balance / legs.weight, needed / legs.weight, np.concatenate([f, u]))
     angles = np.arange(SIDES) * 2 * np.pi / SIDES
@@ -194,24 +194,24 @@ def hold(legs: Legs, q: Array, needed: Array | None = None) -> Stance | Refusal:
 
 
 def input_limits(model: Model) -> Array:
-    """(2, nu) the lower and the upper limits of the inputs."""
+    """Return (2, nu) the lower and the upper limits of the inputs."""
     return np.array([[u.lower for u in model.contract.inputs], [u.upper for u in model.contract.inputs]])
 
 
 def settled(legs: Legs, stance: Stance) -> Rest | Refusal:
-    """Where a stance is at rest in the model's own steps; or why it is not."""
+    """Return the state near a stance that is at rest in the model's own steps, or a Refusal."""
     q = stance.q.copy()
     q[legs.base_q + 6] -= float(np.max(stance.points[:, 2])) + DEEP  # all soles touch, and so have derivatives
     return at_rest(legs, q, stance.u, np.arange(legs.model.nv), np.full(legs.model.nv, ANY))
 
 
 def standing(legs: Legs, posture: Array) -> Rest:
-    """The state at rest with joints as in `posture` (nq,), and the inputs under which a step keeps it.
+    """Return the state at rest with joints as in `posture` (nq,), and the inputs under which a step preserves it.
 
-    The base is rolled, pitched and raised.
+    Only roll, pitch and height of the base are varied.
 
     Raises:
-        InputError: No such state is found, a foot is in the air, something else touches, or a motor is too weak.
+        InputError: No such state is found, a foot is in the air, another body touches, or a motor is too weak.
     """
     base, none = legs.base_v, np.zeros(legs.model.nu)
     rest = at_rest(
@@ -224,7 +224,7 @@ def standing(legs: Legs, posture: Array) -> Rest:
 
 
 def _level(legs: Legs, posture: Array) -> Array:
-    """(nq,) the posture rolled, pitched and raised so that the plane through its soles is a little below the ground."""
+    """Roll, pitch and raise the posture (nq,) until the plane through its soles is slightly below the ground."""
     q, turn = posture.copy(), np.zeros(legs.model.nv)
     q[legs.base_q : legs.base_q + 4] = 1.0, 0.0, 0.0, 0.0
     points = legs.points_in(q) - np.mean(legs.points_in(q), axis=0)
@@ -237,9 +237,9 @@ def _level(legs: Legs, posture: Array) -> Array:
 
 
 def at_rest(legs: Legs, q: Array, u: Array, freed: Indices, unit: Array) -> Rest | Refusal:
-    """A state that a step does not move, near posture q (nq,) and inputs u (nu,); or why there is none.
+    """Return a state that a step does not change, near posture q (nq,) and inputs u (nu,), or a Refusal.
 
-    By Gauss and Newton over the inputs and the coordinates `freed` of the tangent space, of which `unit` counts as 1.
+    Gauss-Newton varies the inputs and the coordinates `freed` of the tangent space, whose scale is `unit`.
     """
     model = legs.model
     x = np.concatenate([q, np.zeros(model.nv)])
@@ -272,13 +272,13 @@ def at_rest(legs: Legs, q: Array, u: Array, freed: Indices, unit: Array) -> Rest
 
 
 def _after(model: Model, x: Array, u: Array) -> tuple[Array, float]:
-    """The state after a step, and the largest velocity in it."""
+    """Return the state after a step, and its largest velocity."""
     x_next = np.array(advance(model.double, x, u))
     return x_next, float(np.max(np.abs(x_next[model.nq :])))
 
 
 def _fault(legs: Legs, x: Array, u: Array, off: float) -> str:
-    """Why the state is not at rest, not on its feet alone, or not held by motors within their limits; else ""."""
+    """Describe why the state is not at rest, not on its feet alone, or beyond a motor's limits, or return ""."""
     model = legs.model
     for entry, value in zip(model.contract.inputs, u, strict=True):
         if not entry.lower <= value <= entry.upper:
@@ -295,19 +295,19 @@ def _fault(legs: Legs, x: Array, u: Array, off: float) -> str:
 
 
 def with_soft_feet(model: Model, feet: int) -> Model:
-    """The model with contact as soft for its step as plans on so many feet need, where its file gives none."""
+    """Return the model with contact as soft as plans on this many feet need, unless its file gives values."""
     h = model.time_step
     weight = float(model.plant.CalcTotalMass(model.double.context)) * GRAVITY
-    stiffness = 2 * weight / feet / (SINK * h)  # two shapes in touch have half of it
+    stiffness = 2 * weight / feet / (SINK * h)  # two touching shapes have half of this stiffness
     return model.changed(
         stiffness=stiffness, dissipation=DISSIPATION, relaxation_time=RELAXES * h, near_rigid=NEAR_RIGID
     )
 
 
 def random_shift(legs: Legs, start: Rest, seed: Sequence[int], depth: Callable[[Array], float]) -> Shift | Refusal:
-    """To a posture drawn at random, the base lower and shifted and the arms moved; or why none was found.
+    """Return a motion to a random posture, with the base shifted and lowered and the arms moved, or a Refusal.
 
-    `depth` tells how deep [m] shapes overlap in a posture: more than at the start is not wanted.
+    `depth` returns the overlap of shapes [m] in a posture, which must not be more than at the start.
     """
     random = np.random.default_rng([*seed, 4])
     model, q0, base = legs.model, start.x[: legs.model.nq], legs.base_v
@@ -337,7 +337,7 @@ def random_shift(legs: Legs, start: Rest, seed: Sequence[int], depth: Callable[[
 
 
 def shift_to(legs: Legs, start: Rest, frames: Mapping[str, Array], joints: Mapping[int, float]) -> Shift | Refusal:
-    """To where frames (3,) [m] by name and joints by their place in q are as asked, the feet where they stand."""
+    """Return a motion to positions (3,) [m] of frames and values of joints by their index in q, with fixed feet."""
     model, q0, base = legs.model, start.x[: legs.model.nq], legs.base_v
     feet, unit = legs.points_in(q0), np.full(model.nv, FREE_JOINT)
     unit[base : base + 6] = FREE_BASE
@@ -369,7 +369,7 @@ def shift_to(legs: Legs, start: Rest, frames: Mapping[str, Array], joints: Mappi
 def _shift_to(
     legs: Legs, start: Rest, wish: Wish, lower: Array, upper: Array, others: Sequence[PointTarget] = ()
 ) -> Shift | Refusal:
-    """From rest to the posture nearest to a wish in which the feet stand where they are, and `others` are kept."""
+    """Return a motion from rest to the posture nearest to a wish, with fixed feet and the targets `others`."""
     q0 = start.x[: legs.model.nq]
     feet = legs.points_in(q0)
     targets = [*legs.at(feet, ON_GROUND, rolls=range(len(feet))), *others]
@@ -396,10 +396,10 @@ def _shift_to(
 
 
 def _between(legs: Legs, start: Rest, end: Rest, duration: float) -> Shift | Refusal:
-    """The model's own steps from one rest to (nearly) another in `duration` [s], the feet on the ground.
+    """Return the model's own steps from one rest to (nearly) another in `duration` [s], with the feet on the ground.
 
-    The inputs are those that make a smooth motion of the posture, its forces shared among the feet, and a regulator
-    keeps the steps to it.
+    The inputs produce a smooth motion of the posture, with forces shared among the feet. A regulator keeps the steps
+    near this motion.
     """
     model, h = legs.model, legs.model.time_step
     moving, holding = round(duration / h), round(HOLDING / h)
@@ -428,7 +428,7 @@ def _between(legs: Legs, start: Rest, end: Rest, duration: float) -> Shift | Ref
 
 
 def _regulated(legs: Legs, xs: Array, us: Array) -> Shift | Refusal:
-    """The model's own steps along xs (N+1, nx) under us (N, nu) and a regulator, which must stay within the limits."""
+    """Return the model's own steps along xs (N+1, nx) under us (N, nu) and a regulator, if they keep within limits."""
     model, nv = legs.model, legs.model.nv
     lower, upper = input_limits(model)
     effort = np.abs(model.efforts(xs[0], us[0]))

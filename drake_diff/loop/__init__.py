@@ -1,4 +1,4 @@
-"""A controller on the plant, through sensor, estimator and actuator."""
+"""Closed-loop simulation of a controller on the plant, with sensor, estimator and actuator."""
 
 from drake_diff._base import attach_stub as _attach_stub
 

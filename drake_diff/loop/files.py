@@ -1,7 +1,7 @@
-"""A closed loop saved: its record, a trace of all that the loop saw and did, a replay and a report; and made again.
+"""Save a closed loop with its record, a trace of all its signals, a replay and a report, and reproduce it.
 
-Each part of the loop is given its recorded inputs again: the plant each recorded state, the sensor too, the estimator
-the measurements, MPC the estimates, the actuator the commands. What a user's code made is data, and is never executed.
+Each part of the loop is run again on its recorded inputs: states for the plant and the sensor, measurements for the
+estimator, estimates for MPC and commands for the actuator. A user's code is never executed, and its output is data.
 """
 
 import io
@@ -70,14 +70,14 @@ from drake_diff.runs.trace import MEDIA_TYPES
 SENSED = ("noise", "bias", "delay", "every", "dropout")
 ACTUATED = ("delay", "every", "lower", "upper", "strength", "lag")
 COUNTS = ("delay", "every")
-PLANTS, CONTROLLERS = "the plant's", "the controller's"  # models
+PLANTS, CONTROLLERS = "the plant's", "the controller's"  # the model of the estimator
 PLAN_ARRAYS = ("xs", "us", f"{GUESS}xs", f"{GUESS}us")
 NOT_MEASURED = "the loop has run, and is not measured yet"
-FURTHEST = 1e6  # m and rad: what runs away further is drawn here; the trace has it as it was
-MOST_PLOTS = 12  # of coordinates; those that end furthest from the plan
-ROUNDED = 1e-9  # of a column's largest number: what a step of a plant differs by on another machine
-COUPLED = 1e-5  # of the largest number of all columns: rounding reaches from one column to the others
-PARTS = ("xs", "us", "observations", "estimates", "applied")  # what the parts of a loop make of the rows before
+FURTHEST = 1e6  # [m or rad] larger values are clipped in drawings; the trace has the original values
+MOST_PLOTS = 12  # of coordinates; those with the largest distance from the plan
+ROUNDED = 1e-9  # fraction of a column's largest number: rounding of a plant's step on another machine
+COUPLED = 1e-5  # fraction of the largest number of all columns: rounding spreads from one column to the others
+PARTS = ("xs", "us", "observations", "estimates", "applied")  # rows that the parts of a loop compute from earlier rows
 RAISED: Mapping[str, Label] = {"sensor": "perception_error", "estimator": "state_error", "controller": "control_error"}
 DEADLINES = (
     "/deadlines: latencies of the controller cannot be reproduced; all values that follow from them were made again"
@@ -86,7 +86,7 @@ HERE = "along the run"
 
 
 def save(run: Any, directory: str | Path, *, meshes: bool = True) -> PlanRecord:
-    """Write the directory of a closed loop; see `runs.save`. InputError where it is none."""
+    """Write the directory of a closed loop; see `runs.save`. Raises InputError if `run` is not a closed loop."""
     if not isinstance(run, ClosedLoop):
         raise InputError("solution", got=type(run).__name__, expected="a result of solve, identify or closed_loop")
     with directories.written_whole(directory) as folder:
@@ -94,7 +94,7 @@ def save(run: Any, directory: str | Path, *, meshes: bool = True) -> PlanRecord:
 
 
 def _write(run: ClosedLoop, folder: Path, meshes: bool) -> PlanRecord:
-    """Write what `save` does into `folder`; first what was recorded, as measuring it takes a while."""
+    """Write the files of `save` into `folder`, and the recorded data first, because measuring takes a while."""
     asked = _asked(run, folder)
     asked.begin(folder)
     controller = run.controller if type(run.controller) is MPC else None
@@ -112,7 +112,7 @@ def _write(run: ClosedLoop, folder: Path, meshes: bool) -> PlanRecord:
 
 
 def _asked(run: ClosedLoop, folder: Path) -> PlanRecord:
-    """The record of a run that is not measured yet: what was asked, and how it ended."""
+    """Return the record of a run before it is measured: its setup, and how it ended."""
     controller, model = run.controller, run.model
     problem = controller.problem if type(controller) is MPC else None
     budget = run.loop.substeps * model.time_step if run.latency_budget is None else run.latency_budget
@@ -157,25 +157,25 @@ def _judged_by(problem: Problem | None) -> str:
 
 
 def _is_same_model(model: Model, other: Model) -> bool:
-    """Whether two models are one, or were loaded alike from the same files."""
+    """Return whether two models are identical, or were loaded in the same way from the same files."""
     return model is other or (model.source is not None and model_input(model) == model_input(other))
 
 
 def _predictive_control(controller: Any, plant: Model) -> PredictiveControl | None:
-    """What it takes to make an MPC again; None where it is another controller, or a clock decides what it answers."""
+    """Return the data to make an MPC again, or None for another controller or if a clock decides its answers."""
     if type(controller) is not MPC or controller.budget is not None:
         return None
     model = controller.problem.model
     its_file, plants_file = model_input(model), model_input(plant)
     files = [evidence.file for evidence in (its_file, plants_file)]
     if its_file.file is None or (files[1] is not None and files[0].path == files[1].path and files[0] != files[1]):  # type: ignore[union-attr]
-        return None  # the trace has one file of a name
+        return None  # the trace has only one file of each name
     counts = {name: getattr(controller, name) for name in ("horizon", "iterations", "replan_every")}
     return PredictiveControl(model=its_file, **counts)
 
 
 def loop_evidence(loop: Loop, controller: Any, model: Model, steps: int, judged_by: str) -> LoopEvidence:
-    """What is around a `controller`, or one of that name, as it stands in a record."""
+    """Return the record's description of the loop around a `controller`, or around a controller of that name."""
     period, fallback = loop.substeps * model.time_step, loop.fallback
     follows: Any = None
     if type(loop.estimator) is Predictor:
@@ -206,12 +206,12 @@ def loop_evidence(loop: Loop, controller: Any, model: Model, steps: int, judged_
 
 
 def _numbers(value: Any) -> Any:
-    """A number or a list of them for JSON; null for what is infinite, or not there."""
+    """Convert a number or a list of numbers for JSON, with null for infinite or missing values."""
     return None if value is None else plain(np.asarray(value, dtype=float)[()])
 
 
 def _loop_of(evidence: LoopEvidence, model: Model, controlled: Model) -> Loop:
-    """The loop that a record describes, its parts those of this package, about the plant and the controller's model."""
+    """Return the loop that a record describes, from parts of this package, the plant and the controller's model."""
 
     def arguments(values: Mapping[str, Any]) -> dict[str, Any]:
         missing = {"lower": -np.inf, "upper": np.inf}
@@ -239,14 +239,14 @@ def _loop_of(evidence: LoopEvidence, model: Model, controlled: Model) -> Loop:
 
 
 def _with_given(loop: Loop, rows: LoopRows, given: Sequence[str]) -> Loop:
-    """The loop with what is `given` in the place of the parts that made it."""
+    """Return the loop with the recorded rows `given` in place of the parts that computed them."""
     parts: dict[str, Any] = {"sensor": "observations", "estimator": "estimates", "actuator": "applied"}
     changes: dict[str, Any] = {name: Recorded(getattr(rows, row)) for name, row in parts.items() if row in given}
     return replace(loop, **changes)
 
 
 def latency_times(latencies: Sequence[Array], budget: float) -> dict[str, Any]:
-    """What the wall clock says of a controller's latencies [s]."""
+    """Return the statistics of a controller's latencies [s] by the wall clock."""
     every = np.concatenate(latencies)
     if not len(every):
         return {}
@@ -260,7 +260,7 @@ def latency_times(latencies: Sequence[Array], budget: float) -> dict[str, Any]:
 
 
 def _arrays(mpc: MPC) -> dict[str, Array]:
-    """The plan of an MPC's whole problem, and what that was made from."""
+    """Return the plan of an MPC's whole problem, and the plan that it was computed from."""
     (xs, us), (guess_xs, guess_us) = mpc.reference, mpc.first_plan
     return {"xs": xs, "us": us, GUESS + "xs": guess_xs, GUESS + "us": guess_us}
 
@@ -273,14 +273,14 @@ def _write_plan(path: Path, arrays: Mapping[str, Array]) -> None:
 
 
 def _model_files(run: ClosedLoop) -> dict[str, bytes]:
-    """The model files of the plant and of an MPC, the plant's where both have the same name."""
+    """Read the model files of the plant and of an MPC. If both have one name, the plant's file is used."""
     models = [run.controller.problem.model] if type(run.controller) is MPC else []
     sources = [model.source for model in (*models, run.model) if model.source is not None]
     return {source.name: source.read_bytes() for source in sources}
 
 
 def loop_channels(run: ClosedLoop, events: Sequence[Any]) -> Iterator[Channel]:
-    """What the loop saw and did, a message for each step of the controller, and the `events`, drake_diff.Event."""
+    """Yield the channels of the loop's signals, with a message for each controller step, and of the `events`."""
     contract = run.model.contract
     states = (contract.positions, contract.velocities)
     seen = ~np.isnan(run.observations).all(axis=1)
@@ -305,7 +305,7 @@ def _events(topic: str, events: Sequence[Any]) -> Channel:
 def _write_trace(
     path: Path, run: ClosedLoop, record: PlanRecord, followed: "_Followed | None", files: Mapping[str, bytes]
 ) -> None:
-    """The motion, all that the loop saw and did, and how long the controller took in each step."""
+    """Write the motion, all signals of the loop, and the controller's latency in each step."""
     model, deadline, loop = run.model, TYPES["Deadline"], _section(record).loop
     budget, states = loop.latency_budget_s, (model.contract.positions, model.contract.velocities)
     rows = [
@@ -334,21 +334,21 @@ def _write_trace(
 
 @dataclass(frozen=True, eq=False)
 class _Followed:
-    """What a controller followed: the problem, without the user's functions in a directory, and the plan of it."""
+    """The problem that a controller followed (in a directory without the user's functions), and its plan."""
 
     problem: Problem
-    arrays: Mapping[str, Array]  # those of plan.npz
+    arrays: Mapping[str, Array]  # the arrays of plan.npz
 
     @property
     def plan(self) -> ReplayPlan:
-        """For the checks of replays, whose tolerances are parts of its ranges."""
+        """The plan for checks of replays, whose tolerances are fractions of its ranges."""
         xs, us = self.arrays["xs"], self.arrays["us"]
         h = self.problem.time_step
         return ReplayPlan(self.problem, self.problem.parameters, h, held(xs, us), False, 0.0)
 
 
 def _judged(asked: PlanRecord, rows: LoopRows, again: ClosedLoop, followed: _Followed | None) -> PlanRecord:
-    """The record of `rows`, measured; `again` is what the parts of the loop make of them."""
+    """Return the measured record of `rows`. `again` is what the parts of the loop compute from them."""
     metrics = [*_metrics_of_the_loop(rows, again, _section(asked).loop.latency_budget_s)]
     invariants: list[Metric] = []
     if len(rows.us):
@@ -389,10 +389,10 @@ def _metrics_of_the_loop(rows: LoopRows, again: ClosedLoop, budget: float) -> It
 
 
 def _relative_difference(recorded: Array, made: Array) -> float:
-    """The largest difference of two arrays (n, m), each column's as a part of its largest number.
+    """Return the largest difference of two arrays (n, m), relative to the largest number of each column.
 
-    Of a column that is nearly zero it is a part of COUPLED times the largest number of all: what a step is rounded to.
-    It is inf where gaps or shapes differ.
+    In a column that is nearly zero, it is relative to COUPLED times the largest number of all columns, the rounding of
+    a step. It is inf if gaps or shapes differ.
     """
     if recorded.shape != made.shape or not np.array_equal(np.isfinite(recorded), np.isfinite(made)):
         return np.inf
@@ -418,7 +418,7 @@ def _metrics_of_the_motion(run: ClosedLoop) -> Iterator[Metric]:
 def _metrics_of_the_problem(
     rows: LoopRows, again: ClosedLoop, followed: _Followed, has_functions: bool
 ) -> Iterator[Metric]:
-    """What the controller's problem asks of the run; what rests on a user's functions is left out."""
+    """Measure the run against the controller's problem, except for measures that depend on a user's functions."""
     problem, plan, h = followed.problem, followed.plan, again.model.time_step
     parts = max(1, round(problem.time_step / h))
     count = min(len(rows.us), parts * problem.num_steps)
@@ -467,7 +467,7 @@ def _write_files(
     fields = fields_of(record)
     _write_trace(folder / TRACE, run, record, followed, {record.FILE: reproducible(fields).encode(), **files})
     times, xs = _times(run.model.time_step, max(2, len(run.xs))), np.clip(run.xs, -FURTHEST, FURTHEST)
-    xs = xs if len(xs) > 1 else np.repeat(xs, 2, axis=0)  # it broke off at once
+    xs = xs if len(xs) > 1 else np.repeat(xs, 2, axis=0)  # the run ended at once
     contacts = run.motion.contacts if len(run.motion.contacts) == len(xs) - 1 else ()
     planned = None if followed is None else _planned(followed, run, len(xs))
     marks = () if followed is None else drawn_goals(run.model.plant, run.model.double.context, followed.problem.goals)
@@ -491,7 +491,7 @@ def _write_files(
 
 
 def _planned(followed: _Followed, run: ClosedLoop, count: int) -> tuple[Array, Array]:
-    """(count, nx) and (count - 1, nu) of the plan at the plant's steps; after its end it stays where it is."""
+    """Return (count, nx) and (count - 1, nu) the plan at the plant's steps. After its end, its last row is repeated."""
     parts = max(1, round(followed.problem.time_step / run.model.time_step))
     xs, us = followed.plan.sample(parts)
     rows = [np.vstack([side[:n], np.repeat(side[-1:], max(0, n - len(side)), axis=0)])
@@ -500,7 +500,7 @@ def _planned(followed: _Followed, run: ClosedLoop, count: int) -> tuple[Array, A
 
 
 def _checks_of(record: PlanRecord, run: ClosedLoop) -> list[PageCheck]:
-    """What was checked of a run, for the first screen."""
+    """Return the checks of a run for the first screen."""
     section, metrics = _section(record), {m.name: m for m in record.metrics}
     loop, error = section.loop, metrics["loop error"]
     result = [PageCheck("Run", "fail" if section.ended else "pass", _end_sentence(record))]
@@ -540,15 +540,15 @@ def _times(period: float, count: int) -> Array:
 def loop_plots(
     run: ClosedLoop, count: int, planned: tuple[Array, Array] | None, bounds: Bounds, scale: Array | None
 ) -> Iterator[Plot]:
-    """Each coordinate as it was, seen, estimated and planned at `count` states; the inputs; the controller's status.
+    """Plot true, observed, estimated and planned coordinates at `count` states, inputs, and the controller's status.
 
-    Of many coordinates those that leave the plan furthest, for the ranges `scale`.
+    Of many coordinates, only those with the largest distance from the plan, relative to `scale`, are plotted.
     """
     contract, model = run.model.contract, run.model
     times = model.time_step * np.arange(count)
 
     def of_plant(rows: Array) -> Array:
-        """Rows of the controller's steps as rows of the plant's."""
+        """Convert rows of the controller's steps to rows of the plant's steps."""
         return _padded(np.repeat(rows, run.loop.substeps, axis=0), count)
 
     def lines(i: int, rows: Sequence[tuple[str, Array]], plan: Array | None, **options: Any) -> list[Line]:
@@ -580,13 +580,13 @@ def loop_plots(
 
 
 def _padded(rows: Array, count: int) -> Array:
-    """`rows` (n, m) as (count, m): NaN below, but a held row lasts to the end where only one is missing."""
+    """Pad `rows` (n, m) with NaN to (count, m). If a single row is missing, the last row is repeated instead."""
     rows = np.vstack([rows, rows[-1:]]) if len(rows) == count - 1 else rows[:count]
     return np.vstack([rows, np.full((count - len(rows), rows.shape[1]), np.nan)])
 
 
 def _other_plots(run: ClosedLoop, loop: LoopEvidence) -> Iterator[Plot]:
-    """Latencies and energies."""
+    """Plot latencies, energies and penetration."""
     motion, group = run.motion, "Energy and contact"
     taken = [Line("latency", 1e3 * run.latencies)]
     yield Plot("latency", "ms", run.times, taken, limits=(None, 1e3 * loop.latency_budget_s), group="Deadlines")
@@ -599,7 +599,7 @@ def _other_plots(run: ClosedLoop, loop: LoopEvidence) -> Iterator[Plot]:
 
 
 def _rows_of(log: McapLog, section: ClosedLoopSection, model: Model) -> LoopRows:
-    """What a trace has recorded; ArtifactError where its channels do not fit together."""
+    """Read the rows that a trace has recorded. Raises ArtifactError if its channels do not fit together."""
     steps, nx, nu = section.loop.steps, model.nx, model.nu
     try:
         states = {topic: log.arrays(topic) for topic in ("/state", "/observation", "/estimate")}
@@ -620,9 +620,9 @@ def _rows_of(log: McapLog, section: ClosedLoopSection, model: Model) -> LoopRows
 
 
 def _compared(rows: LoopRows, again: ClosedLoop, mpc: MPC, followed: _Followed) -> tuple[list[str], list[str]]:
-    """(problems, doubts) of the plan and the commands of an MPC that was run again.
+    """Return (problems, doubts) about the plan and the commands of an MPC that was run again.
 
-    They are doubts where this machine rounds otherwise: then optimization may take other steps.
+    If this machine rounds differently, they are only doubts, because the optimization may then take other steps.
     """
     exact = all(np.array_equal(getattr(rows, name), getattr(again, name), equal_nan=True) for name in PARTS)
     plan = max(
@@ -639,9 +639,9 @@ def _compared(rows: LoopRows, again: ClosedLoop, mpc: MPC, followed: _Followed) 
 
 
 def reproduce(folder: Path, record: PlanRecord, models: Path | None) -> Reproduced:
-    """What the parts of a recorded loop make of the rows before them, and all that is measured and written of it.
+    """Run the parts of a recorded loop again on the recorded rows, and repeat all measures and files.
 
-    ArtifactError where what is in the directory does not go together, ModelError where a model cannot be built again.
+    Raises ArtifactError if the files of the directory do not fit together, ModelError if a model cannot be built again.
     """
     section, log = _section(record), read_mcap(folder / TRACE, links=False)
     problems, undecided = list[str](), list[str]()

@@ -1,9 +1,9 @@
-"""Model predictive control by real-time iterations: one step of sequential quadratic programming a tick, shifted on.
+"""Model predictive control by real-time iterations: one step of sequential quadratic programming per call.
 
-Where the horizon ends before the problem does, it ends in the problem's cost-to-go about a plan of the whole: with
-linear dynamics, quadratic costs and no limit its length then changes nothing. Where the problem has a goal at its end,
-that is stayed at from then on: in the plan, whose steps beyond the end cost what is off the goal, and after it under
-LQR. Without a goal, the problem's own costs go on over the moving horizon.
+If the horizon ends before the problem, its terminal cost is the problem's cost-to-go about a plan of the whole problem.
+With linear dynamics, quadratic costs and no limits, the length of the horizon then has no effect. If the problem has a
+goal at its end, the plant stays there: planned steps beyond the end have a cost for the distance from the goal, and the
+terminal cost is LQR's cost-to-go. Without a goal, the problem's own costs continue over the moving horizon.
 """
 
 from collections.abc import Callable
@@ -32,53 +32,52 @@ from drake_diff.optimize.replay import ReplayPlan, held, regulator_weights
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.solve import solve
 
-PLAN_STEPS = 300  # of the first plan, made once
-DAMPED = 1e-3  # of the cost of a step, for a move by a whole range: the least damping
-PLENTY, NEAR = 100, 1e-6  # after so many, with limits that hold, a plan will do of which a step promises no more
-# Of what a plan that touches costs: a step that gains less ends it, at a damping of up to so much.
+PLAN_STEPS = 300  # limit for the first plan, which is made once
+DAMPED = 1e-3  # smallest damping: cost of a move by a whole range, as a fraction of a step's cost
+PLENTY, NEAR = 100, 1e-6  # after this many steps, a plan with active limits suffices if a step promises no more
+# A plan with contact is accepted if a step gains less than this fraction of its cost, at a damping of at most this.
 SETTLED, MOST_DAMPED = 1e-4, 1.0
 FOLLOWED = "the last plan is followed further"
-FAR_MORE = 2.0  # than was planned: what the last gains may cost from where the plant is before others are tried
+FAR_MORE = 2.0  # times the planned cost: beyond it, gains other than the last ones are tried as well
 FIXED_POINT_STEPS, AT_REST = 20, 1e-10
-RANK = 1e-9  # positions follow velocities: what their rows say beside those is rounding
-GAP = 1e-3  # of a state's range: what a plan's steps may be off, which a call closes
-# What one step costs that is off the goal by a whole range, in units of the plan's mean cost of a step. With it the
+RANK = 1e-9  # relative; positions follow velocities, so that their rows add only rounding
+GAP = 1e-3  # largest gap of a plan's steps, as a fraction of a state's range; a call closes it
+# Cost of a step that is a whole range off the goal, in units of the plan's mean cost of a step. With this value, the
 # cart-pole's swing-up misses its goal by about 0.2 % of a range; with a tenth of it, by 1 %.
 STAY = 1e4
 
 
 class MPC:
-    """A controller, u (nu,) = mpc(x (nx,), t [s]): the first input of a plan over the next steps of a problem.
+    """A controller u (nu,) = mpc(x (nx,), t [s]) that returns the first input of a plan over the next steps.
 
-    Each call shifts the last plan by the time that has passed, puts the state measured in its place, and takes
-    `iterations` steps towards the best plan. `t` is rounded to a step of the problem, which is the model's time step.
-    Where shapes touch along the plan, that and every step is a motion of the plant, rolled out under feedback.
+    Each call shifts the last plan by the elapsed time, replaces its first state by the measured one, and takes
+    `iterations` steps towards the optimal plan. `t` is rounded to a step of the problem, which is the model's time
+    step. If shapes touch along the plan, the plan and all steps are motions of the plant, rolled out under feedback.
 
-    Inputs keep their bounds. All else that the problem asks for (bounds of states, constraints, waypoints, goals and
-    obstacles) is kept wherever it can be; where it cannot, it gives way at a high price, and `status` says what, by how
-    much and when. Knots are those of the problem, wherever the horizon is. Goals at the problem's end are kept as the
-    plan's last state, which is stayed at.
+    Inputs satisfy their bounds. All other conditions of the problem (bounds of states, constraints, waypoints, goals
+    and obstacles) are satisfied if possible. Otherwise they are relaxed at a high cost, and `status` reports which one,
+    by how much and when. Knots are those of the problem, for any position of the horizon. Goals at the problem's end
+    hold at the plan's last state, where the plant then stays.
 
-    `status` is "ok" where a whole step was taken and nothing gives way. It says so where a step was cut because the
-    plant's steps do not follow their derivatives that far, and where none could be made: then the last plan is followed
-    further. With a `budget` it is "late" where the answer took longer; the input of the last plan is given then, and
-    the new one is used from the next call on. Without one no clock changes anything: the same calls give the same
-    bytes.
+    `status` is "ok" if a full step was taken and no condition is relaxed. It reports a step that was cut because the
+    plant deviates from its derivatives, and a step that failed, after which the last plan is continued. With a
+    `budget`, it is "late" if the answer took longer. The call then returns the input of the last plan, and the new plan
+    is used from the next call on. Without a budget, no clock affects the result: the same calls give the same bytes.
 
     Args:
-        problem: With a given x0 and no free horizon.
-        horizon: How many steps are planned; fewer where the problem ends before and has no goal.
-        plan: A Solution of the problem by any method, or (xs (N+1, nx), us (N, nu)), to start from; where None, the
-            problem is solved. States and inputs need not be a motion, nor touch what is to be touched.
-        iterations: How many steps a call takes.
+        problem: The problem, with a given x0 and no free horizon.
+        horizon: The number of planned steps; fewer if the problem ends earlier and has no goal.
+        plan: The first plan: a Solution of the problem by any method, or (xs (N+1, nx), us (N, nu)). If None, the
+            problem is solved. States and inputs need not be a motion, nor make the necessary contacts.
+        iterations: The number of steps per call.
         budget: [s] that a call may take; None waits for every answer.
-        replan_every: After how many steps there is a new plan.
-        clock: What tells the time [s].
+        replan_every: The number of steps from one plan to the next.
+        clock: A function that returns the time [s].
 
     Raises:
-        InputError: The problem has something that MPC cannot keep, a goal that no input within the bounds holds, or it
-            is not solved and no `plan` is given.
-        GradientError, SimulationError: The whole cannot be planned from `plan`.
+        InputError: The problem has something that MPC does not support or a goal that no input within the bounds holds,
+            or it is not solved and no `plan` is given.
+        GradientError, SimulationError: Planning the whole problem from `plan` fails.
 
     Source:
         Diehl, Bock and Schloeder, "A real-time iteration scheme for nonlinear optimization in optimal feedback
@@ -112,14 +111,14 @@ class MPC:
         self.budget = None if budget is None else positive_float("budget [s]", budget)
         self._clock, self.problem = clock, problem
         xs, us = _first_plan(problem, plan)
-        self.first_plan = frozen(xs), frozen(us)  # what the plan of the whole was made from
+        self.first_plan = frozen(xs), frozen(us)  # the plan that the plan of the whole problem is made from
         self._rolling = Rolling(problem, _staying(problem, xs, us), xs, us)
         self._reference = self._plan_the_whole(xs, us)
         self._get_ready()
         self.start(problem.x0)
 
     def start(self, x0: Array) -> None:
-        """Forget all but the first plan; the first call plans from its own estimate, whatever `x0` (nx,) is."""
+        """Reset to the first plan. The first call plans from its own estimate, and `x0` (nx,) is not used."""
         self._begin, self._last, self._fresh = 0, self._reference, True
         self._step: RealtimeStep | None = None
         self._solved_at = 0
@@ -151,12 +150,12 @@ class MPC:
 
     @property
     def latencies(self) -> Array:
-        """(calls,) [s] that each new plan took since `start`, on this machine."""
+        """(calls,) the time [s] that each new plan has taken since `start`, on this machine."""
         return frozen(np.array(self._latencies))
 
     @property
     def plan(self) -> tuple[Array, Array]:
-        """xs (n+1, nx), us (n, nu): the last plan, from the step on that it was made at."""
+        """xs (n+1, nx), us (n, nu): the last plan, which begins at the step at which it was made."""
         return frozen(self._last.xs), frozen(self._last.us)
 
     @property
@@ -166,17 +165,17 @@ class MPC:
 
     @property
     def gains(self) -> Array | None:
-        """(n, nu, nx) K: about `plan`, us[k] + K[k] (x - xs[k]) is what would be planned from x nearby at each step.
+        """(n, nu, nx) gains K about `plan`: us[k] + K[k] (x - xs[k]) is the planned input for a nearby x at each step.
 
-        What holds the plan, of the bounds and limits, goes on to hold it. None where the last plan is of no step that
-        was solved, or that has no minimum.
+        Active bounds and limits stay active. None if the last plan is not the result of a solved step, or if this step
+        has no minimum.
         """
         policy = self._policy()
         return None if policy is None else frozen(policy.feedback)
 
     @property
     def value(self) -> CostToGo | None:
-        """What remains to be paid from the first state of `plan` on, but for a constant; None as of `gains`."""
+        """The cost-to-go from the first state of `plan`, up to a constant, or None as for `gains`."""
         policy = self._policy()
         if policy is None:
             return None
@@ -186,7 +185,7 @@ class MPC:
         return None if self._step is None or self._solved_at != self._begin else self._step.policy
 
     def _replan(self, x: Any, k: int, start: float) -> None:
-        """Plan from step `k` on; where that fails, keep the last plan, moved on to `k`."""
+        """Plan from step `k` on. If that fails, keep the last plan, shifted to `k`."""
         count = self._rolling.count(k, self.horizon)
         xs = np.array([self._row(i, 0) for i in range(k, k + count + 1)])
         us = np.array([self._row(i, 1) for i in range(k, k + count)])
@@ -206,14 +205,14 @@ class MPC:
                 self.status = self._status_of(step, k)
                 now = self._clock()
                 is_late = self.budget is not None and now - start + (now - begin) > self.budget
-                if step.is_reached or not step.size or is_late:  # the next one would be late
+                if step.is_reached or not step.size or is_late:  # the next step would be late
                     break
         except (DrakeDiffError, np.linalg.LinAlgError) as error:
             self.status = f"{FOLLOWED}: {type(error).__name__}: {error}"
         self._begin, self._last, self._fresh = k, motion, False
 
     def _measured(self, x: Array, k: int, xs: Array, us: Array) -> Motion:
-        """The plan xs, us from step `k` on, from the state measured."""
+        """Return the plan xs, us from step `k` on, with the measured state as the first one."""
         twin, last = self.problem.model.double, self._last
         xs[0] = x
         known = range(self._begin + (k == self._begin), self._begin + len(last.us))
@@ -222,9 +221,9 @@ class MPC:
         return Motion.with_ends(xs, us, np.array(ends))
 
     def _followed(self, x: Array, k: int, xs: Array, us: Array, stretch: Stretch) -> Motion:
-        """The plant's own motion from x under the last gains; under those of the first plan where it costs less.
+        """Return the plant's own motion from x under the last gains, or under those of the first plan if it costs less.
 
-        That is looked at where the last ones cost far more than was planned.
+        The first plan's gains are only tried if the motion under the last ones costs far more than planned.
         """
         steps, candidates = np.arange(k, k + len(us)), list[tuple[float, Motion]]()
         last, first = self._step, self._first_step
@@ -246,7 +245,7 @@ class MPC:
         return min(candidates, key=lambda candidate: candidate[0])[1]
 
     def _same_sign(self, x: Array, planned: Array) -> Array:
-        """`x` with its quaternions as near to those of `planned` as they can be: either sign is the same rotation."""
+        """Return `x` with the signs of its quaternions nearest to `planned`, as both signs are the same rotation."""
         x = np.array(x)
         for start in tangent_space(self.problem.model).quaternions:
             entries = slice(start, start + 4)
@@ -255,7 +254,7 @@ class MPC:
         return x
 
     def _status_of(self, step: RealtimeStep, k: int) -> str:
-        """What is to be said of a step at the problem's step `k`."""
+        """Return the status after a step of optimization at the problem's step `k`."""
         remarks = []
         if not step.size and not step.is_reached:
             remarks.append(f"{FOLLOWED}: no step lowers the cost, although the derivatives predict it")
@@ -269,7 +268,7 @@ class MPC:
         return "; ".join(remarks) or OK
 
     def _get_ready(self) -> None:
-        """Do once what each length of a plan needs once, so that no call has to."""
+        """Do the work that each length of a plan needs once, so that no call has to do it."""
         counts = {self._rolling.count(k, self.horizon) for k in range(self.problem.num_steps + 1)}
         for count in counts:
             xs, us = self._reference.xs[-count - 1 :], self._reference.us[-count:]
@@ -281,7 +280,7 @@ class MPC:
                 self._rolling.stretch(0, count)
 
     def _row(self, k: int, i: int) -> Array:
-        """State (i = 0) or input (1) `k` of the last plan, else of the first, and after its end what stays there."""
+        """Return state (i = 0) or input (1) `k` of the last plan, else of the first plan and its continuation."""
         last, first = ((m.xs, m.us)[i] for m in (self._last, self._reference))
         if self._begin <= k < self._begin + len(last):
             return last[k - self._begin]
@@ -290,7 +289,7 @@ class MPC:
         return first[-1] if self._rolling.staying is None else self._rolling.staying.point[i]
 
     def _plan_the_whole(self, xs: Array, us: Array) -> Motion:
-        """A minimum near the given plan, whose costs-to-go are the tails."""
+        """Find a minimum near the given plan, and store its costs-to-go as `tails`."""
         problem, rolling = self.problem, self._rolling
         stretch, paid = rolling.stretch(0, problem.num_steps), np.inf
         xs, us = np.array(xs), np.clip(us, problem.bounds.u_lower, problem.bounds.u_upper)
@@ -298,7 +297,7 @@ class MPC:
         motion, ranges = stretch.motion(xs, us), problem.state_scales(xs)
         efforts = problem.input_scales(us)
         if np.max(np.abs(motion.gaps) / ranges) > GAP and problem.model.contract.contact.collision_pairs:
-            stretch = replace(stretch, rolls=True)  # what is no motion says nothing of what touches
+            stretch = replace(stretch, rolls=True)  # only the states of a motion tell which shapes touch
         unit = abs(stretch.cost(xs, us)) / problem.num_steps / np.concatenate([ranges, efforts]) ** 2
         damping = 0.0
         for i in range(PLAN_STEPS):
@@ -315,7 +314,7 @@ class MPC:
             paid = step.merit if stretch.rolls else np.inf
             less = damping / 8 if damping > DAMPED else 0.0
             damping = max(8 * damping, DAMPED) if step.size < 1.0 else less
-        if damping:  # gains and costs-to-go are those of the problem itself
+        if damping:  # gains and costs-to-go must belong to the undamped problem
             outcome = take_step(stretch, motion)
             step = step if isinstance(outcome, Refusal) else outcome
         apart = float(np.max(np.abs(motion.gaps) / ranges))
@@ -330,7 +329,7 @@ class MPC:
 
 
 def _check(problem: Problem) -> None:
-    """Refuse by name what MPC cannot keep."""
+    """Raise InputError for parts of a problem that MPC does not support."""
     if not isinstance(problem, Problem):
         raise InputError("problem", got=type(problem).__name__, expected="a Problem")
     if not problem.has_model:
@@ -350,9 +349,9 @@ def _check(problem: Problem) -> None:
 
 
 def _staying(problem: Problem, xs: Array, us: Array) -> Staying | None:
-    """Regulation at the problem's end: Bryson's weights along the plan, in the unit of its mean cost a step.
+    """Return the regulation at the problem's end, with Bryson's weights along the plan, in units of its mean step cost.
 
-    None where it has no goal there.
+    The result is None if the problem has no goal at its end.
     """
     model, bounds = problem.model, problem.bounds
     at_end = [c for c in problem.kept_goals if c.knots == LAST]
@@ -378,10 +377,10 @@ def _staying(problem: Problem, xs: Array, us: Array) -> Staying | None:
 
 
 def _fixed_point(problem: Problem, x: Array, u: Array) -> tuple[Array, Array]:
-    """The state at rest nearest to `x` (nx,), and its input, that a step leaves where it is, with the goal's entries.
+    """Return the state at rest nearest to `x` (nx,) that a step keeps, with the goal's entries, and its input.
 
-    By the input alone where that is enough, else by Newton's method, each step the shortest; LQR refuses what is no
-    fixed point in the end.
+    The first iteration changes only the input. Others are Newton steps of minimal length. LQR raises an error if the
+    result is not a fixed point.
     """
     model = problem.model
     x, free = np.where(np.isnan(problem.goal), x, problem.goal), np.isnan(problem.goal)
@@ -416,7 +415,7 @@ def _first_plan(problem: Problem, plan: Any) -> tuple[Array, Array]:
 
 
 def _sampled(problem: Problem, solution: Solution) -> tuple[Array, Array]:
-    """Its states and inputs at the problem's steps; of another horizon the last ones where it ends before."""
+    """Sample a solution at the problem's steps. If its horizon is shorter, its last values are repeated."""
     if len(solution.xs[0]) != problem.nx:
         raise InputError("plan", got=f"a Solution of {len(solution.xs[0])} states", expected=f"one of {problem.nx}")
     h = problem.time_step

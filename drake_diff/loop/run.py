@@ -1,10 +1,10 @@
-"""A controller on the discrete plant, through sensor, estimator and actuator, under pushes, with a fallback.
+"""Closed-loop simulation on the discrete plant, with sensor, estimator, controller, actuator, pushes and a fallback.
 
     x_k -> sensor -> estimator -> controller -> actuator -> plant -> x_(k+1)
 
-The controller has its own period, a whole number of the plant's steps. All randomness comes from one seed. The time
-that the controller takes is measured. What is simulated depends on it only where a latency budget is given: an answer
-that comes after it is not used, and the last command is held.
+The controller has its own period, a whole number of the plant's steps. All randomness comes from one seed. The
+computation time of the controller is measured. It affects the simulation only if a latency budget is given: a late
+answer is not used, and the last command is held.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from drake_diff.motion.rollout import Meter, Rollout
 
 Controller = Callable[[Array, float], Any]  # u (nu,) = controller(x (nx,), t [s])
 OK, LATE = "ok", "late"
-FAILED, UNSEEN = "the controller failed:", "nothing was seen for"  # how its status begins
+FAILED, UNSEEN = "the controller failed:", "nothing was seen for"  # prefixes of the controller's status
 MODES = ("hold", "damp", "stop")
 Reader = Callable[[int, Array], Array | None]
 Drive = Callable[[int, Array], Array]
@@ -49,16 +49,16 @@ Drive = Callable[[int, Array], Array]
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """Measures the state with noise and bias, at its own rate, late, and with samples lost.
+    """A sensor that measures the state with noise, bias, its own rate, a delay and lost samples.
 
-    A sample is y = plus(x, bias + noise N(0, 1)), on the tangent space of the state. The first state is taken to be
-    known until a sample arrives.
+    A sample is y = plus(x, bias + noise N(0, 1)), on the tangent space of the state. Until a sample arrives, the first
+    state is assumed to be known.
 
     Args:
         noise: standard deviation, a number or (nt,), in the units of the tangent space.
         bias: a number or (nt,), in the same units.
-        delay: by how many of the controller's steps a sample is late.
-        every: a sample is taken in each `every`-th step of the controller.
+        delay: the delay of a sample in controller steps.
+        every: a sample is taken in each `every`-th controller step.
         dropout: the probability that a sample is lost, in [0, 1).
 
     Raises:
@@ -81,14 +81,14 @@ class Sensor:
         fraction("Sensor.dropout", self.dropout)
 
     def start(self, space: TangentSpace, random: np.random.Generator) -> Reader:
-        """A function of (k, x_k) that gives what arrives at step k, None where nothing does."""
+        """Return a function of (k, x_k) that returns the sample that arrives at step k, or None."""
         noise, bias = scale("Sensor.noise", self.noise, space.size), np.broadcast_to(self.bias, space.size)
         if np.any(noise < 0):
             raise InputError("Sensor.noise", got=self.noise, expected="numbers of at least 0")
         samples: list[Array | None] = []
 
         def read(k: int, x: Array) -> Array | None:
-            # Drawn in every step, so that another rate or dropout leaves the noise of the other steps as it is.
+            # Random numbers are drawn in every step, so that rate and dropout do not affect the noise of other steps.
             shift, received = noise * random.standard_normal(space.size), random.uniform() >= self.dropout
             due = k % self.every == 0 and (received or k == 0)
             samples.append(space.plus(x, bias + shift) if due else None)
@@ -98,19 +98,19 @@ class Sensor:
 
 
 class Estimator(Protocol):
-    """Makes one estimate a step. `start` is called before each run, so that nothing is left of the run before."""
+    """A protocol for estimators, with one estimate per step. `start` is called before each run to reset the state."""
 
     def start(self, x0: Array) -> None:
-        """Forget everything; `x0` (nx,) is the state that is known to begin with."""
+        """Reset the estimator. `x0` (nx,) is the initial state, which is known."""
         ...
 
     def estimate(self, observation: Array | None, u: Array | None) -> Array:
-        """(nx,) from what arrived, None where nothing did, and the last command (nu,), None at first."""
+        """Return (nx,) the estimate from the new sample, or None, and the last command (nu,), or None at first."""
         ...
 
 
 class Hold:
-    """The estimator that takes the last sample for the state.
+    """An estimator that returns the last sample.
 
     Example:
         >>> hold = dd.loop.Hold()
@@ -131,13 +131,13 @@ class Hold:
 
 
 class Predictor:
-    """The estimator that rolls the last sample forward through a model, under the commands since it was taken.
+    """An estimator that simulates a model from the last sample on, under the commands since that sample.
 
-    It makes up for a known delay of the sensor, and for lost samples.
+    It compensates for a known delay of the sensor and for lost samples.
 
     Args:
         model: the plant as the estimator knows it.
-        delay: how many steps old a sample is when it arrives.
+        delay: the age of a sample when it arrives, in steps.
 
     Raises:
         InputError: `delay` is not a whole number of at least 0.
@@ -176,14 +176,14 @@ class Predictor:
 
 @dataclass(frozen=True, eq=False)
 class Actuator:
-    """Applies commands late, at its own rate, limited, weaker, and through a lag of first order.
+    """An actuator that applies commands with a delay, its own rate, limits, a factor and a first-order lag.
 
-    In each step of the controller, of length H, what is applied moves towards the command that has arrived:
-    u+ = u + (1 - exp(-H / lag)) (strength clip(command, lower, upper) - u). Before that, nothing is applied.
+    In each controller step of length H, the applied input moves towards the command that has arrived:
+    u+ = u + (1 - exp(-H / lag)) (strength clip(command, lower, upper) - u). It is zero before a command arrives.
 
     Args:
-        delay: by how many of the controller's steps a command is late.
-        every: a command is taken over in each `every`-th step of the controller.
+        delay: the delay of a command in controller steps.
+        every: a command is accepted in each `every`-th controller step.
         lower, upper: limits of the commands, numbers or (nu,), in the units of the input.
         strength: factor on the commands, a number or (nu,).
         lag: time constant [s].
@@ -212,7 +212,7 @@ class Actuator:
             raise InputError("Actuator.lower", got=self.lower, expected=f"at most upper, {self.upper!r}")
 
     def start(self, nu: int, period: float) -> Drive:
-        """A function of (k, command (nu,)) that gives what is applied in step k, (nu,)."""
+        """Return a function of (k, command (nu,)) that returns the input (nu,) applied in step k."""
         strength = scale("Actuator.strength", self.strength, nu)
         follow = 1.0 if self.lag == 0 else 1 - np.exp(-period / self.lag)
         commands: list[Array] = []
@@ -230,16 +230,16 @@ class Actuator:
 
 @dataclass(frozen=True, eq=False)
 class Fallback:
-    """Takes over where the controller fails, or where nothing was measured for more than `patience` steps.
+    """A controller that takes over if the main one fails, or after more than `patience` steps without a measurement.
 
     Args:
-        mode: "hold" repeats the last command, "damp" applies -damping v at the actuated joints, with v from the
-            estimate, "stop" applies nothing. Servos are commanded to where their joints are, by both.
-        patience: how many steps of the controller without a measurement are borne.
-        damping: of "damp", [N s/m] or [N m s/rad].
+        mode: "hold" repeats the last command. "damp" applies -damping v at the actuated joints, with v from the
+            estimate. "stop" applies nothing. "damp" and "stop" command servos to the positions of their joints.
+        patience: the largest number of controller steps without a measurement that is tolerated.
+        damping: the coefficient of "damp", [N s/m] or [N m s/rad].
 
     Raises:
-        UnknownNameError: there is no such mode.
+        UnknownNameError: the mode does not exist.
         InputError: `patience` is not a whole number of at least 0.
 
     Example:
@@ -257,7 +257,7 @@ class Fallback:
         count("Fallback.patience", self.patience, 0)
 
     def command(self, model: Model, estimate: Array, last: Array) -> Array:
-        """(nu,) in place of the controller's."""
+        """Return (nu,) the command in place of the controller's."""
         if self.mode == "hold":
             return last
         if self.mode == "stop" or not model.nu or model.inputs.commanded.any():  # servos damp by their own gains
@@ -268,7 +268,7 @@ class Fallback:
 
 @dataclass(frozen=True, eq=False)
 class Push:
-    """A blow at the centre of mass of a body.
+    """An impulse at the centre of mass of a body.
 
     Args:
         body: the body's name.
@@ -287,17 +287,17 @@ class Push:
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """What stands around a controller: by default a perfect sensor and actuator.
+    """The components around a controller. By default, sensor and actuator are ideal.
 
     Args:
-        sensor: what is measured of the state.
-        estimator: makes the state that the controller is given from what was measured.
-        actuator: what becomes of the controller's commands.
-        fallback: what takes over where the controller fails; None ends the run there.
-        pushes: blows to the plant.
-        substeps: how many of the plant's steps one step of the controller takes.
-        latency_budget: [s] that the controller may take for an answer. Where it takes longer, its last command in time
-            is held (at first nothing is applied), and the event says so. None waits for every answer.
+        sensor: measures the state.
+        estimator: computes the controller's state from the measurements.
+        actuator: applies the controller's commands.
+        fallback: takes over if the controller fails; None ends the run at the failure.
+        pushes: impulses on the plant.
+        substeps: the number of the plant's steps in one controller step.
+        latency_budget: [s] that the controller may take for an answer. If it takes longer, its last timely command is
+            held (at first nothing is applied), and an event reports this. None waits for every answer.
 
     Example:
         >>> dd.loop.Loop(sensor=dd.loop.Sensor(noise=0.01), substeps=2).substeps
@@ -314,7 +314,7 @@ class Loop:
 
 
 class LoopEvent(NamedTuple):
-    """Something that happened at simulated time `t` [s]: fallback, recovery, push, late or failure."""
+    """An event at the simulated time `t` [s]: fallback, recovery, push, late or failure."""
 
     t: float
     kind: str
@@ -323,7 +323,7 @@ class LoopEvent(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LoopRows:
-    """What a loop recorded: a row for each step of the controller, of `xs` and `us` for each of the plant's."""
+    """The recorded rows of a loop, one for each controller step. `xs` and `us` have one for each step of the plant."""
 
     xs: Array  # (n+1, nx)
     us: Array  # (n, nu)
@@ -331,8 +331,8 @@ class LoopRows:
     estimates: Array  # (N, nx)
     commands: Array  # (N, nu)
     applied: Array  # (N, nu)
-    controller_status: tuple[str, ...]  # "ok", "late", or why the fallback was in charge
-    latencies: Array  # (N,) [s] that the controller took, on this machine
+    controller_status: tuple[str, ...]  # "ok", "late", or why the fallback was active
+    latencies: Array  # (N,) [s] the computation times of the controller on this machine
     ended: str
     failed_part: str
     controller_error: str
@@ -340,11 +340,11 @@ class LoopRows:
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop(LoopRows, ShowsItsRepr):
-    """What happened in a loop: one row for each step of the controller, in read-only arrays; `save` writes it.
+    """The result of a closed-loop simulation, with one row per controller step in read-only arrays; `save` writes it.
 
-    `xs` and `us` are the plant's own steps, and `motion` has what was measured along them. `ended` is "" or says when
-    and why the run broke off. `failed_part` is "" or the part of the loop whose exception ended it: "controller",
-    "sensor" or "estimator"; `controller_error` is the type and message of the controller's.
+    `xs` and `us` are the plant's own steps, and `motion` has the measures along them. `ended` is "", or says when and
+    why the run ended early. `failed_part` is "", or the part of the loop whose exception ended it: "controller",
+    "sensor" or "estimator". `controller_error` is the type and message of the controller's exception.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -363,12 +363,12 @@ class ClosedLoop(LoopRows, ShowsItsRepr):
 
     @property
     def latency_budget(self) -> float | None:
-        """[s] that the controller was given for an answer; None where every answer was waited for."""
+        """The time [s] that the controller had for an answer, or None without a limit."""
         return self.loop.latency_budget
 
     @property
     def late(self) -> int:
-        """How many of the controller's answers took longer than the budget; 0 without one."""
+        """The number of the controller's answers that took longer than the budget, or 0 without a budget."""
         return 0 if self.latency_budget is None else int(np.sum(self.latencies > self.latency_budget))
 
     def __repr__(self) -> str:
@@ -383,7 +383,7 @@ class ClosedLoop(LoopRows, ShowsItsRepr):
 
 
 def name_of(component: Any) -> str:
-    """What a controller, sensor or estimator is called: of a user's function or class its name alone."""
+    """Return the description of a controller, sensor or estimator, or only the name of a user's function or class."""
     if type(component).__module__.split(".")[0] == __name__.split(".")[0]:
         return repr(component)
     return str(getattr(component, "__qualname__", type(component).__qualname__))
@@ -392,21 +392,21 @@ def name_of(component: Any) -> str:
 def closed_loop(
     model: Model, controller: Controller, x0: ArrayLike, num_steps: int, loop: Loop | None = None, *, seed: int = 0
 ) -> ClosedLoop:
-    """Simulate a controller on the plant, with all that stands around it.
+    """Simulate a controller on the plant, together with the components of a loop.
 
     Args:
         model: the plant.
-        controller: u (nu,) = controller(x (nx,), t [s]). Its method `start(x0)`, where it has one, is called first;
-            its attribute `status`, where it has one, is recorded after each step.
+        controller: u (nu,) = controller(x (nx,), t [s]). Its method `start(x0)`, if it has one, is called first. Its
+            attribute `status`, if it has one, is recorded after each step.
         x0: (nx,) the first state.
-        num_steps: how many steps of the controller.
-        loop: sensor, estimator, actuator, fallback and pushes; ideal ones where None.
-        seed: of all randomness. The same seed gives the same run.
+        num_steps: the number of controller steps.
+        loop: sensor, estimator, actuator, fallback and pushes; None for ideal ones.
+        seed: the seed of all randomness. The same seed gives the same run.
 
     Returns:
-        The motion, and what was measured, estimated, commanded and applied. A step that the plant cannot take, a sensor
-        or estimator that raises, or a controller that does or answers nonsense without a fallback, ends the run:
-        `ended` says why.
+        The motion, and what was measured, estimated, commanded and applied. The run ends early if the plant cannot take
+        a step, if the sensor or the estimator raises an error, or if the controller raises an error or gives an invalid
+        answer and there is no fallback. `ended` says why.
 
     Raises:
         ShapeError, NonFiniteError: `x0` or an impulse is not an array of the right shape of finite numbers.
@@ -425,16 +425,16 @@ def closed_loop(
 
 
 def replayed(rows: LoopRows, model: Model, controller: Controller | None, loop: Loop, seed: int) -> ClosedLoop:
-    """Each part of a loop with the recorded `rows` as its inputs: what it makes of them, for comparison.
+    """Run each part of a loop on the recorded `rows` as its inputs, and return the outputs for comparison.
 
-    So no error of a part reaches another one, nor the next step of the plant. What was recorded is not executed but
-    given where `controller` is None, and where `loop` has `Recorded` parts.
+    An error of a part thus affects neither another part nor the next step of the plant. Recorded outputs replace a part
+    that is not executed: the controller if `controller` is None, and the `Recorded` parts of `loop`.
     """
     return _Replay(rows, model, controller, loop, seed).result(rows.xs[0], len(rows.commands))
 
 
 class OpenLoop:
-    """Plays inputs whatever the state is: u = us[k], k = round(t / time_step), the last one held after the end.
+    """A controller that plays inputs back: u = us[k], k = round(t / time_step). The last input is held after the end.
 
     Args:
         us: (N, nu) the inputs.
@@ -462,24 +462,24 @@ class OpenLoop:
 
 
 class Recorded:
-    """A sensor, estimator or actuator that gives what one of a user's gave: `rows`, one for each step."""
+    """A sensor, estimator or actuator that plays back the recorded `rows` of a user's part, one per step."""
 
     def __init__(self, rows: Array):
         self.rows, self.count = rows, 0
 
     def start(self, *_: Any) -> Callable[[int, Any], Array | None]:
-        """Begin with the first row; a function of (k, ...) that gives row k, None where it is all NaN."""
+        """Begin with the first row. Return a function of (k, ...) that returns row k, or None if it is all NaN."""
         self.count = 0
         return lambda k, _: None if self.rows.shape[1] and np.all(np.isnan(self.rows[k])) else self.rows[k]
 
     def estimate(self, *_: Any) -> Array:
-        """The next row."""
+        """Return the next row."""
         self.count += 1
         return self.rows[self.count - 1]
 
 
 class _LoopRun:
-    """One run under way."""
+    """A simulation in progress."""
 
     def __init__(self, model: Model, controller: Controller, loop: Loop, seed: int):
         random = np.random.default_rng(count("seed", seed, 0, LARGEST_SEED))
@@ -508,7 +508,7 @@ class _LoopRun:
             try:
                 if hasattr(component, "start"):
                     component.start(x0)
-            except Exception as error:  # as one of its first call
+            except Exception as error:  # treated like an error of the first call
                 self.start_errors[name] = error
         meter, xs = Meter(self.model), [x0]
         us: list[Array] = []
@@ -560,17 +560,17 @@ class _LoopRun:
         )
 
     def _given(self, name: str, k: int, made: Any) -> Any:
-        """What goes on to the next part of the loop: what was made."""
+        """Return the input of the next part of the loop, here the output `made` of this part."""
         return made
 
     def _finish(self) -> None:
-        """Say of a run that has ended what none of its parts says again."""
+        """Complete a run that has ended; a replay adds the recorded failure of a part."""
 
     def _decide(self, k: int, x: Array) -> Array | None:
-        """What the actuator applies in step k; None where the run ends."""
+        """Return the input that the actuator applies in step k, or None if the run ends."""
         fallback, t = self.loop.fallback, k * self.period
         last, component = self._given("commands", k - 1, self.rows[-1][2]) if self.rows else None, "sensor"
-        try:  # they may be a user's code, as the controller
+        try:  # sensor and estimator may be a user's code, like the controller
             seen = self.read(k, x)
             if seen is not None:
                 seen = array_with_gaps("the measurement", seen, x.shape)
@@ -615,14 +615,14 @@ class _LoopRun:
         return np.asarray(self._given("applied", k, applied))
 
     def _command(self, estimate: Array, t: float) -> tuple[Array | None, str, float]:
-        """The controller's answer, or None where it has none; its status; and the time that it took [s]."""
+        """Return the controller's command (None without one), its status, and its computation time [s]."""
         begin = perf_counter()
         try:
             if "controller" in self.start_errors:
                 raise self.start_errors["controller"]
             command = finite_array("the controller's command", self.controller(np.array(estimate), t), (self.model.nu,))
             status = str(getattr(self.controller, "status", OK))
-        except Exception as error:  # it is a user's code: whatever it raises is a failure of the controller, not ours
+        except Exception as error:  # a user's code may raise anything, which is a failure of the controller, not ours
             self.controller_error = f"{type(error).__name__}: {error}"
             reason = "it is not finite" if isinstance(error, NonFiniteError) else self.controller_error
             return None, f"{FAILED} {reason}", perf_counter() - begin
@@ -633,7 +633,7 @@ class _LoopRun:
         self.events.append(LoopEvent(k * self.period, "failure", why))
 
     def _pushed(self, k: int, x: Array) -> Array:
-        """The state with the velocity that pushes at plant step k give it: M dv = J' p."""
+        """Return the state after the pushes at plant step k, which change its velocity by dv with M dv = J' p."""
         plant, context = self.model.plant, self.model.double.context
         for push_step, body, impulse in self.pushes:
             if push_step == k:
@@ -650,7 +650,7 @@ class _LoopRun:
 
 
 class _Replay(_LoopRun):
-    """A run whose parts are given what was recorded."""
+    """A run whose parts get recorded inputs."""
 
     def __init__(self, rows: LoopRows, model: Model, controller: Controller | None, loop: Loop, seed: int):
         self.recorded, self.is_given = rows, controller is None
@@ -667,7 +667,7 @@ class _Replay(_LoopRun):
             command, status, _ = super()._command(estimate, t)
             return command, status, taken
         status = rows.controller_status[k]
-        if status == LATE or status.startswith(UNSEEN):  # which follow from the other rows
+        if status == LATE or status.startswith(UNSEEN):  # these follow from the other rows
             status = OK
         return None if status.startswith(FAILED) else rows.commands[k], status, taken
 

@@ -1,4 +1,4 @@
-"""From a problem to a solution: collocation, shooting and iLQR, each solution measured again."""
+"""Trajectory optimization by collocation, shooting and iLQR, with independent checks of each solution."""
 
 from drake_diff._base import attach_stub as _attach_stub
 

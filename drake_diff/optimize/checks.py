@@ -1,4 +1,4 @@
-"""What is checked of a motion: a value, its tolerance and a verdict for everything that a problem asks."""
+"""Checks of a motion: each has a measured value, a tolerance and a verdict."""
 
 import math
 from collections.abc import Iterable
@@ -9,22 +9,22 @@ from drake_diff._base.values import ShowsItsRepr
 from drake_diff.optimize import messages
 
 Verdict = Literal["pass", "fail", "undecided"]
-PLAN = "plan"  # the plant of a check of the states and inputs themselves
+PLAN = "plan"  # the `plant` of checks that use the solver's own states and inputs
 COLUMNS = ("verdict", "what", "where", "plant", "feedback", "value", "tolerance", "unit")
 ORDER: dict[str, int] = {"fail": 0, "undecided": 1, "pass": 2}
 
 
 @dataclass(frozen=True)
 class Check:
-    """One measured value of a motion beside its tolerance.
+    """A measured value of a motion together with its tolerance.
 
     Attributes:
-        what: What is measured: "goal", "bound", "constraint", "defect", "penetration", "energy", "derivative", ...
-        where: The state, constraint or geometry with the largest value, and when.
-        plant: "plan" for the solver's own states, else the plant in which the plan is followed.
-        feedback: The feedback that follows the plan there; None open loop.
-        value, tolerance: In `unit`; `value` is infinite where it could not be measured.
-        verdict: "pass", "fail" or "undecided", which does not pass.
+        what: The measured quantity: "goal", "bound", "constraint", "defect", "penetration", "energy", "derivative", ...
+        where: The state, constraint or geometry with the largest value, and the time of this value.
+        plant: "plan" for the solver's own states, or the plant in which the plan is replayed.
+        feedback: The feedback under which the plan is replayed, or None for an open-loop replay.
+        value, tolerance: Both in `unit`. `value` is infinite if it could not be measured.
+        verdict: "pass", "fail" or "undecided". "undecided" does not count as passing.
 
     Example:
         >>> print(check("goal", "hinge_q", 0.2, 0.05, "rad"))
@@ -47,7 +47,7 @@ class Check:
 
     @property
     def ratio(self) -> float:
-        """`value` over `tolerance`."""
+        """`value` divided by `tolerance`."""
         if self.value <= 0:
             return 0.0
         return self.value / self.tolerance if self.tolerance > 0 else math.inf
@@ -59,7 +59,7 @@ class Check:
 def check(
     what: str, where: str, value: float, tolerance: float, unit: str = "1", verdict: Verdict | None = None
 ) -> Check:
-    """A check of the plan itself, which passes where `value` is at most `tolerance`; NaN is infinitely far."""
+    """Return a check of the plan itself, which passes if `value` <= `tolerance`. NaN counts as infinite."""
     value = math.inf if math.isnan(value) else float(value)
     return Check(
         what, where, PLAN, None, value, float(tolerance), unit, verdict or ("pass" if value <= tolerance else "fail")
@@ -67,14 +67,14 @@ def check(
 
 
 class Checks(list[Check], ShowsItsRepr):
-    """Checks, the worst first; printed as a table."""
+    """A list of checks, sorted from worst to best, that prints as a table."""
 
     def __init__(self, checks: Iterable[Check] = ()):
         super().__init__(sorted(checks, key=lambda c: (ORDER[c.verdict], -c.ratio)))
 
     @property
     def failing(self) -> list[Check]:
-        """Those that do not pass."""
+        """The checks that do not pass."""
         return [c for c in self if not c.passes]
 
     def __str__(self) -> str:

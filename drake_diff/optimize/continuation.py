@@ -1,9 +1,9 @@
-"""Plans through contact from a guess that makes none: stages of softer contact, then the true plant.
+"""Continuation through contact, for an initial guess that makes no contact.
 
-What does not touch has no gradient. So `solve_continuation` first solves the same problem with contact at a distance:
-on the plant with a force added (`soft_contact`), or by inverse dynamics (`relaxed`), of a shorter reach in each stage.
-A stage only warms up the next: the schedule goes on if it fails. Of relaxed stages the true plant follows each under
-feedback: the one that it follows best is where the search on the true plant begins.
+Bodies that do not touch have no gradient. `solve_continuation` therefore first solves the same problem with contact
+that acts at a distance, either on the plant with an added force (`soft_contact`) or by inverse dynamics (`relaxed`).
+The distance shrinks in each stage. A stage only warm-starts the next one, so that the schedule continues if it fails.
+The true plant tracks each relaxed stage under feedback, and its own search starts from the motion that tracks best.
 """
 
 import math
@@ -40,34 +40,34 @@ from drake_diff.optimize.relaxed_contact import RelaxedPlant, RelaxedSearch, Sof
 
 @dataclass(frozen=True)
 class SoftOptions:
-    """Stages on the plant with a force at a distance."""
+    """Options of the stages on a plant with an added force that acts at a distance."""
 
-    iterations: int = 30  # of a stage
-    tolerance: float = 1e-4  # of a stage, which is a guess for the next
-    reach: float = 3.0  # the first distance is this part of the gap, where the force is e^-3 = 5 % of that at touching
-    shorter: float = 3.0  # each distance is this part of the one before
-    # No distance is shorter than what crosses the gap L at 4 L / T moves in a step: it would be met only by chance.
+    iterations: int = 30  # per stage
+    tolerance: float = 1e-4  # per stage, as a stage is only the initial guess of the next one
+    reach: float = 3.0  # first distance = gap / reach; the force across the gap is then e^-3 = 5 % of that at contact
+    shorter: float = 3.0  # each distance is the previous one divided by this number
+    # No distance is shorter than a step at the speed 4 L / T across the gap L: contact would only be met by chance.
     fastest: float = 4.0
-    # h^2 k / m of the stiffest stage: at 4 the explicit force is unstable; where it is weak, true contact, which jumps,
-    # does the work, and the stage is as rough as the true plant.
+    # h^2 k / m of the stiffest stage. At 4 the explicit force is unstable. A weak force leaves the load to true
+    # contact, which is discontinuous, and the stage is then as rough as the true plant.
     largest_stiffness: float = 0.4
-    nudge: float = 10.0  # how many gaps the force at x0 alone would move what it acts on, were it to last
+    nudge: float = 10.0  # displacement, in gaps, by the force at x0 if it acted for the whole horizon
 
 
 @dataclass(frozen=True)
 class RelaxedOptions:
-    """Stages by inverse dynamics with relaxed contact."""
+    """Options of the stages by inverse dynamics with relaxed contact."""
 
-    stages: int = 5  # each reach is half of the one before
-    iterations: int = 60  # of a stage
-    reach: tuple[float, float] = (0.01, 0.1)  # [m] the smallest and the largest of the first stage
-    nearest: float = 6.0  # where nothing touches, the first reach is this part of the nearest gap
-    slip: float = 0.1  # [m/s] in the first stage
-    least_slip: float = 0.02  # [m/s] in any
-    rebound: float = 0.1  # [m/s] contact that parts faster than twice that does not push
-    share: float = 1 / 3  # of its weight that pushes a body which just touches
-    without_gravity: float = 1.0  # [m/s^2]
-    # What the whole range of an input is worth to the regulator, where that of a state is 1; at the last it rests.
+    stages: int = 5  # each reach is half of the previous one
+    iterations: int = 60  # per stage
+    reach: tuple[float, float] = (0.01, 0.1)  # [m] bounds of the first stage's reach
+    nearest: float = 6.0  # without contact, the first reach is the smallest gap divided by this number
+    slip: float = 0.1  # [m/s] slip speed of the friction law in the first stage
+    least_slip: float = 0.02  # [m/s] smallest slip speed of all stages
+    rebound: float = 0.1  # [m/s] bodies that separate faster than twice this speed do not push each other
+    share: float = 1 / 3  # force on a body at first contact, as a fraction of its weight
+    without_gravity: float = 1.0  # [m/s^2] in place of gravity if the model has none
+    # Regulator cost of an input's full range; a state's full range costs 1. The last weight disables the feedback.
     weights: tuple[float, ...] = (0.1, 10.0, 1e9)
 
 
@@ -78,12 +78,11 @@ Stages = tuple[SoftContact, ...] | RelaxedPlant
 
 @dataclass(frozen=True)
 class StageLog:
-    """What one stage did; `distance` [m] and `stiffness` [N/m] are None for the true plant.
+    """The log of one stage of a continuation.
 
-    They are those of a SoftContact, or of relaxed contact, which `kind` says.
-
-    `status` is an outcome of iLQR or "refused: ..."; `goal_error` is the stage's own and `gradient` that of
-    its last step.
+    `distance` [m] and `stiffness` [N/m] belong to a SoftContact or to relaxed contact, as `kind` says. They are None
+    for the true plant. `status` is an outcome of iLQR or "refused: ...". `goal_error` is that of the stage's own
+    motion, and `gradient` is that of its last step.
     """
 
     kind: str
@@ -109,10 +108,10 @@ def solve_continuation(
 ) -> tuple[NlpResult, Array, Array, tuple[StageLog, ...]]:
     """Solve `problem` by iLQR through the `stages` and then on the true plant, from xs (N+1, nx) and us (N, nu).
 
-    Stages of SoftContacts take the inputs, relaxed ones the positions. Gives what `solve_ilqr` gives, of the true
-    plant, and a log for each stage. `limits.time_limit` is that of all stages together; if it or Ctrl-C ends one, the
-    rest are left out and the motion is the true plant's rollout. Raises GradientError or SimulationError if the true
-    plant refuses.
+    SoftContact stages start from the inputs, and relaxed stages start from the positions. Returns the result, states
+    and inputs of `solve_ilqr` on the true plant, and a log for each stage. `limits.time_limit` applies to all stages
+    together. If it or Ctrl-C ends a stage, the other stages are skipped, and the motion is the true plant's rollout.
+    Raises GradientError or SimulationError if a step of the true plant fails or has no derivative.
     """
     with noted_interrupts() as interrupted:
         through = _Stages(problem, limits, report, interrupted)
@@ -129,7 +128,7 @@ def solve_continuation(
 
 
 class _Stages:
-    """One stage after the other; `xs`, `us` are the motion of the true plant so far, `ended` why no other follows."""
+    """A sequence of stages. `xs`, `us` are the true plant's motion so far, and `ended` is why no further stage runs."""
 
     def __init__(self, problem: Problem, limits: Limits, report: Report | None, interrupted: threading.Event):
         self.problem, self.limits, self.report, self.interrupted = problem, limits, report, interrupted
@@ -148,7 +147,7 @@ class _Stages:
         self._say(str(self.logs[-1]))
 
     def soften(self, us: Array, stages: Sequence[SoftContact]) -> None:
-        """By iLQR on the plant with a force at a distance beside its contact."""
+        """Run the stages by iLQR on the plant with an added force that acts at a distance."""
         problem, limits, x0 = self.problem, self.limits, np.array(self.problem.x0)
         for contact in stages:
             softer = replace(problem, system=softened(problem.model, contact))
@@ -168,7 +167,7 @@ class _Stages:
         self.xs, self.us = roll_states(problem.model, x0, us), us
 
     def relax(self, xs: Array, us: Array, plant: RelaxedPlant) -> None:
-        """By inverse dynamics with relaxed contact from xs (N+1, nx); then the true plant follows a stage."""
+        """Run the relaxed stages from xs (N+1, nx), then keep the true plant's motion that tracks a stage best."""
         problem, followed = self.problem, list[tuple[float, Array, Array]]()
         try:
             with until_set(self.interrupted):
@@ -185,7 +184,7 @@ class _Stages:
             self.ended = Outcome.INTERRUPTED if self.interrupted.is_set() else Outcome.TIME_LIMIT
 
     def _relax(self, xs: Array, plant: RelaxedPlant, followed: list[tuple[float, Array, Array]]) -> None:
-        """Add to `followed` (how far it is from the stage, xs, us) of each motion of the true plant that follows it."""
+        """Append (distance from the stage, xs, us) to `followed` for each true-plant motion that tracks a stage."""
         problem, nq = self.problem, self.problem.model.nq
         search = RelaxedSearch(problem, plant)
         q = np.array(xs[:, :nq])
@@ -211,7 +210,7 @@ class _Stages:
             self.report.say(line)
 
     def on_the_true_plant(self) -> NlpResult:
-        """The stage whose result is told; what is found is `xs`, `us`."""
+        """Solve on the true plant, store its motion in `xs` and `us`, and return the result."""
         problem, limits = self.problem, self.limits
         left = replace(limits, time_limit=self.deadline - now())
         try:
@@ -229,7 +228,7 @@ class _Stages:
 
 
 def check_schedule(problem: Problem, continuation: Any) -> Stages:
-    """The stages before the true plant, from "auto", "relaxed" or a sequence of SoftContacts; refuses what has none."""
+    """Return the stages for "auto", "relaxed" or a sequence of SoftContacts, or raise InputError."""
     if isinstance(continuation, str) and continuation == "auto":
         return default_schedule(problem)
     if isinstance(continuation, str) and continuation == "relaxed":
@@ -242,15 +241,15 @@ def check_schedule(problem: Problem, continuation: Any) -> Stages:
 
 
 def default_schedule(problem: Problem) -> tuple[SoftContact, ...]:
-    """Stages from the model's sizes and masses, the problem's start and duration.
+    """Choose stages from the model's sizes and masses and from the problem's start and duration.
 
-    The reach L is the largest gap at x0 between two bodies that may collide, or the smallest half width of what
-    collides if that is more. The distances are L/3, L/9, ..., down to 4 L / num_steps, what moves at
-    4 L / T passes in a step. The stiffness is such that the force at L alone would move the lightest of what can
-    approach each other, its mass m, by 10 L in the whole time T; but no more than 0.4 m / h^2, h being the time step.
+    The reach L is the largest gap at x0 between two bodies that may collide, or half of the smallest thickness of a
+    collision geometry if that is larger. The distances are L/3, L/9, ..., down to 4 L / num_steps, the motion in one
+    step at the speed 4 L / T. The stiffness is such that the force at L alone would move m, the lightest mass of a pair
+    that can approach, by 10 L in the whole time T. It is at most 0.4 m / h^2, where h is the time step.
     """
     model = problem.model
-    softened(model, SoftContact(1.0, 1.0))  # refuses what cannot be
+    softened(model, SoftContact(1.0, 1.0))  # raises if the model does not support soft contact
     set_state(model.double, problem.x0)
     mass = min((1 / pair.mobility for pair in separations(model.double) if pair.mobility > 0), default=math.inf)
     if not math.isfinite(mass):
@@ -268,7 +267,7 @@ def default_schedule(problem: Problem) -> tuple[SoftContact, ...]:
 
 
 def read_relaxed_plant(problem: Problem) -> RelaxedPlant:
-    """What the stages need to know of the model; InputError where a problem or a model is none of theirs."""
+    """Return the model data of the relaxed stages, or raise InputError if they do not support the problem or model."""
     if not problem.initial_state_is_given:
         raise InputError("continuation", got="'relaxed' with a free initial state", expected="a given initial state")
     plant = problem.model.cache("relaxed plant", lambda: relaxed_plant(problem.model))
@@ -282,9 +281,10 @@ def read_relaxed_plant(problem: Problem) -> RelaxedPlant:
 
 
 def relaxed_schedule(problem: Problem, plant: RelaxedPlant) -> tuple[Softness, ...]:
-    """The stages, from the model's sizes and masses: reaches from half of the thinnest shape or a sixth of the gap.
+    """Choose relaxed stages from the model's sizes and masses.
 
-    What just touches pushes with a third of the lighter one's weight, and no contact is stiffer than the model's own.
+    The first reach is half of the smallest thickness or a sixth of the smallest gap, whichever is larger. The force at
+    first contact is a third of the lighter body's weight, and no contact is stiffer than the model's own.
     """
     model = problem.model
     gap = float(np.min(plant.distances(problem.x0[None, : model.nq])))
@@ -298,8 +298,8 @@ def relaxed_schedule(problem: Problem, plant: RelaxedPlant) -> tuple[Softness, .
 
 
 def _weights(problem: Problem, plant: RelaxedPlant) -> Array:
-    """(P,) [N] the weight of the lighter of the two trees that each pair is of, or what moves it in the time given."""
-    drake, mass = problem.model.plant, dict[int, float]()  # by the tree's first degree of freedom
+    """Return (P,) [N] the weight of the lighter tree of each pair, with 1 m/s^2 in place of zero gravity."""
+    drake, mass = problem.model.plant, dict[int, float]()  # keyed by the tree's first degree of freedom
 
     def tree(body: Any) -> int | None:
         moving = np.flatnonzero(plant.moving(body))
@@ -317,9 +317,9 @@ def _weights(problem: Problem, plant: RelaxedPlant) -> Array:
 
 
 def follow(problem: Problem, xs: Array, us: Array, weight: float) -> tuple[Array, Array] | None:
-    """The true plant as it follows xs (N+1, nx), us (N, nu) under feedback; None where it cannot be stepped along.
+    """Return the true plant's motion that tracks xs (N+1, nx), us (N, nu) under TVLQR, or None if a step fails.
 
-    The feedback weighs states by their ranges along xs, and inputs by theirs and `weight`.
+    States are weighted by their ranges along xs, and inputs by their ranges and `weight`.
     """
     bounds, model = problem.bounds, problem.model
     us = np.clip(us, bounds.u_lower, bounds.u_upper)
@@ -341,7 +341,7 @@ def follow(problem: Problem, xs: Array, us: Array, weight: float) -> tuple[Array
 def _stage_record(
     problem: Problem, result: NlpResult, xs: Array, us: Array
 ) -> tuple[str, int, float | None, float | None, float | None]:
-    """Status, iterations, cost, goal error and gradient of a stage, for its log."""
+    """Return the status, iterations, cost, goal error and gradient of a stage for its log."""
     last = result.iterations[-1]
     numbers = cost_of(problem, result, xs, us), miss_of(problem, xs), last.dual_infeasibility
     cost, error, gradient = (value if math.isfinite(value) else None for value in numbers)

@@ -18,13 +18,13 @@ from drake_diff.pages.scene import BLUE
 from drake_diff.pages.shapes import Drawn, body_path
 
 AXES = (Rgba(0.8, 0.15, 0.1, 0.9), Rgba(0.1, 0.6, 0.15, 0.9), Rgba(0.1, 0.3, 0.85, 0.9))  # x, y, z
-THIN = 0.03  # of an axis or an arrow: its radius
-Colour = tuple[str, str, str]  # of a legend: a colour of CSS, "line", "dot" or "arrow", and what it means
-LARGE = 0.25  # [m] the radius from which on a goal is so translucent that the robot is seen through it
+THIN = 0.03  # radius of an axis or an arrow, as a fraction of its length
+Colour = tuple[str, str, str]  # a legend entry: a CSS colour, "line", "dot" or "arrow", and the meaning
+LARGE = 0.25  # [m] goals with a larger radius are so translucent that the robot stays visible
 
 
 def drawn_goals(plant: Any, context: Any, goals: Iterable[Goal]) -> tuple[Drawn, ...]:
-    """What the `goals` mark, on the bodies of `plant` or in its world; UnknownNameError where it has no such frame."""
+    """Return the markers of `goals` on the bodies of `plant` or in the world. UnknownNameError for an unknown frame."""
     marks = [(mark, not isinstance(goal, Obstacle)) for goal in goals for mark in goal.marks()]
     frames: dict[str, Any] = {}
     for frame in (plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())):
@@ -41,7 +41,7 @@ def drawn_goals(plant: Any, context: Any, goals: Iterable[Goal]) -> tuple[Drawn,
         if not mark.in_world:
             shapes += _shapes(mark, path, pose @ RigidTransform(mark.position), above)
             continue
-        origin = pose @ np.array(mark.position)  # on the body, which may turn as it likes
+        origin = pose @ np.array(mark.position)  # a point on the body; the marker keeps the world's axes
         if path:
             shapes += [replace(shape, origin=origin) for shape in _shapes(mark, path, RigidTransform(), above)]
         else:
@@ -50,7 +50,7 @@ def drawn_goals(plant: Any, context: Any, goals: Iterable[Goal]) -> tuple[Drawn,
 
 
 def _shapes(mark: Mark, path: str, pose: RigidTransform, above: bool) -> list[Drawn]:
-    """The shapes of one mark at `pose` on the body of that path; those of a goal are `above` what hides them."""
+    """Return the shapes of one mark at `pose` on the body at `path`. Shapes `above` are drawn over what hides them."""
     frame = pose @ RigidTransform(RotationMatrix(np.array(mark.rotation)), np.zeros(3))
     colour = Rgba(*mark.colour)
     if above and mark.shape in ("sphere", "box") and max(mark.size) / 2 > LARGE:
@@ -68,14 +68,14 @@ def _shapes(mark: Mark, path: str, pose: RigidTransform, above: bool) -> list[Dr
 
 
 def _arrow(path: str, frame: RigidTransform, along: Array, colour: Rgba) -> list[Drawn]:
-    """A shaft from the origin of `frame` along a vector (3,) [m], and its tip; nothing along a vector of length 0."""
+    """Return a shaft from the origin of `frame` along a vector (3,) [m] and its tip, or [] for a zero vector."""
     length = float(np.linalg.norm(along))
     if length == 0.0:
         return []
     turned = frame @ RigidTransform(RotationMatrix.MakeFromOneVector(along / length, 2), np.zeros(3))
     radius = THIN * length
     middle, end = (turned @ RigidTransform([0.0, 0.0, fraction * length]) for fraction in (0.5, 1.0))
-    tip = end @ RigidTransform(RollPitchYaw(np.pi, 0.0, 0.0), [0.0, 0.0, 4 * radius])  # a cone's apex is its origin
+    tip = end @ RigidTransform(RollPitchYaw(np.pi, 0.0, 0.0), [0.0, 0.0, 4 * radius])  # a cone's origin is its apex
     shaft = _drawn(path, Cylinder(radius, length), middle, colour, length / 2)
     return [shaft, _drawn(path, MeshcatCone(8 * radius, 3 * radius, 3 * radius), tip, colour, 4 * radius)]
 
@@ -85,7 +85,7 @@ def _drawn(path: str, shape: Any, pose: RigidTransform, colour: Rgba, radius: fl
 
 
 def meaning_of(goals: Sequence[Goal]) -> list[Colour]:
-    """What the marks of the `goals` mean, each once."""
+    """Return the legend entries of the marks of `goals`, without duplicates."""
     marks = [mark for goal in goals for mark in goal.marks() if mark.shape != "axes"]
     rows = [(css(Rgba(*mark.colour)), "arrow" if mark.shape == "arrow" else "dot", mark.label) for mark in marks]
     if any(mark.shape == "axes" for goal in goals for mark in goal.marks()):
@@ -94,7 +94,7 @@ def meaning_of(goals: Sequence[Goal]) -> list[Colour]:
 
 
 def colours_of(*, plan: bool, contacts: bool, thrusts: bool) -> list[Colour]:
-    """What is drawn of a motion beside the robot: its path, and where there are any a ghost and forces."""
+    """Return the legend entries of a motion: its path, and the plan and the forces if they are drawn."""
     colours = [(css(BLUE), "dot", "the plan, where it differs from the motion")] if plan else []
     colours.append((css(TRAIL), "line", "path of the centre of mass of the body that moves most"))
     if contacts:
@@ -105,5 +105,5 @@ def colours_of(*, plan: bool, contacts: bool, thrusts: bool) -> list[Colour]:
 
 
 def css(colour: Any) -> str:
-    """A colour of Drake's for a style sheet, without its opacity."""
+    """Format a Drake colour for a style sheet, without its opacity."""
     return f"rgb({', '.join(str(round(255 * channel)) for channel in (colour.r(), colour.g(), colour.b()))})"

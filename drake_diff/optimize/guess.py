@@ -1,6 +1,6 @@
-"""Where a search starts: a line to the goal, a reference, arrays, Drake's trajectories, or a solution on its own knots.
+"""Initial guesses: a line to the goal, a reference, arrays, Drake trajectories, or a solution on its own knots.
 
-What has another length or other knots is stretched to the problem's: its first state is the first, its last the last.
+A guess of another length or with other knots is stretched to the problem's knots, from its first to its last state.
 """
 
 from collections.abc import Sequence
@@ -25,19 +25,19 @@ from drake_diff.optimize.program import Multipliers
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.transcription.collocation import Collocated
 
-ROUNDED = 1e-6  # of the largest input that holds a state: no input
-NOISE = 1e-3  # of the largest input: breaks the symmetry of a guess that is a stationary point
-WANDER = (1.0, 0.3)  # of the way to the goal, or of 1: how far another guess goes from the straight line
+ROUNDED = 1e-6  # inputs below this fraction of the largest holding input count as zero
+NOISE = 1e-3  # noise on a stationary guess, as a fraction of the input limits, to break its symmetry
+WANDER = (1.0, 0.3)  # deviation of a random guess from the straight line, as a fraction of max(1, distance to the goal)
 WAVES = 4
-LONGER = 3.0  # times the first horizon at most, or that part of it at least
+LONGER = 3.0  # largest factor between a random horizon and the first horizon, in both directions
 FORMS = "None, (xs, us), two of Drake's trajectories (state, input) or a Solution"
 
 
 @dataclass(frozen=True, eq=False)
 class Guess:
-    """Where a search starts: xs (N+1, nx), us (N, nu); for collocation also the last input, a horizon, or a motion.
+    """An initial guess: xs (N+1, nx), us (N, nu), and for collocation also the last input, a horizon or a motion.
 
-    Parameters (np,) that are optimized start at the problem's values where it has none.
+    Optimized parameters start at the problem's values if `parameters` (np,) is None.
     """
 
     xs: Array
@@ -51,7 +51,7 @@ class Guess:
 
 
 def first_guesses(problem: Problem | PhasedProblem, method: str, given: Any, seed: int) -> list[Guess]:
-    """One for each phase: of `given`, a solution or one for each, or straight lines."""
+    """Return a guess for each phase, from `given` (a solution, or a guess for each phase) or from straight lines."""
     if isinstance(problem, Problem):
         return [first_guess(problem, method, given, seed)]
     parts: Sequence[Any] = [None] * len(problem.phases)
@@ -67,16 +67,16 @@ def first_guesses(problem: Problem | PhasedProblem, method: str, given: Any, see
 
 
 def other_guess(problem: Problem | PhasedProblem, seed: int, number: int) -> Any:
-    """Another first guess, a random one by `seed`, of each phase where there are several."""
+    """Return a random initial guess by `seed`, or a list of one for each phase."""
     if isinstance(problem, Problem):
         return another_guess(problem, seed, number)
     return [another_guess(phase, seed * len(problem.phases) + i, number) for i, phase in enumerate(_aimed(problem))]
 
 
 def _aimed(problem: PhasedProblem) -> list[Problem]:
-    """The phases, for guesses alone: one that has no goal ends where the next one's first guess begins.
+    """Return the phases for their initial guesses: a phase without a goal ends where the next phase's guess begins.
 
-    That is its state before a linear reset; before another it is the same state, where there are as many.
+    This is the state that a linear reset maps to the next x0, or the next x0 itself if the sizes agree.
     """
     phases = list(problem.phases)
     for switch in problem.switches:
@@ -90,7 +90,7 @@ def _aimed(problem: PhasedProblem) -> list[Problem]:
 
 
 def first_guess(problem: Problem, method: str, given: Any, seed: int) -> Guess:
-    """The guess of a search by `method`: `given`, or a straight line where that is None."""
+    """Return the initial guess of a search by `method`: `given`, or a straight line if `given` is None."""
     continuous = method == "collocation"
     if given is None:
         return _line(problem, method, seed)
@@ -111,7 +111,7 @@ def first_guess(problem: Problem, method: str, given: Any, seed: int) -> Guess:
 
 
 def _of_solution(problem: Problem, given: Solution, continuous: bool) -> Guess:
-    """The motion of a solution with as many states and inputs, on the problem's own knots."""
+    """Return the motion of a solution with the problem's numbers of states and inputs, at the problem's knots."""
     count, motion = problem.num_steps, given.transcribed
     sizes = given.xs.shape[1], given.us.shape[1]
     if sizes != (problem.nx, problem.nu):
@@ -131,16 +131,16 @@ def _of_solution(problem: Problem, given: Solution, continuous: bool) -> Guess:
 
 
 def _means(us: Array, ends: Array) -> Array:
-    """(M, nu) the means of held inputs us (N, nu) between `ends` (M+1,), counted in steps from 0 to N."""
+    """Return (M, nu) the means of held inputs us (N, nu) between `ends` (M+1,), in steps from 0 to N."""
     summed = np.vstack([np.zeros((1, us.shape[1])), np.cumsum(us, axis=0)])
     sums_at_ends = np.array([np.interp(ends, np.arange(len(summed)), column) for column in summed.T]).T
     return np.asarray(np.diff(sums_at_ends, axis=0) / np.diff(ends)[:, None])
 
 
 def sampled(problem: Problem, method: str, given: Any) -> Any:
-    """`given`; of two of Drake's trajectories the arrays that they are at the problem's knots.
+    """Return `given`, with two Drake trajectories sampled at the problem's knots.
 
-    Inputs that are held are taken in the middle of a step.
+    Held inputs are sampled in the middle of each step.
     """
     if not (isinstance(given, (tuple, list)) and any(isinstance(signal, Trajectory) for signal in given)):
         return given
@@ -158,7 +158,7 @@ def sampled(problem: Problem, method: str, given: Any) -> Any:
     if not (np.isfinite(end - start) and end > start):
         raise InputError("initial_guess state", got=f"from {start:g} to {end:g} s", expected="a beginning and an end")
     knots = np.linspace(start, end, problem.num_steps + 1)
-    if method == "collocation" or problem.horizon:  # a free one is collocation's
+    if method == "collocation" or problem.horizon:  # collocation takes a free horizon
         return _values("state", state, knots), _values("input", held, knots), end - start
     return _values("state", state, knots), _values("input", held, (knots[:-1] + knots[1:]) / 2)
 
@@ -169,7 +169,7 @@ def _values(name: str, trajectory: Any, times: Array) -> Array:
 
 
 def _line(problem: Problem, method: str, seed: int) -> Guess:
-    """A straight line to the goal, or the reference, with the problem's inputs, or inputs near zero."""
+    """Return a straight line to the goal or the reference, with the problem's inputs or inputs near zero."""
     xs, followed = _way(problem)
     us = np.array(problem.us)
     if method == "collocation" and followed is None and not us.any() and _keeps_shapes_clear(problem):
@@ -187,9 +187,9 @@ def _line(problem: Problem, method: str, seed: int) -> Guess:
 
 
 def _way(problem: Problem) -> tuple[Array, Array | None]:
-    """(N+1, nx) the straight line to the goal, and where a running cost follows a reference that, bent to the ends.
+    """Return (N+1, nx) a straight line to the goal, or the running cost's reference, bent to meet both ends.
 
-    The inputs (N+1, nu) of the reference are the second, where it has some.
+    The second value has the inputs (N+1, nu) of the reference, or is None without them.
     """
     s, goal = np.linspace(0, 1, problem.num_steps + 1)[:, None], np.array(problem.goal)
     line = problem.x0 + s * (np.where(np.isnan(goal), problem.x0, goal) - problem.x0)
@@ -203,7 +203,7 @@ def _way(problem: Problem) -> tuple[Array, Array | None]:
 
 
 def _keeps_shapes_clear(problem: Problem) -> bool:
-    """Whether shapes keep clear of each other in a motion of driven hinges and slides from rest to rest."""
+    """Return whether a rest-to-rest motion of driven hinges and slides must keep shapes apart."""
     of_shapes = any(isinstance(c.clearance, OfShapes) for c in clearances(problem.kept))
     if not (of_shapes and problem.has_model and problem.optimizes_controls):
         return False
@@ -214,9 +214,9 @@ def _keeps_shapes_clear(problem: Problem) -> bool:
 
 
 def _from_rest_to_rest(problem: Problem) -> tuple[Array, Array]:
-    """The straight line passed along the polynomial of degree 5 that begins and ends at rest, with the efforts for it.
+    """Return the straight line, timed by the quintic polynomial that begins and ends at rest, and its efforts.
 
-    A search that begins far from a motion goes through shapes before it comes to one.
+    A search that begins far from a feasible motion passes through shapes before it finds one.
     """
     model, duration = problem.model, problem.start_horizon
     s, goal = np.linspace(0, 1, problem.num_steps + 1)[:, None], np.array(problem.goal)
@@ -233,7 +233,7 @@ def _from_rest_to_rest(problem: Problem) -> tuple[Array, Array]:
 
 
 def _with_closed_loops(problem: Problem, xs: Array) -> Array:
-    """xs (N+1, nx) with loops closed where the coordinates of the goal let them."""
+    """Return xs (N+1, nx) with closed loops, where the coordinates that the goal fixes allow it."""
     if not problem.has_model or not problem.model.file_facts.held_points:
         return xs
     model = problem.model
@@ -246,10 +246,10 @@ def _with_closed_loops(problem: Problem, xs: Array) -> Array:
 
 
 def another_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:
-    """A random smooth motion about the straight line, for collocation: xs (N+1, nx), us (N+1, nu) and a horizon.
+    """Return a random smooth motion near the straight line for collocation: xs (N+1, nx), us (N+1, nu), a horizon.
 
-    One sine or cosine for each of a few frequencies, with amplitudes from a normal distribution; of two in turn, one
-    stays near the line and one goes far. A free horizon is a random part or multiple of the first one's.
+    The states add a few sines and the inputs are a few cosines with normally distributed amplitudes. Guesses near the
+    line and far from it alternate. A free horizon is the first one times a random factor.
     """
     random = np.random.default_rng([seed, number])
     far, s = WANDER[number % len(WANDER)], np.linspace(0, 1, problem.num_steps + 1)[:, None]
@@ -259,7 +259,7 @@ def another_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:
     waves = [random.standard_normal(problem.nx) * np.sin(j * np.pi * s) / j for j in range(1, WAVES)]
     swings = [random.standard_normal(problem.nu) * np.cos(j * np.pi * s) / (j + 1) for j in range(WAVES)]
     xs = way + far * np.maximum(1.0, np.abs(way[-1] - problem.x0)) * sum(waves)
-    if problem.initial_state_mask.any():  # a first state that is free is another one too
+    if problem.initial_state_mask.any():  # a free initial state is random as well
         xs = xs + far * (1 - s) * np.where(problem.initial_state_mask, random.standard_normal(problem.nx), 0.0)
     us = size * sum(swings)
     if isinstance(problem.system, Model):
@@ -275,10 +275,10 @@ def another_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:
 
 
 def _holding(problem: Problem, xs: Array) -> Array:
-    """(N, nu) the inputs that hold the first state best for a step, within bounds, where they are not all actuators.
+    """Return (N, nu) inputs within bounds that best hold the first state for one step, unless all are actuators.
 
-    Rotors and thrusters without thrust do not steer: a quadrotor that falls moves sideways for none of them. Actuators
-    do, and their guess is 0; that of servos is where their joints are in xs (N+1, nx).
+    Rotors and thrusters do not steer without thrust: no rotor moves a falling quadrotor sideways. Joint actuators do,
+    and their guess is 0. The guess of a servo is the position of its joint in xs (N+1, nx).
     """
     model = problem.model if isinstance(problem.system, Model) else None
     if model is None or model.inputs.plain:

@@ -1,7 +1,7 @@
-"""Functions of points such as the knots z = [x, u] of a motion: values and exact derivatives of many in one call.
+"""Batched values and exact derivatives of functions of points, such as the knots z = [x, u] of a motion.
 
-A function is traced to a CasADi expression where that is possible, and else called point by point with AutoDiffXd.
-Hessians of costs are positive semidefinite: negative eigenvalues are cut to 0.
+A function is traced to a CasADi expression if possible, and otherwise called point by point with AutoDiffXd. Hessians
+of costs are positive semidefinite, because negative eigenvalues are set to 0.
 """
 
 import os
@@ -35,18 +35,18 @@ from drake_diff.optimize.problem.goals import GoalConstraint, WithGoals
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint
 from drake_diff.optimize.problem.problem import Problem
 
-SAME_VALUES = 1e-10  # of the largest value at a knot: the same operations, rounded in another order
-THREAD_WORTH = 500_000  # instructions of 1 to 5 ns; to start a thread costs 50 us
-DIFFERENCE = 1e-5  # of max(1, |z|): of exact Jacobians, known to 1e-12
+SAME_VALUES = 1e-10  # relative to the largest value at a knot; the same operations may be rounded in another order
+THREAD_WORTH = 500_000  # instructions of 1 to 5 ns; starting a thread takes 50 us
+DIFFERENCE = 1e-5  # step of differences, relative to max(1, |z|), of exact Jacobians that are accurate to 1e-12
 Values = Callable[[Array], Array]  # points (K, w) -> (K, m)
 Linearize = Callable[[Array], tuple[Array, Array]]  # -> (K, m), (K, m, w)
-Pattern = tuple[Indices, Indices]  # rows and columns of the nonzeros of a matrix
+Pattern = tuple[Indices, Indices]  # rows and columns of a matrix's nonzeros
 
 
 def trace(f: Callable[[Any, Any], Any], nx: int, probe: Array, wanted: Array) -> Any | Refusal:
-    """The function (x, u) -> (m,) as an SX function of a knot [x, u], or why there is none.
+    """Trace the function (x, u) -> (m,) to an SX function of a knot [x, u], or return the reason why that fails.
 
-    It must give the values `wanted` (P, m) at the knots `probe` (P, nx + nu).
+    It must return the values `wanted` (P, m) at the knots `probe` (P, nx + nu).
     """
     knot = ca.SX.sym("knot", probe.shape[1])
     entries = symbols(knot)
@@ -54,7 +54,7 @@ def trace(f: Callable[[Any, Any], Any], nx: int, probe: Array, wanted: Array) ->
         with np.errstate(all="ignore"):
             result = np.asarray(f(entries[:nx], entries[nx:])).ravel()
             expressions = [entry.sx if isinstance(entry, Symbol) else float(entry) for entry in result]
-    except Exception as error:  # whatever it is that f cannot do with symbols: it need not
+    except Exception as error:  # f need not support symbols, and may raise anything
         return Refusal(f"{type(error).__name__}: {str(error).splitlines()[0][:100] if str(error) else ''}")
     function = ca.Function("traced", [knot], [ca.vertcat(*expressions)])
     if not agrees(function, probe, wanted, SAME_VALUES):
@@ -63,7 +63,7 @@ def trace(f: Callable[[Any, Any], Any], nx: int, probe: Array, wanted: Array) ->
 
 
 class Mapped:
-    """A CasADi function at many points in one call: rows (K, .) in, the nonzeros (K, .) of every output out."""
+    """A CasADi function mapped over points: it takes rows (K, .) and returns the nonzeros (K, .) of every output."""
 
     def __init__(self, function: Any):
         self.function = function
@@ -81,7 +81,7 @@ class Mapped:
         return [np.array(array) for array in arrays]
 
     def _mapped(self, count: int) -> Any:
-        """On as many cores as have enough to do: their threads start anew at every call."""
+        """Map the function to `count` points, on as many threads as are worth starting at every call."""
         f = self.function
         threads = min(os.cpu_count() or 1, count * f.n_instructions() // THREAD_WORTH)
         mapped = f.map(count, *(("thread", threads) if threads > 1 else ()))
@@ -93,10 +93,10 @@ class Mapped:
 
 
 class PointFunction:
-    """m numbers of a point of `width` entries; `why_not` says why it has no exact second derivative, "" if it has.
+    """A function from a point of `width` entries to m numbers.
 
-    One that has none may be `linear` to a search: its second derivatives are taken for 0.
-    `jacobian_at` and `hessian_at`, of the upper triangle, are where the nonzeros of one point are.
+    `why_not` is the reason why it has no exact second derivatives, or "". If it is `linear`, a search takes them as 0.
+    `jacobian_at` and `hessian_at` (upper triangle) are the positions of the nonzeros at one point.
     """
 
     rows: int
@@ -107,31 +107,31 @@ class PointFunction:
     hessian_at: Pattern
 
     def values(self, points: Array) -> Array:
-        """(K, m) at points (K, width)."""
+        """Compute the values (K, m) at points (K, width)."""
         raise NotImplementedError
 
     def jacobian(self, points: Array) -> Array:
-        """(K, nonzeros) of the Jacobians."""
+        """Compute the nonzeros (K, nonzeros) of the Jacobians."""
         raise NotImplementedError
 
     def hessian(self, points: Array, weights: Array, jacobian: Array) -> Array:
-        """(K, nonzeros) of the second derivatives of weights (K, m) times the values, whose `jacobian` is known."""
+        """Compute the Hessians' nonzeros (K, nonzeros) of weights (K, m) times the values; `jacobian` is known."""
         raise NotImplementedError
 
     def linearize(self, points: Array) -> tuple[Array, Array]:
-        """(K, m), and the Jacobians (K, m, width)."""
+        """Compute the values (K, m) and the Jacobians (K, m, width)."""
         dense = np.zeros((len(points), self.rows, self.width))
         dense[:, self.jacobian_at[0], self.jacobian_at[1]] = self.jacobian(points)
         return self.values(points), dense
 
     @cached_property
     def columns(self) -> Indices:
-        """The entries of a point that it depends on."""
+        """The entries of a point that the function depends on."""
         return np.unique(self.jacobian_at[1])
 
 
 class Traced(PointFunction):
-    """A function of which CasADi has the expression; `known` (K, p) are its second argument."""
+    """A function with a CasADi expression. `known` holds its further arguments, each (K, p)."""
 
     def __init__(self, function: Any, *known: Array):
         self.function, self.known = function, known
@@ -175,9 +175,9 @@ class Traced(PointFunction):
 
 
 class Called(PointFunction):
-    """A function that is called, and depends on the entries `depends` of a point, on all where None.
+    """A function that is called, and that depends on the entries `depends` of a point (None: on all entries).
 
-    Its second derivatives are differences of its Jacobians, but of one that is `linear`.
+    Its second derivatives are differences of its Jacobians, or 0 if it is `linear`.
     """
 
     def __init__(
@@ -224,8 +224,8 @@ def _places(sparsity: Any) -> Pattern:
 
 
 def constraint_function(c: Constraint, nx: int, probe: Array) -> PointFunction:
-    """What a constraint limits; `probe` (P, nx + nu) are points [x, u] at which its expression is compared with it."""
-    if isinstance(c, ClearanceConstraint) and isinstance(c.clearance, OfShapes):  # Drake's own have no expression
+    """Return the function that a constraint limits. `probe` (P, nx + nu) are points [x, u] that test its expression."""
+    if isinstance(c, ClearanceConstraint) and isinstance(c.clearance, OfShapes):  # Drake's distances have no expression
         depends, why_not = np.arange(c.clearance.model.nq), "distances between shapes are taken as linear"
         return _called(c, why_not, nx, probe[:0], depends, linear=True)
     values = c.along(probe[:, :nx], probe[:, nx:])
@@ -237,7 +237,7 @@ def constraint_function(c: Constraint, nx: int, probe: Array) -> PointFunction:
 
 
 def knot_function(c: Constraint, nx: int, nu: int, probe: Array) -> PointFunction:
-    """The same of a knot [x, u], but clearances, which have many rows of which few are near, are called."""
+    """Return this function of a knot [x, u]. Clearances are called, as few of their many rows are close."""
     if isinstance(c, ClearanceConstraint):
         return _called(c, "called", nx, np.empty((0, nx + nu)), np.arange(c.clearance.model.nq))
     return constraint_function(c, nx, probe)
@@ -254,7 +254,7 @@ def _called(c: Constraint, why_not: str, nx: int, probe: Array, depends: Indices
 
 
 class Selected(PointFunction):
-    """Entries of a point of `width` numbers."""
+    """The selection of entries from a point of `width` numbers."""
 
     def __init__(self, which: Indices, width: int):
         self.rows, self.width = len(which), width
@@ -271,19 +271,19 @@ class KnotCost(Protocol):
     """A cost at knots (K, n) at times (K,) [s]."""
 
     def values(self, knots: Array, times: Array) -> Array:
-        """(K,)"""
+        """Compute the costs (K,)."""
         ...
 
     def expand(self, knots: Array, times: Array) -> tuple[Array, Array]:
-        """Gradients (K, n) and Hessians (K, n, n), which are positive semidefinite."""
+        """Compute the gradients (K, n) and the positive semidefinite Hessians (K, n, n)."""
         ...
 
 
 def knot_cost(cost: Any, nx: int, nu: int, probe: Array, *, gauss_newton: bool = False) -> KnotCost:
-    """A running cost of (x, u), or with nu = 0 a final one of x; None costs nothing.
+    """Return the knot cost of a running cost of (x, u), or of a final cost of x if nu = 0. None means no cost.
 
-    `probe` (P, nx + nu) are knots at which its expression is compared with it. With `gauss_newton` the Hessians of
-    goals with a weight leave out the second derivatives of what these measure.
+    `probe` (P, nx + nu) are knots that test the cost's expression. With `gauss_newton`, the Hessians of weighted goals
+    omit the second derivatives of the goals' residuals.
     """
     if cost is None:
         return _Sum(())
@@ -318,7 +318,7 @@ class _Sum:
 
 @dataclass(frozen=True, eq=False)
 class _Quadratic:
-    """A quadratic form, from whose knots the references of `tracking` at their times are subtracted."""
+    """A quadratic form of the knots minus the references of `tracking` at their times."""
 
     form: QuadraticForm
     tracking: TrackingCost | None = None
@@ -338,7 +338,7 @@ class _Quadratic:
 
 
 class _WeightedGoal:
-    """The weighted square of what a goal misses, with Gauss and Newton's curvature."""
+    """The weighted squared residuals of a goal, with the Gauss-Newton Hessian."""
 
     def __init__(self, weight: float, goal: GoalConstraint, nx: int, nu: int, probe: Array):
         self.weight, size = weight, len(goal.residuals(probe[0, :nx]))
@@ -355,7 +355,7 @@ class _WeightedGoal:
 
 
 class _Function:
-    """Any other cost: by its expression, or where it has none, knot by knot with differences of exact gradients."""
+    """Any other cost, by its expression, or else called at each knot, with differences of exact gradients."""
 
     def __init__(self, cost: Any, nx: int, nu: int, probe: Array):
         self.timed = cost if isinstance(cost, TimedCost) else None
@@ -410,7 +410,7 @@ class _Function:
 
 
 def not_negative(hessians: Array) -> Array:
-    """(K, n, n) symmetric matrices, their negative eigenvalues cut to 0."""
+    """Set the negative eigenvalues of symmetric matrices (K, n, n) to 0."""
     if not np.all(np.isfinite(hessians)):
         return hessians
     values, vectors = np.linalg.eigh(hessians)
@@ -421,7 +421,7 @@ def not_negative(hessians: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """`weight` times a cost at some of the knots 0 ... N, at their times (K,) [s]: of [x, u], or of x where `final`."""
+    """`weight` times a cost of [x, u] (or of x if `final`) at the knots `at` of 0 ... N, at `times` (K,) [s]."""
 
     cost: KnotCost
     at: slice
@@ -441,7 +441,7 @@ class Costs:
         return [evaluate(stage, (xs if stage.final else knots)[stage.at]) for stage in self.stages]
 
     def values(self, xs: Array, us: Array) -> Array:
-        """(N+1,) of the knots."""
+        """Compute the costs (N+1,) of the knots."""
         total = np.zeros(len(xs))
         values = self._evaluate(lambda stage, knots: stage.weight * stage.cost.values(knots, stage.times), xs, us)
         for stage, of_knots in zip(self.stages, values, strict=True):
@@ -449,7 +449,7 @@ class Costs:
         return total
 
     def expand(self, xs: Array, us: Array) -> tuple[Array, Array]:
-        """Gradients (N+1, nx + nu) and Hessians (N+1, nx + nu, nx + nu); GradientError where one is not finite."""
+        """Compute gradients (N+1, nx + nu) and Hessians (N+1, nx + nu, nx + nu), or raise GradientError."""
         nx, n = xs.shape[1], xs.shape[1] + us.shape[1]
         gradients, hessians = np.zeros((len(xs), n)), np.zeros((len(xs), n, n))
         expanded = self._evaluate(lambda stage, knots: stage.cost.expand(knots, stage.times), xs, us)
@@ -463,7 +463,7 @@ class Costs:
 
 
 def require_finite(derivatives: Array, knots: Array) -> None:
-    """GradientError where the derivatives (K, ...) of a cost are not finite at one of the knots (K, n)."""
+    """Raise GradientError if the derivatives (K, ...) of a cost are not finite at one of the knots (K, n)."""
     bad = ~np.isfinite(derivatives).reshape(len(derivatives), -1).all(axis=1)
     if bad.any():
         k = int(np.argmax(bad))
@@ -477,9 +477,9 @@ _KNOT_COSTS: WeakKeyDictionary[Problem, tuple[KnotCost, KnotCost]] = WeakKeyDict
 
 
 def costs_of(problem: Problem, xs: Array, us: Array, time_step: float | None = None) -> Costs:
-    """The running and the final cost of `problem`, in steps of `time_step` [s], the model's where None.
+    """Return the running and the final cost of `problem` for steps of `time_step` [s], by default the model's.
 
-    Where they were not expanded before, their expressions are compared with them at knots of xs (N+1, nx), us (N, nu).
+    The first call tests their expressions at knots of xs (N+1, nx), us (N, nu).
     """
     h, N = problem.time_step if time_step is None else time_step, len(us)
     costs = _KNOT_COSTS.get(problem)

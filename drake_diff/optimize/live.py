@@ -1,4 +1,4 @@
-"""What `solve(view=True)` shows: the iterates of a search on a page, and then the motion of its plan."""
+"""The page of `solve(view=True)`, which shows the iterates of a search and then the motion of its plan."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -20,16 +20,16 @@ from drake_diff.pages.meshcat import stills_of
 from drake_diff.pages.scene import BLUE, Scene, scene_of
 from drake_diff.pages.shapes import Drawn
 
-SEEN = 1e-3  # of the height of a plot: less than a pixel
-PERIOD = 0.3  # [s] from one drawing to the next, at least
-PART = 0.05  # of the time of a search: more is not spent on drawing it
-TRAIL_POINTS = 60  # of an iterate
+SEEN = 1e-3  # fraction of a plot's height; less than a pixel
+PERIOD = 0.3  # [s] shortest time between two drawings
+PART = 0.05  # largest fraction of a search's time that is spent on drawing
+TRAIL_POINTS = 60  # points per iterate
 
 
 class LiveSearch:
-    """The page of one `solve`, whose address goes to `tell` when the search begins.
+    """The page of one `solve`. `tell` gets its address when the search begins.
 
-    Raises InputError where `problem` has no robot that could be drawn.
+    Raises InputError if `problem` has no model with bodies to draw.
     """
 
     def __init__(self, problem: Any, tell: Callable[[str], None]):
@@ -45,7 +45,7 @@ class LiveSearch:
         self.shapes: tuple[Drawn, ...] = ()
 
     def begin(self) -> None:
-        """Open the page, with the robot as it stands at first."""
+        """Open the page and show the robot in its initial state."""
         problem = self.problem
         self.page = live_page()
         self.marks = drawn_goals(problem.model.plant, problem.model.double.context, problem.goals)
@@ -59,7 +59,7 @@ class LiveSearch:
         self.tell(self.page.address)
 
     def beside(self, report: Report) -> Report:
-        """A report that shows here what it hands on."""
+        """Return a report that shows the progress on this page and forwards it to `report`."""
 
         def row(row: Iteration) -> None:
             self.row(row)
@@ -80,11 +80,11 @@ class LiveSearch:
         return shown
 
     def is_due(self) -> bool:
-        """Whether it is time to draw again."""
+        """Return whether the next drawing is due."""
         return self.page is not None and time.monotonic() >= self.due and not self.page.is_busy
 
     def row(self, row: Iteration) -> None:
-        """Add a row to the plots, and draw its motion if it is time to: at most for a PART of the time."""
+        """Add a row to the plots, and draw its motion if that is due. Drawing takes at most PART of the time."""
         if self.page is None:
             return
         self.page.add(self.number, row.iteration, row.objective, row.primal_infeasibility)
@@ -97,17 +97,17 @@ class LiveSearch:
         self.due = end + max(PERIOD, (end - begin) / PART)
 
     def _show(self, scene: Callable[[], Scene], *, end: bool = False) -> None:
-        """Draw a scene; where it cannot be made, as of a quaternion of zeros, the page says so and all goes on."""
+        """Draw a scene. If that fails, as with a zero quaternion, show the error on the page and continue."""
         if self.page is None:
             return
         try:
-            with np.errstate(over="ignore", invalid="ignore"):  # of motions that leave every finite number
+            with np.errstate(over="ignore", invalid="ignore"):  # motions that diverge overflow
                 self.page.show(self.number, scene(), end=end)
-        except Exception as error:  # whatever Drake says of a state: nobody asked for a search to end by it
+        except Exception as error:  # an error of Drake in a drawing must not end the search
             self._update_page(line=f"the motion cannot be drawn: {type(error).__name__}: {error}")
 
     def _scene(self, motion: Iterate) -> Scene:
-        """Of some of its states, which are enough to see it by."""
+        """Return the scene of a motion, with at most TRAIL_POINTS + 1 of its states."""
         count, parameters = len(motion.us), self.problem.design.own(motion.vector.values)
         knots = np.unique(np.round(np.linspace(0, count, min(count, TRAIL_POINTS) + 1)).astype(int))
         seen = stills_of(len(knots))[:-1]
@@ -128,7 +128,7 @@ class LiveSearch:
 
     @contextmanager
     def running(self, started: Callable[[], None] | None) -> Iterator[Callable[[], None]]:
-        """What to call when the work begins, for as long as it goes on; the page says so if an error ends it."""
+        """Yield a function to call when the work begins. The page shows an error that ends the work."""
 
         def start() -> None:
             if started is not None:
@@ -142,7 +142,7 @@ class LiveSearch:
             raise
 
     def end(self, solution: Solution) -> None:
-        """Show the motion of the plan, and what became of it."""
+        """Show the motion and the status of the plan."""
         if self.page is None:
             return
         self._show(lambda: self._scene_at_the_end(solution), end=True)
@@ -164,13 +164,13 @@ class LiveSearch:
 
 
 def _shown(solution: Solution) -> Rollout | None:
-    """The motion that the verdict rests on, the open-loop one where none does; no replay is made for it."""
+    """Return the motion that decides the verdict, else the open-loop motion, without starting the replays."""
     judged = solution.judged_replay if "replays" in vars(solution) else None
     return solution.replay if judged is None or judged.motion is None else judged.motion
 
 
 def scene_of_plan(solution: Solution, motion: Rollout | None) -> Scene:
-    """A `motion` of the plant beside the plan that it follows, or where there is none the plan alone."""
+    """Return the scene of a `motion` of the plant together with its plan, or of the plan alone if `motion` is None."""
     problem, xs = solution.problem, solution.xs[solution.knots]
     model = problem.model
     marks = drawn_goals(model.plant, model.double.context, problem.goals)
@@ -183,7 +183,7 @@ def scene_of_plan(solution: Solution, motion: Rollout | None) -> Scene:
 
 
 def differ(motion: Array, plan: Array) -> bool:
-    """Whether a reader could tell a motion (n, m) from its plan: by SEEN of what a column moves, 1e-3 at least."""
+    """Return whether a motion (n, m) visibly differs from its plan, by SEEN times max(range of a column, 1e-3)."""
     moved = np.ptp(motion, axis=0)
     apart = np.max(np.abs(motion - plan), axis=0)
-    return not bool(np.all(apart <= SEEN * np.maximum(moved, 1e-3)))  # what is not finite differs
+    return not bool(np.all(apart <= SEEN * np.maximum(moved, 1e-3)))  # non-finite values count as different

@@ -1,4 +1,4 @@
-"""What is checked of a solution's own states and inputs, replays apart."""
+"""Checks of a solution's own states and inputs, without replays."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -25,23 +25,23 @@ from drake_diff.optimize.transcription.collocation import SMALLEST_COST, Colloca
 from drake_diff.optimize.transcription.lead import SUBSTEPS
 from drake_diff.optimize.transcription.task import OptimalControl, UserCost, user_costs
 
-# Of a state's scale: between two knots the transcription is a cubic, and further than this from an accurate integration
-# its motion is not the model's.
+# Fraction of a state's scale. Between two knots the transcription is a cubic. If it is further than this from an
+# accurate integration, it is not a motion of the model.
 INTEGRATION_TOLERANCE = 5e-3
-FEEDBACK_COST = 0.2  # of the cost, what feedback may cost more or less than the plan that it follows
-# Of the cost: by how much the quadrature that was minimized may differ from its integral. A step of refinement makes it
-# 16 times smaller, and costs of plans that are worth comparing differ by more.
+FEEDBACK_COST = 0.2  # fraction of the cost by which feedback may change the cost of the plan
+# Fraction of the cost by which the minimized quadrature may differ from its integral. A step of refinement makes the
+# difference 16 times smaller, and costs of plans that are worth comparing differ by more.
 COST_TOLERANCE = 1e-2
-ASKED = ("defect", "goal", "bound", "constraint", "start", "cost")  # checks of what a solver is asked to satisfy
-BESIDE = np.linspace(-0.1, 0.1, 41)  # of the scale of a state or input: where costs are looked at beside a plan
-LOOKED_AT, MOST_BENDS = 3, 20  # knots at which costs are compared; places on a line at which they may jump
-HALVED = 24  # times, so that a jump is told from what is steep: 6e-8 of the way between two places
-SMALLEST_JUMP = 1e-6  # of the largest cost on these lines; what is smooth leaves 1e-9
-FIRST_KNOTS, BENDS = 3, 3  # of a guess; of a result, beside its first and last knot
+ASKED = ("defect", "goal", "bound", "constraint", "start", "cost")  # checks of conditions that the solver must satisfy
+BESIDE = np.linspace(-0.1, 0.1, 41)  # offsets from a plan at which costs are evaluated, in units of the scale
+LOOKED_AT, MOST_BENDS = 3, 20  # knots at which costs are compared; candidate places of a jump on a line
+HALVED = 24  # bisections to distinguish a jump from a steep slope; 6e-8 of the distance between two places
+SMALLEST_JUMP = 1e-6  # fraction of the largest cost on these lines; a smooth cost changes by 1e-9
+FIRST_KNOTS, BENDS = 3, 3  # knots of a guess; knots of a result in addition to its first and last knot
 
 
 def plan_checks(s: Any) -> Iterator[Check]:
-    """Of a `Solution`: what was asked at the knots and between them, overlaps of a collocated plan, certificates."""
+    """Check the knots and intervals of a `Solution`, overlaps of a collocated plan, certificates and user costs."""
     yield from _knot_checks(s)
     if s.transcribed is not None:
         yield from _interval_checks(s, s.transcribed)
@@ -58,7 +58,7 @@ def plan_checks(s: Any) -> Iterator[Check]:
 
 
 def _knot_checks(s: Any) -> Iterator[Check]:
-    """Equations, ends, bounds and constraints."""
+    """Check the equations, ends, bounds, constraints and cost at the knots."""
     problem, xs = s.problem, np.asarray(s.xs)
     with np.errstate(all="ignore"):
         scales = problem.feasibility_scales(xs, s.us, s.vector.values, s.knots)
@@ -87,7 +87,7 @@ def _knot_checks(s: Any) -> Iterator[Check]:
 
 
 def _worst(values: Array, limits: Array) -> tuple[int, int]:
-    """The row and column of the largest of values (M, n) for the limits (n,) of its column."""
+    """Return the row and column of the largest of values (M, n), relative to the limit (n,) of its column."""
     if not values.size:
         return 0, 0
     row, i = np.unravel_index(int(np.argmax(np.nan_to_num(values / limits, nan=np.inf))), values.shape)
@@ -104,7 +104,7 @@ def _excess_checks(
 
 
 def _interval_checks(s: Any, motion: Collocated) -> Iterator[Check]:
-    """Whether the motion between nodes is that of the dynamics, and within its bounds and constraints."""
+    """Check whether the motion between nodes obeys the dynamics, the bounds and the constraints."""
     tolerance = INTEGRATION_TOLERANCE * s.problem.state_scales(motion.xs)
     knot, i = _worst(motion.gaps, tolerance)
     where = f"{s.problem.state_names[i]} at knot {knot}"
@@ -113,7 +113,7 @@ def _interval_checks(s: Any, motion: Collocated) -> Iterator[Check]:
 
 
 def _overlap_check(s: Any, motion: Collocated) -> Check:
-    """How deep geometries overlap, at knots or between them, in a motion that leaves contact out."""
+    """Check how deep geometries overlap, at knots or between them, in a motion that ignores contact."""
     model, (times, between) = s.problem.model, motion.between_knots
     xs, depths = np.vstack([motion.xs, between]), []
     finite = np.isfinite(xs).all(axis=1)
@@ -126,7 +126,7 @@ def _overlap_check(s: Any, motion: Collocated) -> Check:
 
 
 def _user_checks(s: Any) -> Iterator[Check]:
-    """Whether the user's costs jump along a plan or beside it, and are what their derivatives are taken of."""
+    """Check whether the user's costs jump along a plan or near it, and whether they equal their traced forms."""
     problem, nx, motion = s.problem, s.problem.nx, s.transcribed
     us = s.inputs_at_knots[: len(s.xs)]
     knots, times = np.hstack([s.xs, np.vstack([us, us[-1:]])[: len(s.xs)]]), np.asarray(s.times, dtype=float)
@@ -154,10 +154,10 @@ def _user_checks(s: Any) -> Iterator[Check]:
 
 
 def largest_jump(cost: UserCost, lines: Sequence[Array]) -> tuple[float, float, float]:
-    """By how much a cost jumps between two places [x, u, t] of one of the `lines`, each (S, nx + nu + 1), and when [s].
+    """Return the largest jump of a cost along the `lines` (S, nx + nu + 1) of places [x, u, t], its time, and a scale.
 
-    And how large the cost is there. Those halves between which it changes most are halved, from the places about which
-    it bends most.
+    The scale is the largest magnitude of the cost on the lines. The intervals next to the largest second differences
+    are bisected, each time to the half in which the cost changes most.
     """
     every, begin = np.vstack(lines), np.cumsum([0, *map(len, lines)])
     values = np.ravel(cost.values_of_many(every[:, :-1], every[:, -1]))
@@ -181,8 +181,8 @@ def largest_jump(cost: UserCost, lines: Sequence[Array]) -> tuple[float, float, 
 
 
 def derivative_check(c: Certificate) -> Check:
-    """The worst entry of a certificate."""
-    if not c.codes.size:  # a derivative by nothing has no entry
+    """Return a check of the worst entry of a certificate."""
+    if not c.codes.size:  # a derivative with respect to no variable has no entry
         return check("derivative", f"{c.subject}: {c.verdict}", 0.0, 0.0, verdict=_verdict(c.verdict))
     e = c.worst
     where = f"d {e.row} / d {e.column}: {c.verdict}{f' ({e.reason})' if e.reason else ''}"
@@ -194,7 +194,7 @@ def _verdict(certified: str) -> Any:
 
 
 def following_checks(s: Any, motion: Collocated) -> list[Check]:
-    """Whether the dynamics follow the plan from its first knot to its last: open loop, and where not, under TVLQR."""
+    """Check whether the dynamics follow the plan from its first knot to its last, open loop or else under TVLQR."""
     names, ranges, units = s.problem.state_names, s.problem.state_scales(motion.xs), units_of(s.problem)
     rows = list[Check]()
     for control in ("open loop", "TVLQR"):
@@ -210,7 +210,7 @@ def following_checks(s: Any, motion: Collocated) -> list[Check]:
 
 
 def _cost_beside(motion: Collocated, xs: Array, control: str) -> Check:
-    """The cost of where the dynamics lead, xs, beside the plan's; feedback costs what it has to."""
+    """Compare the cost of the integrated motion xs with the plan's. Feedback may change the cost by more."""
     is_open = control == "open loop"
     with np.errstate(all="ignore"):
         difference = abs(motion.cost_beside(xs, None if is_open else motion.gains()[0]))
@@ -220,7 +220,7 @@ def _cost_beside(motion: Collocated, xs: Array, control: str) -> Check:
 
 
 def _furthest(s: Any, motion: Collocated, xs: Array, ranges: Array) -> tuple[str, int, float, str]:
-    """What of xs (S, nx) is off most for its range: a state from the plan at knots, or beyond a bound anywhere."""
+    """Find the largest deviation of xs (S, nx) relative to its range, from the plan at knots or beyond a bound."""
     b = s.problem.bounds
     apart = np.nan_to_num(np.abs(xs[::SUBSTEPS] - motion.xs), nan=np.inf)
     beyond = np.nan_to_num(np.maximum(np.maximum(b.x_lower - xs, xs - b.x_upper), 0.0)[1:], nan=np.inf)
@@ -232,23 +232,23 @@ def _furthest(s: Any, motion: Collocated, xs: Array, ranges: Array) -> tuple[str
 
 
 def _spans(knots: Any) -> str:
-    """Whole numbers as ranges: "0-11, 14"."""
+    """Format whole numbers as ranges, such as "0-11, 14"."""
     runs = np.split(knots, np.flatnonzero(np.diff(knots) > 1) + 1)
     return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs if len(run))
 
 
-# Certificates of the derivatives that a collocation gets.
+# Certificates of the derivatives that collocation uses.
 
 
 def first_knots(us: Array) -> Indices:
-    """The knots, out of those of us (N, nu), at which the derivatives at a guess are certified."""
+    """Return the knots of us (N, nu) at which the derivatives at an initial guess are certified."""
     return np.unique(np.linspace(0, len(us) - 1, FIRST_KNOTS).astype(np.intp))
 
 
 def telling_knots(problem: Problem, xs: Array) -> Indices:
-    """The knots of the motion xs (N+1, nx) at which derivatives are certified: both ends, and where it bends most.
+    """Return the knots of xs (N+1, nx) to certify: both ends, and those with the largest second differences.
 
-    Forces change there: touches begin or end, or an input switches.
+    Forces change at these knots, because a contact begins or ends or an input switches.
     """
     count = len(xs) - 1
     bends = np.abs(np.diff(xs, n=2, axis=0)) / problem.state_scales(xs)
@@ -265,11 +265,10 @@ def certify_equations(
     *,
     knots: Indices | None = None,
 ) -> tuple[Certificate, ...]:
-    """Certificates, at `knots`, of the Jacobian that the solver gets against the equations themselves.
+    """Certify the Jacobian that the solver uses against the equations themselves, at `knots`.
 
-    Without them, at those that tell most of the motion.
-
-    Where parameters are optimized it has columns by their coordinates, near those of `task`, a collocation's.
+    By default, the knots are those of `telling_knots`. If parameters are optimized, the Jacobian has columns for their
+    coordinates as well, near the coordinates of `task`, which belongs to a collocation.
     """
     system, is_map, tail, sizes, names = problem.system, problem.is_map, np.zeros(0), np.zeros(0), ()
     if task is not None and task.varied is not None:

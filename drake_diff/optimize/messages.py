@@ -1,12 +1,12 @@
-"""How checks and verdicts of plans read."""
+"""Texts of checks and verdicts of plans."""
 
 from collections.abc import Sequence
 from typing import Any
 
-FEW = 4  # names of a list that are written out
-LONGEST = 160  # characters of a message: a line that is read at once
+FEW = 4  # number of names of a list that are written out
+LONGEST = 160  # characters of a message, so that it fits on one line
 
-# {name} and {time} are the two parts of a check's `where` that " at " joins.
+# {name} and {time} are the parts of a check's `where` before and after " at ".
 CLAUSES = {
     "left-out pair": "{where} overlap where the file has them: SelfCollision(ignore=) says which may",
     "bound": "{name} is {value} beyond its bound at {time}, tolerance {tolerance}",
@@ -41,12 +41,12 @@ NO_UNIT = ("1", "", "unknown")
 
 
 def quantity(value: float, unit: str) -> str:
-    """A number with its unit: "0.05 rad"."""
+    """Format a number with its unit, such as "0.05 rad"."""
     return f"{value:.3g}" if unit in NO_UNIT else f"{value:.3g} {unit}"
 
 
 def clause(c: Any) -> str:
-    """A `Check` as a clause."""
+    """Describe a `Check` in a clause."""
     name, _, time = c.where.rpartition(" at ")
     values = {"value": quantity(c.value, c.unit), "tolerance": quantity(c.tolerance, c.unit)}
     text = CLAUSES[c.what].format(name=name or c.where, time=time, where=c.where, **values)
@@ -54,23 +54,23 @@ def clause(c: Any) -> str:
 
 
 def under(control: str | None) -> str:
-    """The words of a control: "open loop", "under TVLQR"."""
+    """Describe a controller: "open loop" or "under TVLQR"."""
     return "open loop" if control in (None, "open loop") else f"under {control}"
 
 
 def in_milliseconds(seconds: float) -> str:
-    """A time step: "20 ms"."""
+    """Format a time step in milliseconds, such as "20 ms"."""
     return f"{1e3 * seconds:.4g} ms"
 
 
 def headline(status: str, text: str) -> str:
-    """The status and what is most worth saying of it, in at most LONGEST characters."""
+    """Return the status and the most important text, in at most LONGEST characters."""
     line = f"{status}: {text}" if text else status
     return line if len(line) <= LONGEST else f"{line[: LONGEST - 3].rstrip()}..."
 
 
 def joined(words: Sequence[str]) -> str:
-    """Joined by commas and one "and"; of many the first, and how many more."""
+    """Join words by commas and one "and". A long list has its first words and the number of other words."""
     words = list(dict.fromkeys(words))
     if len(words) > FEW + 1:
         words = [*words[:FEW], f"{len(words) - FEW} more"]

@@ -1,18 +1,18 @@
-"""Whether a plan is a stationary point, and what its variables cannot move.
+"""Check whether a plan is a stationary point, and find goals that its variables cannot affect.
 
-With the multipliers mu of what holds the plan (goal, waypoints, and the bounds and constraints that it lies on), the
-Lagrangian is L = cost + mu' c. At an optimum its gradient by every variable that no bound holds is zero, and
-d L / d x_k, the later steps being functions of x_k, is the costate (Nocedal and Wright, "Numerical Optimization", 2006,
-ch. 12). The multipliers are those that leave the least gradient, an inequality's of its own sign alone, so that nothing
-here is a solver's word.
+With the multipliers mu of the active constraints c (goal, waypoints, and the bounds and constraints that the plan lies
+on), the Lagrangian is L = cost + mu' c. At an optimum, its gradient with respect to every variable that is not on a
+bound is zero. With the later steps as functions of x_k, d L / d x_k is the costate (Nocedal and Wright, "Numerical
+Optimization", 2006, ch. 12). The multipliers minimize the norm of the gradient, and those of inequalities have the
+correct sign. They do not come from a solver.
 
-A plan that touches nothing can be stationary for no better reason than that nothing it could change reaches what the
-cost is about. Whether a coordinate is moved is read off the steps' derivatives along the plan, and off who touches
-whom: a differenced step has noise in every entry. What the cost asks of a coordinate is its Newton step, after all that
-moves has done what it can: a hand that follows a flying ball asks nothing of the ball.
+A plan without contact may only be stationary because its variables do not affect the states in the cost. Moved
+coordinates are found from the steps' derivatives along the plan and from the contacts, because a differenced step has
+noise in every entry. The cost's demand on a coordinate is its Newton step, after minimization over all moved
+coordinates: a hand that follows a flying ball demands nothing of the ball.
 
-After many impacts, or one that barely touches, the derivative of a motion in continuous time exists and yet says
-nothing of the motion beside it: it is compared with slopes of another integration.
+After many impacts or a grazing impact, the derivative of a motion in continuous time exists but does not predict nearby
+motions. It is therefore compared with slopes of another integration.
 """
 
 from collections.abc import Iterator
@@ -49,38 +49,38 @@ from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
 from drake_diff.optimize.transcription.steps import StepProgram
 
-AT_ONCE = 64  # rows: each takes as much memory as the plan
-RIDGE = 1e-12  # on columns of length 1: rows that say the same have no multipliers of their own
+AT_ONCE = 64  # rows per batch; each takes as much memory as the plan
+RIDGE = 1e-12  # for columns of length 1; linearly dependent rows have no unique multipliers
 NO_EFFECT = 1e-12
-DIFFERENCED = 1e-6  # of the largest effect: the noise of differences of a contact solver that stops early
-ASKED = 1e-3  # [the state's unit] less is how far a body gives way that rests on a compliant ground
-WORTH = 1e-12  # of the cost: what moving a coordinate by ASKED must gain, or it is rounding
-FLAT = 1e-9  # of the largest curvature
-ROUNDING = 1e-9  # [the state's unit] of a coordinate that is moved by nothing, in two rollouts
-TRIALS, TRIAL_SIZE = 3, 0.1  # rollouts of other variables, moved by this part of their size, or of 1
-WIDTHS = (1e-4, 1e-5, 1e-6)  # of a variable's unit, over the derivative's own size where that is more
-SAME, SETTLED = 0.01, 0.1  # of the derivative: how far a slope may be from it, and slopes from each other
+DIFFERENCED = 1e-6  # noise of finite differences, relative to the largest effect; the contact solver stops early
+ASKED = 1e-3  # [the state's unit] smaller distances are those by which a body sinks into compliant ground
+WORTH = 1e-12  # fraction of the cost that a motion by ASKED must gain; less is rounding
+FLAT = 1e-9  # fraction of the largest curvature; a smaller curvature counts as zero
+ROUNDING = 1e-9  # [the state's unit] difference of a coordinate between two rollouts if nothing moves it
+TRIALS, TRIAL_SIZE = 3, 0.1  # rollouts with random variables, changed by this fraction of max(1, their size)
+WIDTHS = (1e-4, 1e-5, 1e-6)  # steps in a variable's unit, divided by the size of the derivative if that is larger
+SAME, SETTLED = 0.01, 0.1  # fractions of the derivative: largest error of a slope, and difference of slopes
 HOLDS = f"the derivative of its end is the slope of that integration, to {SAME:.0%}"
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
 class Optimality:
-    """What `optimality` finds; a discrete plan is a stationary point where `gradient` is rounding beside `terms`."""
+    """The result of `optimality`. A discrete plan is stationary if `gradient` is negligible relative to `terms`."""
 
-    multipliers: Array  # (m,) of what holds the plan
-    state_norms: Array  # (N+1,) |d L / d x_k|, the cost's unit per the state's
-    gradient: float  # the largest |d L / d z| of an optimized variable that no bound holds
-    terms: float  # the largest sum of magnitudes that such an entry is made of
+    multipliers: Array  # (m,) of the active constraints
+    state_norms: Array  # (N+1,) |d L / d x_k|, in the cost's unit per the state's unit
+    gradient: float  # the largest |d L / d z| of an optimized variable that is not on a bound
+    terms: float  # the largest sum of the magnitudes of such an entry's terms
 
     @property
     def ratio(self) -> float:
-        """`gradient` over `terms`; 0 where there are no terms."""
+        """`gradient` / `terms`, or 0 without terms."""
         return self.gradient / self.terms if self.terms else 0.0
 
 
 def final_state_norms(linearization: list[StepDerivatives]) -> Array:
-    """(N+1,) |d x_N / d x_k|, the largest singular value, from the derivatives of N steps; it may be infinite."""
+    """Return (N+1,) the largest singular values of d x_N / d x_k, from the derivatives of N steps; they may be inf."""
     product = np.eye(len(linearization[-1].x_next))
     norms = [1.0]
     for d in reversed(linearization):
@@ -91,10 +91,10 @@ def final_state_norms(linearization: list[StepDerivatives]) -> Array:
 
 
 def optimality(problem: Problem, xs: Array, us: Array, values: Array) -> Optimality:
-    """How far a plan xs (N+1, nx), us (N, nu) is from a stationary point of the Lagrangian of its program of steps.
+    """Measure how far a plan xs (N+1, nx), us (N, nu) is from a stationary point of the Lagrangian of its step program.
 
-    `values` (np,) are those of the problem's design. The multipliers of the steps are the costates: they leave no
-    gradient by a state. Raises GradientError where a cost or constraint has no derivative.
+    `values` (np,) are those of the problem's design. The multipliers of the steps are the costates, for which the
+    gradient with respect to the states is zero. Raises GradientError if a cost or constraint has no derivative.
     """
     program = StepProgram(problem)
     z = program.pack(xs, us, values)
@@ -120,7 +120,7 @@ def optimality(problem: Problem, xs: Array, us: Array, values: Array) -> Optimal
     lowest, highest = (np.where(np.concatenate(sides), np.inf, 0.0) for sides in zip(*signs, strict=True))
 
     def reduced(gradients: Array) -> Array:
-        """(others, k) what is left of gradients (n, k) by all variables when the states follow the others."""
+        """Reduce gradients (n, k) to (others, k), with the states as functions of the other variables."""
         return np.asarray(gradients[others] - every[:count, others].T @ of_steps.solve(gradients[steps]))
 
     free = ~(on_lower | on_upper)[others]
@@ -144,12 +144,12 @@ def optimality(problem: Problem, xs: Array, us: Array, values: Array) -> Optimal
 
 
 def _sides(values: Array, lower: Array, upper: Array, scales: Any) -> tuple[Mask, Mask]:
-    """Which values, of these `scales`, lie on their lower bound, and which on their upper one."""
+    """Return the masks of values, of these `scales`, that lie on their lower and on their upper bounds."""
     return values <= lower + FEASIBILITY_TOLERANCE * scales, values >= upper - FEASIBILITY_TOLERANCE * scales
 
 
 def _multipliers(of_cost: Array, jacobian: Array, lowest: Array, highest: Array) -> Array:
-    """(m,) those with the least |of_cost + jacobian mu|, each from `lowest` to `highest`."""
+    """Return (m,) the mu between `lowest` and `highest` that minimize |of_cost + jacobian mu|."""
     count = len(lowest)
     if not count or not len(of_cost):
         return np.zeros(count)
@@ -168,14 +168,14 @@ def _multipliers(of_cost: Array, jacobian: Array, lowest: Array, highest: Array)
 
 @dataclass(frozen=True)
 class OutOfReach:
-    """`silent` says what the cost asks for and this plan cannot feel; `constant` what nothing can change. Or empty."""
+    """Messages, or "": `silent` reports a demand of the cost that no variable meets, `constant` fixed coordinates."""
 
     silent: str = ""
     constant: str = ""
 
 
 def why_blind(problem: Problem, variables: ShootingVariables, z: Array) -> str:
-    """Which part of the goal no variable in z has an effect on, though it is not reached; empty if there is none."""
+    """Describe a part of the goal that is not reached and that no variable in z affects, or return ""."""
     last = final_sensitivity(variables, z)
     effect = np.abs(last).max(axis=1, initial=0.0)
     xs = variables.states(z)
@@ -189,7 +189,7 @@ def why_blind(problem: Problem, variables: ShootingVariables, z: Array) -> str:
 
 
 def _unmoved_goals(problem: Problem, end: Array, last: Array, spans: Array) -> Iterator[str]:
-    """The goals at the end that are not reached there and that no variable changes, by `last` (nx, n) of them."""
+    """Describe the goals at the end that are missed and that no variable affects, by `last` (nx, n) = d x_N / d z."""
     for c in problem.kept_goals:
         if problem.num_steps in problem.knots_of(c, input_at_end=False):
             none = np.zeros(problem.nu)
@@ -200,9 +200,9 @@ def _unmoved_goals(problem: Problem, end: Array, last: Array, spans: Array) -> I
 
 
 def out_of_reach(problem: Problem, variables: ShootingVariables, z: Array) -> OutOfReach:
-    """What the cost asks of coordinates that no variable moves along the states of z.
+    """Find the demands of the cost on coordinates that no variable moves along the states of z.
 
-    Raises GradientError where the cost or a step has no derivative.
+    Raises GradientError if the cost or a step has no derivative.
     """
     plan = _Plan(problem, variables, z)
     if plan.moved.all():
@@ -234,7 +234,7 @@ class _Plan:
         self.moved, self.reached = self._follow()
 
     def _follow(self) -> tuple[Mask, set[int]]:
-        """Which coordinates some variable moves at some knot, and the trees that it reaches."""
+        """Return the coordinates that some variable moves at some knot, and the trees that the variables reach."""
         problem, random = self.problem, np.random.default_rng(0)
         trees, of_states = self.trees, np.array(self.trees.of_states)
         reached = {of_states[i] for i in self.variables.free}
@@ -242,7 +242,7 @@ class _Plan:
             reached |= trees.driven
         if self.linked:
             reached = set(of_states.tolist())
-        effect = np.zeros(problem.nx)  # of a change of all variables at random: 0 where each of them has none
+        effect = np.zeros(problem.nx)  # effect of a random change of all variables; 0 where no variable has an effect
         effect[self.variables.free] = random.standard_normal(len(self.variables.free))
         moved = np.abs(effect) > NO_EFFECT
         design = self.variables.design
@@ -260,7 +260,7 @@ class _Plan:
         return moved, reached
 
     def _touching(self) -> list[tuple[tuple[int, int], ...]]:
-        """(N,) the pairs of trees that push each other in each step; empty if nothing can, or it does not matter."""
+        """Return (N,) the pairs of trees in contact in each step, or [] if contact is impossible or irrelevant."""
         if self.linked or not self.model.contract.contact.collision_pairs:
             return []
         touching = []
@@ -270,7 +270,7 @@ class _Plan:
         return touching
 
     def asked(self) -> Iterator[tuple[int, tuple[float, int]]]:
-        """(coordinate that nothing moves, (how far the cost asks it to go, at which knot)), the furthest knot each."""
+        """Yield (unmoved coordinate, (largest distance that the cost demands of it, knot of this distance))."""
         total, by_xs, by_us = self._slopes
         still, worth = np.flatnonzero(~self.moved), WORTH * (1 + abs(total))
         furthest: dict[int, tuple[float, int]] = {}
@@ -287,7 +287,7 @@ class _Plan:
 
     @cached_property
     def _slopes(self) -> tuple[float, Array, Array]:
-        """The cost, and its derivatives by the states (N+1, nx) and the inputs (N, nu) themselves, the steps apart."""
+        """The cost, and its partial derivatives with respect to the states (N+1, nx) and the inputs (N, nu)."""
         problem, h, nx = self.problem, self.variables.time_step(self.z), self.problem.nx
         slopes = costs_of(problem, self.xs, self.us, h).expand(self.xs, self.us)[0]
         by_xs, by_us = slopes[:, :nx], slopes[:-1, nx:]
@@ -297,7 +297,7 @@ class _Plan:
         return problem.objective(self.xs, self.us, h), by_xs, by_us
 
     def _left_to_ask(self, slope: Array, hessian: Array, still: NDArray[np.intp]) -> tuple[Array, Array]:
-        """The cost's slope and curvature by the coordinates that are `still`, at the best of all that is not."""
+        """Return slope and curvature of the cost in the `still` coordinates, after minimization over all others."""
         inputs = np.full(self.problem.nu, self.problem.optimizes_controls)
         goes = np.flatnonzero(np.concatenate([self.moved, inputs]))
         across = hessian[np.ix_(still, goes)] @ np.linalg.pinv(hessian[np.ix_(goes, goes)], rcond=FLAT, hermitian=True)
@@ -306,7 +306,7 @@ class _Plan:
         return slope[still] - across @ slope[goes], np.where(curvature > flat, curvature, 0.0)
 
     def _hessian(self, k: int) -> Array:
-        """(nx + nu, nx + nu) of what state and input of knot k cost, a `trajectory_cost` apart."""
+        """Return the Hessian (nx + nu, nx + nu) of the cost at knot k, without a `trajectory_cost`."""
         problem, (nx, nu) = self.problem, (self.problem.nx, self.problem.nu)
         if k < len(self.us):
             running = problem.total_running_cost
@@ -320,7 +320,7 @@ class _Plan:
         return hessian
 
     def asks_of_what_moves(self) -> bool:
-        """Whether a goal, constraint or the cost is about a coordinate that something moves."""
+        """Return whether a goal, a constraint or the cost depends on a coordinate that some variable moves."""
         if np.any(~np.isnan(self.problem.goal) & self.moved) or self.problem.waypoints or self.problem.kept:
             return True
         by_xs = self._slopes[1]
@@ -329,7 +329,7 @@ class _Plan:
         return bool(np.any(about & self.moved))
 
     def can_move(self, i: int) -> bool:
-        """Whether coordinate i, that stays as it is here, could be moved: by contact, or by other variables."""
+        """Return whether coordinate i, unmoved along this plan, could move by contact or with other variables."""
         tree = self.trees.of_states[i]
         if tree not in self.reached:
             return tree in _joined(self.reached, self.trees.may_touch)
@@ -349,7 +349,7 @@ class _Plan:
 
 
 class _Trees:
-    """The parts of a model that joints hold together, each a number; what is fixed to the world is in none."""
+    """The kinematic trees of a model, as numbers. Bodies that are fixed to the world belong to no tree."""
 
     def __init__(self, model: Model):
         plant = model.plant
@@ -370,7 +370,7 @@ class _Trees:
                 self.of_states[i] = number
         driven = np.flatnonzero(np.any(model.actuation != 0, axis=1))
         self.driven = {self.of_states[model.nq + i] for i in driven.tolist()}
-        if model.systems_act:  # which may reach any of them
+        if model.systems_act:  # the diagram's systems may act on any tree
             self.driven = set(self.of_states)
         self.may_touch = tuple(self._candidates(model))
 
@@ -378,7 +378,7 @@ class _Trees:
         self.number = {body: a if number == b else number for body, number in self.number.items()}
 
     def pairs(self, a: str, b: str) -> Iterator[tuple[int, int]]:
-        """The trees of two bodies by their names; none where one of them is fixed to the world."""
+        """Yield the pairs of trees of two bodies by their names, or nothing if a body is fixed to the world."""
         for tree in self.names.get(a, ()):
             for other in self.names.get(b, ()):
                 yield tree, other
@@ -394,7 +394,7 @@ class _Trees:
 
 
 def _joined(reached: set[int], pairs: tuple[tuple[int, int], ...]) -> set[int]:
-    """`reached` and all that is joined to it by the pairs."""
+    """Return `reached` and all trees that the pairs connect to it."""
     trees, size = set(reached), -1
     while size != len(trees):
         size = len(trees)
@@ -405,21 +405,21 @@ def _joined(reached: set[int], pairs: tuple[tuple[int, int], ...]) -> set[int]:
 
 
 def _is_coupled(model: Model) -> bool:
-    """Whether something beside joints and contact holds bodies together: constraints, springs between them."""
+    """Return whether constraints or force elements such as springs couple bodies, besides joints and contact."""
     uncoupled = (UniformGravityFieldElement, RevoluteSpring, PrismaticSpring)
     elements = (model.plant.get_force_element(ForceElementIndex(i)) for i in range(model.plant.num_force_elements()))
     return bool(model.contract.constraints or model.forces) or not all(isinstance(e, uncoupled) for e in elements)
 
 
 def _what_is_apart(problem: Problem, xs: Array) -> str:
-    """Which bodies that may collide never touch along xs (N+1, nx); empty if there are none."""
+    """Describe the bodies that may collide but never touch along xs (N+1, nx), or return ""."""
     model, nearest = problem.model, dict[tuple[str, str], tuple[float, int]]()
     try:
         for k, x in enumerate(xs):
             set_state(model.double, x)
             for pair, distance in distances(model.double).items():
                 nearest[pair] = min((distance, k), nearest.get(pair, (np.inf, k)))
-    except ModelError:  # Drake knows no distance of some pair
+    except ModelError:  # Drake cannot compute the distance of some pair
         return ""
     apart = {pair: closest for pair, closest in nearest.items() if closest[0] > 0}
     if not apart:
@@ -432,9 +432,9 @@ def _what_is_apart(problem: Problem, xs: Array) -> str:
 
 
 def doubt_of_the_slope(problem: Problem, vector: ParameterVector, x0: Array, us: Array) -> tuple[str, str] | None:
-    """The value of the status of a solve whose plan's end has no slope, and why it has none; None where it has one.
+    """Return a status value and a reason if slopes contradict the derivative of a plan's end, or None if they agree.
 
-    Along the change of the variables that moves the end most, and along a random one; parameters stay as they are.
+    Slopes are along the change of variables that moves the end most and along a random one, with fixed parameters.
     """
     variables = ShootingVariables(problem)
     z = variables.pack(x0, us, vector.values)
@@ -474,7 +474,7 @@ def doubt_of_the_slope(problem: Problem, vector: ParameterVector, x0: Array, us:
 
 
 def _slope(vector: ParameterVector, variables: ShootingVariables, z: Array, direction: Array, width: float) -> Array:
-    """(nx,) that of the end over +-`width` along `direction` (size,)."""
+    """Return (nx,) the slope of the end over +-`width` along `direction` (size,)."""
     ahead, behind = (variables.unpack(z + sign * width * direction) for sign in (1, -1))
     with applied(vector) as model:
         motion = ContinuousMotion(model)

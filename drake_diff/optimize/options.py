@@ -13,7 +13,7 @@ from drake_diff.model.contact import SoftContact
 LARGEST_TOLERANCE = 1e3
 SOLVERS = ("ipopt", "snopt")
 HOOKS = ("on_start", "on_plan")
-# What only some methods take; "auto" takes all, and hands each to those that do.
+# Options of some methods only. "auto" accepts all, and passes each option to the methods that accept it.
 TAKEN_BY = {
     "scheme": ("collocation",),
     "solver": ("collocation", "shooting"),
@@ -32,35 +32,34 @@ TAKEN_BY = {
 
 @dataclass(frozen=True, repr=False)
 class Options:
-    """Options of `solve`, each with a default that serves most problems; the record of a run has them all.
+    """Options of `solve`, whose defaults suit most problems. The record of a run contains all of them.
 
     Attributes:
-        scheme: of collocation: "hermite_simpson" (order 4, the default), "trapezoid" (order 2), or "drake", which is
-            what Drake's DirectCollocation transcribes.
-        solver: "ipopt", or "snopt" with scheme="drake", which then is Drake's own DirectCollocation.
+        scheme: the collocation scheme: "hermite_simpson" (order 4, the default), "trapezoid" (order 2), or "drake", the
+            transcription of Drake's DirectCollocation.
+        solver: "ipopt", or "snopt" with scheme="drake", which runs Drake's own DirectCollocation.
         tolerance: the solver's tolerance of feasibility and optimality.
-        continuation: finds contact that the guess does not make, by stages of a force at a distance before the true
-            plant: "auto" or a sequence of SoftContacts, with method="ilqr"; or "relaxed": by inverse dynamics over the
-            positions of the guess, with contact and friction at a distance, of hinges, slides and free bodies that
-            spheres touch. `Solution.options` has the stages' log.
-        refine: with collocation, whether coarse intervals are split and the problem is solved again. None: where the
-            plan does not hold between its knots or in a replay, until it does or every error is at most
-            `error_tolerance`. True: until every error is. False: never.
-        error_tolerance: of an interval, against an accurate integration, in the states' units; and of its part of
-            the cost, relative to the whole.
-        max_num_steps: the most intervals of a refined mesh.
-        mesh_rounds: the most refinements of a mesh whose plan does not hold.
+        continuation: finds contact that the guess does not make, with method="ilqr". "auto" or a sequence of
+            SoftContacts solves stages with a force at a distance before the true plant. "relaxed" solves stages by
+            inverse dynamics over the positions of the guess, with contact and friction at a distance. It supports
+            hinges, slides and free bodies that touch spheres. `Solution.options` has the log of the stages.
+        refine: with collocation, whether coarse intervals are split and the problem is solved again. None: if the plan
+            fails between its knots or in a replay, until it passes or every error is at most `error_tolerance`. True:
+            until every error is at most `error_tolerance`. False: never.
+        error_tolerance: the largest error of an interval against an accurate integration, in the states' units, and of
+            its part of the cost, relative to the total cost.
+        max_num_steps: the largest number of intervals of a refined mesh.
+        mesh_rounds: the largest number of refinements of a mesh whose plan fails its checks.
         other_guesses: the number of random initial guesses after a straight line from which no motion is found.
         other_iterations: the solver's iteration limit from each of these guesses.
         guess_iterations: the iteration limit of an iLQR attempt of "auto" that makes a guess for the next attempt.
-        sweeps: the most iterations of iLQR that make the guess of shooting.
-        clearance_parts: the numbers of parts of a step at which obstacles are checked, one for each further search of
-            shooting or iLQR whose plan comes too near to an obstacle within a step.
+        sweeps: the largest number of iLQR iterations that make the guess of shooting.
+        clearance_parts: the numbers of parts of a step at which obstacles are checked. Each is for a further search by
+            shooting or iLQR, after a plan that comes too near to an obstacle within a step.
         on_start: called once, after all input is checked and before the search. Not recorded.
         on_plan: called with each unverified `Solution` that a search ends with. Not recorded.
-
     Raises:
-        InputError: a value does not fit; UnknownNameError for an unknown solver.
+        InputError: a value is invalid; UnknownNameError for an unknown solver.
 
     Example:
         >>> dd.optimize.Options(refine=True, error_tolerance=1e-8)
@@ -108,12 +107,12 @@ class Options:
         return f"Options({', '.join(f'{name}={value!r}' for name, value in self.changed().items())})"
 
     def changed(self) -> dict[str, Any]:
-        """The options that are not at their defaults."""
+        """Return the options that differ from their defaults."""
         pairs = ((f, getattr(self, f.name)) for f in fields(self))
         return {f.name: value for f, value in pairs if value is not f.default and value != f.default}
 
     def check_method(self, method: str) -> None:
-        """Raise InputError where an option was changed that `method` does not take."""
+        """Raise InputError if an option was changed that `method` does not accept."""
         for name, value in self.changed().items():
             methods = TAKEN_BY.get(name, (method,))
             if value is not False and method not in ("auto", *methods):
@@ -122,13 +121,13 @@ class Options:
                 raise InputError(name, got=f"{value!r:.80}", expected=expected)
 
     def of_method(self, method: str) -> "Options":
-        """These options without the scheme, solver, continuation and refinement that `method` does not take."""
+        """Return these options without a scheme, solver, continuation or refinement that `method` does not accept."""
         others = {name for name, methods in TAKEN_BY.items() if method not in methods}
         left_out: dict[str, Any] = {f.name: None for f in fields(self) if f.default is None and f.name in others}
         return replace(self, **left_out)
 
     def to_dict(self) -> dict[str, Any]:
-        """All options as plain values but the functions, for a record."""
+        """Return all options except the functions as plain values, for a record."""
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in HOOKS}
         stages = values["continuation"]
         if isinstance(stages, (list, tuple)):
@@ -137,7 +136,7 @@ class Options:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Options":
-        """The options of a record; those that it does not have are at their defaults."""
+        """Read the options of a record. Missing options have their default values."""
         known = [f.name for f in fields(cls) if f.name not in HOOKS]
         for name in values:
             if name not in known:

@@ -1,8 +1,8 @@
-"""Problems in phases: solved as one program, each phase judged as a solution, and their links and their chain as well.
+"""Problems in phases, solved as one program. Each phase is judged as a solution, as are the links and the chain.
 
-A chain is the motion that the dynamics make from the first state of all, through the resets at the times of the plan,
-open loop or under TVLQR whose cost to go is led back through the resets too. An `Impact` with a gap comes where that
-closes, by Drake's mass matrix, and the cost to go is led back through its saltation matrix.
+The chain is the motion of the dynamics from the very first state, through the resets at the plan's times, open loop or
+under TVLQR. The cost-to-go of TVLQR is propagated backward through the resets as well. An `Impact` with a gap occurs
+when the gap closes. It uses Drake's mass matrix, and the cost-to-go is propagated through its saltation matrix.
 """
 
 from collections.abc import Iterator, Sequence
@@ -33,21 +33,21 @@ from drake_diff.optimize.transcription.lead import SUBSTEPS
 from drake_diff.optimize.verification import ended, status_of
 
 NOT_FOUND = (Status.INFEASIBLE, Status.ITERATION_LIMIT, Status.DIVERGED, Status.FAILED)
-LATE = 0.1  # of a phase's time: so long after it an impact is waited for
-HALVES = 50  # of a step in which a gap closes
+LATE = 0.1  # fraction of a phase's duration by which an impact may be late
+HALVES = 50  # bisections of the step in which a gap closes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PhasedSolution(Solution):
-    """The motion that `solve` found for a `PhasedProblem`, and what it measures.
+    """The motion that `solve` found for a `PhasedProblem`, and its measures.
 
-    Every phase is a `Solution` with measures and a status of its own. The measures of all are the sum of the phases'
-    costs and horizons, and the largest of their errors; `link_errors` and `chain` are of the resets between them, and
-    `certificates` of the resets' derivatives. `xs` and `us` have the rows of all phases, NaN where a phase has fewer
-    states or inputs than another. `success` holds where the solver converged and all of that holds.
+    Every phase is a `Solution` with its own measures and status. Costs and horizons are sums over the phases, and
+    errors are the largest of all phases. `link_errors` and `chain` measure the resets between phases, and
+    `certificates` verify the derivatives of the resets. `xs` and `us` have the rows of all phases, with NaN where a
+    phase has fewer states or inputs than another. `success` is true if the solver converged and all checks pass.
 
     Attributes:
-        phases: A `Solution` of each phase, from its own time 0 on.
+        phases: A `Solution` for each phase, whose times start at 0.
 
     Example:
         >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
@@ -64,7 +64,7 @@ class PhasedSolution(Solution):
 
     @classmethod
     def joined(cls, problem: PhasedProblem, phases: Sequence[Solution], **fields: Any) -> "PhasedSolution":
-        """The solution of `problem` by its phases'."""
+        """Assemble the solution of `problem` from the solutions of its phases."""
         first, rows = phases[0], ([phase.xs for phase in phases], [phase.us for phase in phases])
         whole: dict[str, Any] = {"status": Status.FAILED, "message": "", "scheme": first.scheme} | fields
         return cls(
@@ -86,29 +86,29 @@ class PhasedSolution(Solution):
         return "\n  ".join(lines)
 
     def told(self, **fields: Any) -> "PhasedSolution":
-        """The same motion with other `fields`; a status is that of the phases too of which nothing was said yet."""
+        """Return the same motion with other `fields`. A new status also applies to phases without a message."""
         news = {name: fields[name] for name in ("status", "message") if name in fields}
         phases = (p if p.message or "status" not in news else p.told(**news) for p in self.phases)
         changed: Any = super().told(**fields)
         vars(changed)["phases"] = tuple(phases)
         return changed
 
-    transcribed = None  # as every phase has its own motion
+    transcribed = None  # each phase has its own motion
 
     def trajectory(self) -> Trajectories:
-        """ModelError: every one of `phases` has its own."""
+        """Raise ModelError, because each of `phases` has its own trajectory."""
         raise ModelError(
             f"{self.problem.name}: expected a phase, got all phases: each of `phases` has its own trajectory"
         )
 
     @property
     def defects(self) -> Array:
-        """The phases' defects, and then the distance of every link from its reset."""
+        """The defects of all phases, followed by the errors of all links."""
         return np.concatenate([*(phase.defects for phase in self.phases), *self.link_errors.values()])
 
     @property
     def integration_errors(self) -> Array:
-        """Those of the phases, one after the other."""
+        """The integration errors of all phases, concatenated."""
         return np.concatenate([phase.integration_errors for phase in self.phases])
 
     @property
@@ -118,47 +118,47 @@ class PhasedSolution(Solution):
 
     @property
     def initial_state_error(self) -> float:
-        """The distance of the first state of all from what is given of it."""
+        """The distance of the very first state from the given initial state."""
         return self.phases[0].initial_state_error
 
     @property
     def bound_excess(self) -> dict[str, tuple[float, int]]:
-        """That of all phases, with their names."""
+        """The excesses over bounds in all phases, by the phase's and the entry's name."""
         return {f"{name}: {key}": row for name, phase in self._named for key, row in phase.bound_excess.items()}
 
     @property
     def constraint_excess(self) -> dict[str, tuple[float, int]]:
-        """That of all phases, with their names."""
+        """The excesses over constraints in all phases, by the phase's and the constraint's name."""
         return {f"{name}: {key}": row for name, phase in self._named for key, row in phase.constraint_excess.items()}
 
     @property
     def cost(self) -> float:
-        """The sum of the phases' costs; inf where one is not finite."""
+        """The sum of the phases' costs, or inf if one is not finite."""
         return sum(phase.cost for phase in self.phases)
 
     @property
     def cost_error(self) -> float:
-        """The sum of the phases' errors."""
+        """The sum of the phases' cost errors."""
         return sum(phase.cost_error for phase in self.phases)
 
     @property
     def horizon(self) -> float:
-        """[s] from the first state to the last, or steps."""
+        """The duration from the first state to the last, in [s] or in steps."""
         return sum(phase.horizon for phase in self.phases)
 
     @property
     def starts(self) -> Array:
-        """(P,) [s] when each phase begins, or steps."""
+        """(P,) the start time of each phase, in [s] or in steps."""
         return np.cumsum([0.0, *(phase.horizon for phase in self.phases[:-1])])
 
     @property
     def times(self) -> Array:
-        """[s] of the rows of `xs`."""
+        """The times [s] of the rows of `xs`."""
         return np.concatenate([start + phase.times for start, phase in zip(self.starts, self.phases, strict=True)])
 
     @cached_property
     def link_errors(self) -> dict[str, Array]:
-        """By the name of each reset: (n,) how far the first state after it is from where it leads; inf if unknown."""
+        """For each reset, (n,) the distance of the next phase's first state from the reset's result; inf if unknown."""
         errors = {}
         for s in self.problem.switches:
             before, after = self.phases[s.before].xs[-1], self.phases[s.after].xs[0]
@@ -168,41 +168,41 @@ class PhasedSolution(Solution):
 
     @property
     def link_error(self) -> float:
-        """The largest of all, in its state's unit."""
+        """The largest of `link_errors`, in its state's unit."""
         return max((float(np.max(errors)) for errors in self.link_errors.values()), default=0.0)
 
     @cached_property
     def chain(self) -> Check:
-        """Where the dynamics lead from the first state of all through all phases: open loop, and else under TVLQR.
+        """The check of the dynamics from the very first state through all phases, open loop or else under TVLQR.
 
-        The value is the largest distance from the plan or beyond a bound, as a part of the state's range in its phase.
+        The value is the largest distance from the plan or beyond a bound, relative to the state's range in its phase.
         """
         return _chain_check(self)
 
     @property
     def following(self) -> list[Check]:
-        """The chain."""
+        """The check of the chain."""
         return [self.chain]
 
     @cached_property
     def link_checks(self) -> Checks:
-        """What is checked of resets, their derivatives and the sum of all durations."""
+        """Checks of the resets, their derivatives and the sum of all durations."""
         return Checks(_link_checks(self))
 
     @property
     def plan_checks(self) -> Checks:
-        """What is checked of the states and inputs of all phases, and of the links."""
+        """Checks of the states and inputs of all phases, and of the links."""
         rows = [replace(c, where=f"{name}: {c.where}") for name, phase in self._named for c in phase.plan_checks]
         return Checks([*rows, *self.link_checks])
 
     @property
     def replays(self) -> tuple[Replay, ...]:
-        """Those of the phases, one after the other."""
+        """The replays of all phases, concatenated."""
         return tuple(replay for phase in self.phases for replay in phase.replays)
 
     @property
     def checks(self) -> Checks:
-        """Everything that was checked, the worst first: of each phase, the links and the chain."""
+        """All checks of the phases, the links and the chain, the worst first."""
         rows = [replace(c, where=f"{name}: {c.where}") for name, phase in self._named for c in phase.checks]
         return Checks([*rows, *self.link_checks, self.chain])
 
@@ -212,7 +212,7 @@ class PhasedSolution(Solution):
 
 
 def _stacked(arrays: Sequence[Array]) -> Array:
-    """The rows of all, with NaN in the columns that one does not have."""
+    """Stack the rows of all arrays, with NaN in the columns that an array does not have."""
     width = max(array.shape[1] for array in arrays)
     rows = [np.pad(a, ((0, 0), (0, width - a.shape[1])), constant_values=np.nan) for a in arrays]
     return frozen(np.vstack(rows))
@@ -233,9 +233,9 @@ def _chain_check(solution: PhasedSolution) -> Check:
 
 
 def _led_through(solution: PhasedSolution, motions: Sequence[Collocated], control: str) -> tuple[float, str]:
-    """The largest distance from the plan, or beyond a bound, as a part of the state's range, and where it is.
+    """Return the largest distance from the plan or beyond a bound, relative to the state's range, and its place.
 
-    Where all phases have the same states, that is the largest of their ranges.
+    If all phases have the same states, the range is the largest over the phases.
     """
     problem, scales = solution.problem, [m.task.problem.state_scales(m.xs) for m in motions]
     if len({tuple(m.task.dynamics.state_names) for m in motions}) == 1:
@@ -276,10 +276,10 @@ def _led_through(solution: PhasedSolution, motions: Sequence[Collocated], contro
 
 
 def _until_it_touches(motion: Collocated, xs: Array, gains: Array | None, impact: Impact) -> Array | None:
-    """(S, nx) where a motion leads, ten steps an interval, until the gap closes that closes at the end of the plan.
+    """Return (S, nx) the motion, ten steps per interval, until the gap closes that the plan closes at its end, or None.
 
-    `xs` is where it leads to the end; from there it goes on for a tenth of its time. A gap that the plan itself closes
-    earlier, such as of a foot that swings through, does not count. None where none closes.
+    `xs` is the motion up to the plan's end. It continues for at most a tenth of its duration. A gap that the plan
+    itself closes earlier, as with a foot that swings through, does not count.
     """
     per, count, T = SUBSTEPS, len(motion.mesh) - 1, motion.horizon
     parts = np.linspace(0, 1, per + 1)[:-1]
@@ -324,7 +324,7 @@ def _until_it_touches(motion: Collocated, xs: Array, gains: Array | None, impact
 
 
 def _gains(problem: PhasedProblem, motions: Sequence[Collocated]) -> list[Array | None]:
-    """TVLQR's gains of each phase, whose cost to go at its end is that of the next phase through the reset."""
+    """Return TVLQR's gains of each phase, whose final cost-to-go is the next phase's, mapped through the reset."""
     gains: list[Array | None] = [None] * len(motions)
     at_end: Array | None = None
     for i in range(len(motions) - 1, -1, -1):
@@ -337,12 +337,12 @@ def _gains(problem: PhasedProblem, motions: Sequence[Collocated]) -> list[Array 
 
 
 def _impact_of(switch: Switch) -> Impact | None:
-    """The impact of a switch that comes where a gap closes."""
+    """Return the impact of a switch that occurs when a gap closes, or None."""
     return switch.reset if isinstance(switch.reset, Impact) and switch.reset.has_gap else None
 
 
 def _across(switch: Switch, before: Collocated, after: Collocated) -> Array:
-    """(n, m) the derivative of a first state by the last one before; of a rigid impact the saltation matrix."""
+    """Return (n, m) the derivative of the state after a switch, for a rigid impact the saltation matrix."""
     x = before.xs[-1]
     impact = _impact_of(switch)
     if impact is None:
@@ -353,7 +353,7 @@ def _across(switch: Switch, before: Collocated, after: Collocated) -> Array:
 
 
 def certified_links(transcription: Transcription, motions: Sequence[Collocated]) -> tuple[Certificate, ...]:
-    """GradientError where a derivative is refused."""
+    """Certify the derivatives of the links. Raises GradientError if a derivative does not exist."""
     certificates = []
     switches = transcription.problem.switches if transcription.links else ()
     for s, function in zip(switches, transcription.links, strict=True):
@@ -379,7 +379,7 @@ def _jacobian_of(function: PointFunction, z: Array) -> Array:
 
 
 def judged_phases(draft: PhasedSolution, result: NlpResult) -> Any:
-    """The draft, whose phases are judged, with the status that they, the links and the chain allow."""
+    """Return the draft, whose phases are judged, with the status that the phases, the links and the chain allow."""
     statuses, complaints = [phase.status for phase in draft.phases], [str(c) for c in draft.link_checks.failing]
     details = [
         f"{name}: {sentence}"
@@ -401,7 +401,7 @@ def judged_phases(draft: PhasedSolution, result: NlpResult) -> Any:
 
 
 def _link_checks(draft: PhasedSolution) -> Iterator[Check]:
-    """Resets that the plan keeps, derivatives that agree, and a sum of durations."""
+    """Check the resets, their derivatives and the sum of durations."""
     for s in draft.problem.switches:
         errors = draft.link_errors[s.label]
         after = draft.phases[s.after]

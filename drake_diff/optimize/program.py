@@ -1,4 +1,4 @@
-"""What is common to all solves: limits, progress, interrupts, the motion of an iterate, the best one, how they end."""
+"""Common parts of all solvers: limits, progress, interrupts, iterates and outcomes."""
 
 import enum
 import math
@@ -18,19 +18,19 @@ from drake_diff.model.step import advance
 from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.problem.problem import Problem
 
-FEASIBILITY_TOLERANCE = 1e-5  # defect, goal and bounds, of the scale of the state, input or constraint itself
-FAR_FROM_ONE = 1e4  # a scale or one over it: what a solver's own tolerances do not allow for
+FEASIBILITY_TOLERANCE = 1e-5  # of defects, goals and bounds, relative to the scale of the state, input or constraint
+FAR_FROM_ONE = 1e4  # a solver's own tolerances do not suit scales above this number or below its inverse
 
 
 def are_far_from_one(scales: Array) -> bool:
-    """Whether the numbers of a program have to be divided by its scales."""
+    """Return whether the scales of a program are so extreme that its numbers have to be divided by them."""
     return bool(np.max(scales) > FAR_FROM_ONE or np.min(scales) < 1 / FAR_FROM_ONE)
 
 
 class Scales(NamedTuple):
-    """What the numbers of a program are divided by, so that they do not depend on units.
+    """The numbers that a program is divided by, so that it does not depend on units.
 
-    Of its variables (n,), in iLQR of a knot's (nx + nu,), its rows (m,) and its cost; without them nothing is divided.
+    They apply to variables (n,) (in iLQR to those of a knot, (nx + nu,)), to rows (m,) and to the cost. Default: 1.
     """
 
     variables: Any = 1.0
@@ -44,15 +44,15 @@ REPORT_PERIOD = 0.2  # [s] between two progress reports: each costs an evaluatio
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Iterate:
-    """One motion of a search, with copies of its own: nothing that the solver does later changes it.
+    """One motion of a search, as a copy that the solver does not change later.
 
     Attributes:
-        problem: what is solved; a stage of a continuation has a problem of its own.
+        problem: the problem that is solved; a stage of a continuation has its own problem.
         times: (N+1,) [s].
-        xs: (N+1, nx) the states. Where the search has gaps still to close, from x_k under u_k the plant gets elsewhere.
-        us: (N, nu) the inputs; those of collocation are at the knots before the last.
-        vector: the parameters, as they are at this iterate.
-        by_steps: whether the search goes through the plant's own steps; collocation does not.
+        xs: (N+1, nx) the states. While the search has open gaps, the step from x_k under u_k need not end in x_(k+1).
+        us: (N, nu) the inputs; collocation has them at all knots except the last.
+        vector: the parameters at this iterate.
+        by_steps: whether the search uses the plant's own steps; collocation does not.
     """
 
     problem: Problem
@@ -67,17 +67,17 @@ class Iterate:
 
     @cached_property
     def contacts(self) -> tuple[tuple[ContactPoint, ...], ...] | None:
-        """The contacts of each of the N steps from x_k under u_k, computed when they are first asked for.
+        """The contacts of each of the N steps from x_k under u_k, computed on first access.
 
-        Collocation has no contact: N times none. None where the motion is in continuous time, in which contact comes
-        and goes within an interval. Raises SimulationError where the plant cannot take a step.
+        Collocation has no contact, so that all N tuples are empty. The value is None for a motion in continuous time,
+        because its contacts change within an interval. Raises SimulationError if the plant cannot take a step.
         """
         if self.problem.motion != STEPS:
             return None
         return tuple(self.contacts_in(range(len(self.us))))
 
     def contacts_in(self, steps: Iterable[int]) -> list[tuple[ContactPoint, ...]]:
-        """Those of some of the N steps, of a motion by steps."""
+        """Compute the contacts of some of the N steps of a discrete motion."""
         touches = self.problem.has_model and self.problem.model.contract.contact.collision_pairs
         if not (self.by_steps and touches):
             return [() for _ in steps]
@@ -91,15 +91,15 @@ class Iterate:
 
 @dataclass(frozen=True, slots=True)
 class Iteration:
-    """One row of the solver's own table; NaN where it prints no such number.
+    """One row of the solver's own table, with NaN for numbers that the solver does not print.
 
-    What a callback gets has the motion at which the solver stands too. The arrays are copies that may be kept.
-    Everything of it is None where the motion cannot be simulated, in `Solution.iterations`, and of a PhasedProblem,
-    which has one for each phase in `motions`.
+    A row in a callback also has the solver's current motion, in arrays that the callback may store. The motion's
+    attributes are None if it cannot be simulated, in `Solution.iterations`, and for a PhasedProblem, which has one
+    motion for each phase in `motions`.
 
     Attributes:
         iteration, objective, primal_infeasibility, dual_infeasibility, step: the solver's row.
-        motions: an `Iterate` for each phase; one where there are no phases.
+        motions: an `Iterate` for each phase; a single one if the problem has no phases.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.05)
@@ -120,22 +120,22 @@ class Iteration:
 
     @property
     def times(self) -> Array | None:
-        """(N+1,) [s]"""
+        """(N+1,) the times [s]."""
         return self.motions[0].times if len(self.motions) == 1 else None
 
     @property
     def xs(self) -> Array | None:
-        """(N+1, nx), in the states' units; see `Iterate`."""
+        """(N+1, nx) the states, in their units; see `Iterate`."""
         return self.motions[0].xs if len(self.motions) == 1 else None
 
     @property
     def us(self) -> Array | None:
-        """(N, nu), in the inputs' units; see `Iterate`."""
+        """(N, nu) the inputs, in their units; see `Iterate`."""
         return self.motions[0].us if len(self.motions) == 1 else None
 
     @property
     def contacts(self) -> tuple[tuple[ContactPoint, ...], ...] | None:
-        """N tuples: the contacts of each step, computed when they are first asked for; see `Iterate.contacts`."""
+        """N tuples with the contacts of each step, computed on first access; see `Iterate.contacts`."""
         return self.motions[0].contacts if len(self.motions) == 1 else None
 
     def __str__(self) -> str:
@@ -149,8 +149,8 @@ class Iteration:
 
 
 class Report:
-    """Where the progress of a solve goes: a `line` for people, an Iteration for `callback`, and for `plan` what a
-    search came to, before it is measured.
+    """The receivers of a solve's progress. `line` gets text, `callback` gets an Iteration, and `plan` gets the result
+    of a search before its verification.
     """
 
     def __init__(
@@ -161,16 +161,16 @@ class Report:
         looks: Callable[[], bool] = lambda: True,
     ):
         self.line, self.callback, self.plan = line, callback, plan
-        self.looks = looks  # whether the callback looks at the motions of a row
+        self.looks = looks  # whether the callback uses the motions of a row
         self.asked: Any = None  # the `Search` that is reported on
 
     def found(self, plan: Any) -> None:
-        """Hand on a solution that is not measured yet."""
+        """Report a solution that is not verified yet."""
         if self.plan is not None:
             self.plan(replace(plan, search=self.asked))
 
     def row(self, row: Iteration, motions: Callable[[], tuple[Iterate, ...]], *, printed: bool = True) -> None:
-        """Hand on `row` with its `motions`, which are made only where somebody gets them, and print it."""
+        """Report `row` with its `motions`, which are only made if the callback uses them, and print it."""
         if self.callback is not None:
             self.callback(replace(row, motions=motions()) if self.looks() else row)
         if printed:
@@ -183,7 +183,7 @@ class Report:
 
 
 class Outcome(enum.Enum):
-    """How the solver says it ended."""
+    """The outcome of a search, as the solver reports it."""
 
     SOLVED = "solved"
     ITERATION_LIMIT = "iteration limit"
@@ -199,7 +199,7 @@ class Outcome(enum.Enum):
 
 @dataclass(frozen=True)
 class Limits:
-    """When to stop: iterations, seconds, and the tolerance on feasibility and optimality."""
+    """The limits of a search: iterations, seconds, and the tolerance of feasibility and optimality."""
 
     max_iterations: int
     time_limit: float
@@ -208,42 +208,42 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class Multipliers:
-    """Those of a program's variables (n,), positive on an upper bound and negative on a lower one, and rows (m,)."""
+    """Multipliers of variables (n,), positive on an upper bound and negative on a lower one, and of rows (m,)."""
 
     variables: Array
     rows: Array
 
     @property
     def sizes(self) -> tuple[int, int]:
-        """(n, m)"""
+        """The sizes (n, m)."""
         return len(self.variables), len(self.rows)
 
 
 @dataclass(frozen=True, eq=False)
 class NlpResult:
-    """The final, or the best, values of the decision variables (n,), how they were reached, and a claim's limits."""
+    """The result of a nonlinear program: the final or the best variables (n,), and how they were reached."""
 
     z: Array
     outcome: Outcome
     message: str
     iterations: tuple[Iteration, ...]
-    note: str = ""  # what a claim of a minimum is limited to, if it is
-    # What multipliers of rows that hold leave of the Lagrangian's gradient, over its largest term; NaN if not known.
-    parameters: Array | None = None  # (np,) of iLQR: those of discrete steps that it found
+    note: str = ""  # restriction of the claim that this is a minimum
+    parameters: Array | None = None  # (np,) the values that iLQR found for discrete steps
+    # The part of the Lagrangian's gradient that active rows do not balance, over its largest term; NaN if unknown.
     stationarity: float = math.nan
-    multipliers: Multipliers | None = None  # where the solver has them
-    refusal: str = ""  # why a point could not be evaluated, the last one
+    multipliers: Multipliers | None = None  # if the solver provides them
+    refusal: str = ""  # reason for the last point that could not be evaluated
 
 
 def heard(result: NlpResult, interrupted: threading.Event) -> NlpResult:
-    """A result that says that it was interrupted where a signal came when the search had just ended, too."""
+    """Return the result, marked as interrupted if a signal came just after the search had ended."""
     if not interrupted.is_set() or result.outcome is Outcome.INTERRUPTED:
         return result
     return replace(result, outcome=Outcome.INTERRUPTED, message=f"{result.message}; then interrupted")
 
 
 class Watch:
-    """What is kept of a solve while it runs: the best iterate, and whether a signal or the clock ends it."""
+    """The state of a running solve: the best iterate, and whether a signal or the time limit ends it."""
 
     def __init__(self, limits: Limits, interrupted: threading.Event):
         self.limits, self.interrupted = limits, interrupted
@@ -254,11 +254,11 @@ class Watch:
 
     @property
     def elapsed(self) -> float:
-        """[s] since the start."""
+        """The time since the start [s]."""
         return now() - self.start
 
     def look_up(self) -> bool:
-        """Note what ends the solve, if anything does; whether a report is due."""
+        """Check for a signal and for the time limit, and return whether a report is due."""
         moment = now()
         if self.interrupted.is_set():
             self.stopped_by = Outcome.INTERRUPTED
@@ -269,11 +269,11 @@ class Watch:
         return due
 
     def offer(self, z: Array, cost: float, violation: float) -> None:
-        """Keep a copy of `z` (n,) if it is the best so far by cost + 1e6 * (violation beyond the tolerance)."""
+        """Store a copy of `z` (n,) if its cost + 1e6 * (violation beyond the tolerance) is the least so far."""
         merit = cost + 1e6 * max(0.0, violation - self.limits.tolerance)
         if self.best is None or merit < self.best_merit:
             self.best, self.best_merit = np.array(z), merit
 
     def best_of(self, guess: Array) -> Array:
-        """The best iterate, the guess where there was none."""
+        """Return the best iterate, or the guess if there is none."""
         return guess if self.best is None else self.best

@@ -1,17 +1,17 @@
-"""Motions under inverse dynamics of Drake's discrete step with relaxed contact, and the search for the best of them.
+"""Trajectory optimization by inverse dynamics of Drake's discrete step with relaxed contact.
 
-With v and v' the velocities before and after a step from q, the force that the motors would have to give is
+With v and v' the velocities before and after a step from q, the force that the motors would have to provide is
 
     tau = M(q) (v' - v) / h + bias(q, v) + springs + D v' - sum_c J_c(q)' f_c(phi_c, J_c v')
 
-as in Drake's step (see `derivatives.smooth_step`), but for f_c, which is smooth and acts at a distance:
+as in Drake's step (see `derivatives.smooth_step`), except for f_c, which is smooth and acts at a distance:
 
     f_n = F log2(1 + exp(-(phi + h vn) / sigma)) d(vn),   f_t = -mu f_n vt / sqrt(|vt|^2 + s^2)
 
-phi + h vn being the distance after the step, F the force of what just touches, sigma the reach, s the speed at which
-friction begins to slide and d a dissipation that leaves no rebound: 1 - vn / w for vn < 0, (1 - vn / (2 w))^2 to 2 w,
-then 0. Links of one tree push each other on the true plant alone. Inverse dynamics need no contact solver, and
-everything here has a closed form.
+Here phi + h vn is the distance after the step, F the force at first contact, sigma the reach and s the speed at which
+friction begins to slide. The dissipation d prevents rebound: 1 - vn / w for vn < 0, (1 - vn / (2 w))^2 up to 2 w, then
+0. Links of one tree push each other only on the true plant. Inverse dynamics needs no contact solver, and all
+expressions have a closed form.
 """
 
 from collections.abc import Callable
@@ -44,12 +44,12 @@ from drake_diff.optimize.ilqr.expansion import Motion, expand_costs
 from drake_diff.optimize.ilqr.riccati import LinearQuadratic, follow, slope_along, solve_riccati
 from drake_diff.optimize.problem.problem import Problem
 
-FAR = 12.0  # reaches: beyond it the force is 1e-5 of that of what touches, and left out
+FAR = 12.0  # reaches; at larger distances the force is below 1e-5 of that at contact, and is omitted
 
 
 @dataclass(frozen=True, eq=False)
 class Softness:
-    """How contact is relaxed in one stage."""
+    """The parameters of relaxed contact in one stage."""
 
     reach: float  # sigma [m]
     force: Array  # (P,) F [N] of each pair
@@ -59,7 +59,7 @@ class Softness:
 
 @dataclass(frozen=True, eq=False)
 class RelaxedForces:
-    """tau (N, nv) of N steps and its derivatives (N, nv, nv) by small motion, by v and by v'."""
+    """The forces tau (N, nv) of N steps and their derivatives (N, nv, nv) with respect to small motions, v and v'."""
 
     tau: Array
     by_motion: Array
@@ -69,7 +69,7 @@ class RelaxedForces:
 
 @dataclass(frozen=True, eq=False)
 class RelaxedPlant:
-    """What of a model does not change from step to step."""
+    """The data of a model that is the same in all steps."""
 
     model: Model
     tree: TreeModel
@@ -77,35 +77,35 @@ class RelaxedPlant:
     pairs: ContactPairs
     topology: Topology
     by_body: Array  # (bodies of pairs, nv)
-    carriers: Indices  # (bodies of pairs,) the link of each body, -1 of the world
+    carriers: Indices  # (bodies of pairs,) the link of each body, -1 for the world
     material: Material
     actuation: Array  # (nv, nu)
-    labels: dict[Any, str]  # of Drake's bodies, by their index, as in the topology
+    labels: dict[Any, str]  # of Drake's bodies, keyed by their index, as in the topology
 
     @cached_property
     def inverse_actuation(self) -> Array:
-        """(nu, nv) the inputs that give a force."""
+        """(nu, nv) the map from forces to the inputs that produce them."""
         return np.asarray(np.linalg.pinv(self.actuation), dtype=float)
 
     @cached_property
     def undriven(self) -> Array:
-        """(nv, nv - rank) an orthonormal basis of the forces that no input gives."""
+        """(nv, nv - rank) an orthonormal basis of the forces that no input can produce."""
         left, size, _ = np.linalg.svd(self.actuation)
         rank = int(np.count_nonzero(size > 1e-9 * np.max(size, initial=0.0)))
         return np.asarray(left[:, rank:])
 
     def moving(self, body: Any) -> Array:
-        """(nv,) 1 for the degrees of freedom that move one of Drake's bodies."""
+        """Return (nv,) 1 for the degrees of freedom that move a Drake body."""
         return self.topology.bodies[self.labels[body.index()]]
 
     def _poses(self, links: Array) -> Array:
-        """(N, bodies, 3, 4) of the bodies of the pairs, from those of the links."""
+        """Return the poses (N, bodies, 3, 4) of the bodies of the pairs, from the poses of the links."""
         poses = own_array(links[:, self.carriers])
         poses[:, self.carriers < 0] = np.eye(3, 4)
         return poses
 
     def forces(self, q: Array, v: Array, v_next: Array, soft: Softness, *, slopes: bool) -> RelaxedForces:
-        """At q (N, nq), v and v_next (N, nv); without `slopes` the derivatives are empty."""
+        """Compute the forces at q (N, nq), v and v_next (N, nv). Without `slopes`, the derivatives are empty."""
         tree, h, n = self.tree, self.model.time_step, self.coordinates.nv
         a = (v_next - v) / h
         moved = tree.compiled(q, v, a, derivatives=slopes)
@@ -132,7 +132,7 @@ class RelaxedPlant:
         return RelaxedForces(moved.tau + added - push, by_q, by_v, by_next)
 
     def distances(self, q: Array) -> Array:
-        """(N, P) the signed distance of each pair at q (N, nq), infinite where it is further than 1e3 m."""
+        """Return (N, P) the signed distance of each pair at q (N, nq), or inf beyond 1e3 m."""
         still = np.zeros((len(q), self.coordinates.nv))
         links = self.tree.compiled(q, still, still, derivatives=False).poses
         touch = _within(self.pairs, self._poses(links), 1e3)
@@ -163,7 +163,7 @@ class RelaxedPlant:
 
 @cache
 def _law() -> Any:
-    """The force (3,) on the sphere's side, and its Jacobian by z: v' of that side less the other's, normal and phi."""
+    """Build the force (3,) on the sphere and its Jacobian; z is the relative v' of the sphere, the normal and phi."""
     import casadi as ca
 
     from drake_diff.optimize.knots import Mapped
@@ -172,7 +172,7 @@ def _law() -> Any:
     velocity, normal, phi = z[:3], z[3:6], z[6]
     friction, size, reach, slip, rebound, h = ca.vertsplit(constants)
     vn = ca.dot(velocity, normal)
-    ahead = (phi + h * vn) / reach  # how far the two are apart after the step, in reaches
+    ahead = (phi + h * vn) / reach  # distance after the step, in reaches
     elastic = size / np.log(2) * (ca.fmax(-ahead, 0) + ca.log1p(ca.exp(-ca.fabs(ahead))))
     damping = ca.if_else(vn < 0, 1 - vn / rebound, ca.fmax(1 - vn / rebound / 2, 0) ** 2)
     tangent = velocity - vn * normal
@@ -183,9 +183,9 @@ def _law() -> Any:
 
 
 def contact_forces(z: Array, constants: Array) -> tuple[Array, Array]:
-    """(M, 3) the forces of M contacts, and (M, 7, 3) their derivatives by each entry of z (M, 7).
+    """Return (M, 3) the forces of M contacts, and (M, 7, 3) their derivatives with respect to each entry of z (M, 7).
 
-    By the expressions of the law, of as many rows as a power of two, so that few maps of them are made.
+    The number of rows is padded to a power of two, so that few maps of the expressions are made.
     """
     count = len(z)
     padded = [np.ones((1 << count.bit_length(), rows.shape[1])) for rows in (z, constants)]
@@ -195,16 +195,16 @@ def contact_forces(z: Array, constants: Array) -> tuple[Array, Array]:
 
 
 def _within(pairs: ContactPairs, poses: Array, far: float) -> Touches:
-    """The pairs that are no further apart than `far` [m]: they overlap where the spheres are larger by that."""
+    """Return the pairs within the distance `far` [m], which overlap if the spheres are enlarged by `far`."""
     touch = replace(pairs, radius=pairs.radius + far).touching(poses)
-    further, change = far / 2 * touch.normal, np.array(touch.change)  # from the larger sphere's middle to the pair's
+    further, change = far / 2 * touch.normal, np.array(touch.change)  # from the larger sphere's midpoint to the pair's
     change[:, :, 3:] += change[:, :, :3] @ skew(further)
     change[:, :3] += far / 2 * change[:, 3:6]
     return replace(touch, middle=touch.middle + further, phi=touch.phi + far, change=change)
 
 
 def _of_one_tree(pairs: ContactPairs, rows: Array, topology: Topology) -> NDArray[np.bool_]:
-    """(P,) whether the same root carries both, by which degrees of freedom move each body (bodies, nv)."""
+    """Return the mask (P,) of pairs in one tree. `rows` (bodies, nv) mark the degrees of freedom that move a body."""
     first = np.where(rows.any(axis=1), np.argmax(rows > 0, axis=1), -1 - np.arange(len(rows)))
     return np.asarray(first[pairs.sphere_body] == first[pairs.other_body])
 
@@ -216,7 +216,7 @@ def _select_pairs(pairs: ContactPairs, mask: NDArray[np.bool_]) -> ContactPairs:
 
 
 def relaxed_plant(model: Model) -> RelaxedPlant | Refusal:
-    """Of a tree of hinges, slides and free bodies whose contacts are of spheres; else why there is none."""
+    """Return the relaxed plant of a tree of hinges, slides and free bodies with sphere contacts, or a Refusal."""
     form = form_of(model)
     contact = model.contract.contact
     if contact.model != "point":
@@ -251,20 +251,20 @@ def relaxed_plant(model: Model) -> RelaxedPlant | Refusal:
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """What tunes the search of a stage."""
+    """The parameters of a stage's search."""
 
     growth: float = 5.0
     largest_penalty: float = 1e8
-    sufficient: float = 1e-3  # of the decrease that the model promises
-    smallest: float = 1e-8  # of the Hessian's largest entry: what counts as its smallest
+    sufficient: float = 1e-3  # fraction of the decrease that the quadratic model predicts
+    smallest: float = 1e-8  # smallest curvature, as a fraction of the Hessian's largest entry
     least_damping: float = 1e-9
     most_damping: float = 1e9
-    enough: float = 1e-3  # of the merit: less than that is no gain
-    inner: int = 20  # steps between two looks at the multipliers
-    # [m/s or rad/s], and in the units of bounds and goals: what a stage leaves is for the true plant to close.
+    enough: float = 1e-3  # fraction of the merit; a smaller gain counts as none
+    inner: int = 20  # steps between two updates of the multipliers
+    # [m/s or rad/s], or in the units of bounds and goals. The search on the true plant closes smaller gaps.
     closed: float = 1e-3
-    stalled: float = 0.7  # of what was open: where no more than that was closed
-    patience: int = 6  # times in a row, the search ends
+    stalled: float = 0.7  # an update that leaves a larger fraction of the gap is stalled
+    patience: int = 6  # stalled updates in a row that end the search
 
 
 OPTIONS = SearchOptions()
@@ -272,7 +272,7 @@ OPTIONS = SearchOptions()
 
 @dataclass(frozen=True, eq=False)
 class RelaxedMotion:
-    """q (N+1, nq), and what it comes to."""
+    """Positions q (N+1, nq), and the quantities that follow from them."""
 
     q: Array
     xs: Array  # (N+1, nx)
@@ -282,7 +282,7 @@ class RelaxedMotion:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The motion, its cost and how far it is from one: what no motor gives as a speed [m/s or rad/s], in N steps."""
+    """The motion of a stage and its cost. `gap` is the force that no motor provides, as a speed [m/s or rad/s]."""
 
     motion: RelaxedMotion
     iterations: int
@@ -293,14 +293,14 @@ class Found:
 
 
 class RelaxedSearch:
-    """Gauss-Newton over positions: the least cost of a motion of one problem, by inverse dynamics.
+    """Gauss-Newton search over positions for the motion of least cost, by inverse dynamics.
 
-    The unknowns are q_1 ... q_N. Velocities are v_k = (q_k - q_(k-1)) / h, forces are those of the plant, inputs what
-    of them the motors give, and what they cannot give has to vanish. That, bounds, goals and constraints are an
-    augmented Lagrangian. With v_(k+1) as the input that leads from q_k to q_(k+1), a step is Riccati's sweep (Kurtz and
-    Lin, "Inverse dynamics trajectory optimization for contact-implicit model predictive control", 2023; there the
-    forces that no motor gives cost a penalty). No motion is ever rolled out, so that any guess will do. Each stage
-    begins where the one before ended.
+    The unknowns are q_1 ... q_N. Velocities are v_k = (q_k - q_(k-1)) / h, forces are those of the plant, and inputs
+    are the part of the forces that motors provide. The other part must vanish. This condition, bounds, goals and
+    constraints enter an augmented Lagrangian. With v_(k+1) as the input from q_k to q_(k+1), a step is a Riccati sweep
+    (Kurtz and Lin, "Inverse dynamics trajectory optimization for contact-implicit model predictive control", 2023; they
+    penalize forces that no motor provides). Motions are never rolled out, so that any guess is possible. Each stage
+    begins at the result of the previous stage.
     """
 
     def __init__(self, problem: Problem, plant: RelaxedPlant):
@@ -316,7 +316,7 @@ class RelaxedSearch:
         self.started = False
 
     def _scales(self) -> tuple[Array, Array]:
-        """What a force of 1 along each undriven direction and each input changes in a step, as a speed."""
+        """Return the speed that a unit force along each undriven direction and each input adds in a step."""
         x0, model, plant = self.problem.x0, self.problem.model, self.plant
         still = np.zeros((1, model.nv))
         moved = plant.tree.compiled(x0[None, : model.nq], still, still, derivatives=False)
@@ -329,7 +329,7 @@ class RelaxedSearch:
     def run(
         self, q: Array, soft: Softness, most: int, is_over: Callable[[], bool], tell: Callable[[str], None]
     ) -> Found:
-        """At most `most` steps from q (N+1, nq), of which the first is given."""
+        """Take at most `most` steps from q (N+1, nq), whose first row is given."""
         motion = self.motion(q, soft)
         if not self.started:
             self._start(motion)
@@ -364,7 +364,7 @@ class RelaxedSearch:
     def _improved(
         self, motion: RelaxedMotion, merit: float, soft: Softness, damping: float
     ) -> tuple[RelaxedMotion | None, float, float]:
-        """The motion after a step that lowers the merit, None where there is none; by how much; and the damping."""
+        """Return the motion after a step that lowers the merit (or None), the decrease, and the damping."""
         model, size = self._expand(motion, soft)
         while damping <= OPTIONS.most_damping:
             step = self._step(model, damping * size)
@@ -397,7 +397,7 @@ class RelaxedSearch:
         self.started = True
 
     def _undriven(self, motion: RelaxedMotion) -> Array:
-        """(N, nv - rank) the forces that no motor gives."""
+        """Return (N, nv - rank) the forces that no motor can provide."""
         return motion.tau @ self.undriven
 
     def _merit(self, motion: RelaxedMotion) -> float:
@@ -407,14 +407,14 @@ class RelaxedSearch:
             return cost + of_rows + self.constraints.value(motion.xs, motion.us)
 
     def _size(self, motion: RelaxedMotion) -> float:
-        """What the merit's parts come to, which may cancel in it."""
+        """Return the size of the merit's parts, which may cancel in the merit."""
         of_rest = float(np.sum((self._undriven(motion) * self.rest.scale) ** 2))
         return abs(self.problem.objective(motion.xs, motion.us)) + self.rest.penalty / 2 * of_rest
 
     def _update(
         self, motion: RelaxedMotion, before: tuple[float, float], now: tuple[float, float], *, grow: bool
     ) -> None:
-        """Better multipliers, and where the last ones did not help, higher penalties."""
+        """Update the multipliers, and raise the penalties whose violation decreases too slowly."""
         self.rest.update(self._undriven(motion))
         self.inputs.update(motion.us)
         self.constraints.update(motion.xs, motion.us)
@@ -430,17 +430,17 @@ class RelaxedSearch:
         beyond = self.inputs.scale * self.inputs.excess(motion.us)
         return max(self.constraints.violation(motion.xs, motion.us), float(np.max(beyond, initial=0.0)))
 
-    # ------------------------------------------------------------------ its expansion
+    # ------------------------------------------------------------------ the expansion of the cost
 
     def _expand(self, motion: RelaxedMotion, soft: Softness) -> tuple[LinearQuadratic, Array]:
-        """The cost by small motions of q and changes of v, v_(k+1) being the input of knot k; see `_sizes`."""
+        """Expand the cost in small motions of q and changes of v; v_(k+1) is the input of knot k; see `_sizes`."""
         nv, nq, N, h = self.nv, self.problem.model.nq, self.count, self.h
         q, v = motion.q, motion.xs[:, nq:]
         forces = self.plant.forces(q[:-1], v[:-1], v[1:], soft, slopes=True)
-        g, H = self._of_knots(motion)  # by [dq_k, v_k, tau_k]
-        Z = np.tile(np.diag([1.0] * 2 * nv + [0.0] * nv), (N + 1, 1, 1))  # that by z_k = [dq_k, dv_k, dv_(k+1)]
+        g, H = self._of_knots(motion)  # with respect to [dq_k, v_k, tau_k]
+        Z = np.tile(np.diag([1.0] * 2 * nv + [0.0] * nv), (N + 1, 1, 1))  # d[dq, v, tau]_k / d[dq_k, dv_k, dv_(k+1)]
         Z[:-1, 2 * nv :] = np.concatenate([forces.by_motion, forces.by_v, forces.by_next], axis=2)
-        first, second = slopes_of(self.plant.coordinates, q[:-1], q[1:])  # of h v_(k+1)
+        first, second = slopes_of(self.plant.coordinates, q[:-1], q[1:])  # derivatives of h v_(k+1)
         F = np.zeros((N, 2 * nv, 3 * nv))
         F[:, :nv, :nv], F[:, :nv, 2 * nv :] = -np.linalg.solve(second, first), h * np.linalg.inv(second)
         F[:, nv:, 2 * nv :] = np.eye(nv)
@@ -450,7 +450,7 @@ class RelaxedSearch:
         return model, self._sizes(hessians, first / h, second / h)
 
     def _sizes(self, hessians: Array, first: Array, second: Array) -> Array:
-        """(nv,) the mean curvature of the cost by one q_k alone, which changes v_k and v_(k+1) too."""
+        """Return (nv,) the mean curvature of the cost in a single q_k, which also changes v_k and v_(k+1)."""
         none, identity = np.zeros_like(first), np.broadcast_to(np.eye(self.nv), first.shape)
         after, beyond = np.concatenate([first[1:], none[:1]]), np.zeros((1, *hessians.shape[1:]))
         moved = (none, none, second), (identity, second, after), (none, after, none)
@@ -460,7 +460,7 @@ class RelaxedSearch:
         return np.asarray(np.maximum(size, OPTIONS.smallest * np.max(size)) + np.finfo(float).tiny)
 
     def _of_knots(self, motion: RelaxedMotion) -> tuple[Array, Array]:
-        """The gradients (N+1, 3 nv) and Hessians (N+1, 3 nv, 3 nv) of the augmented cost by [dq, v, tau]."""
+        """Return gradients (N+1, 3 nv) and Hessians (N+1, 3 nv, 3 nv) of the augmented cost in [dq, v, tau]."""
         nv, nq, nx, N = self.nv, self.problem.model.nq, self.problem.nx, self.count
         rate = self.plant.coordinates.rate(motion.q)
         T = np.zeros((N + 1, nx + self.problem.nu, 3 * nv))
@@ -480,14 +480,14 @@ class RelaxedSearch:
         return g, H
 
     def _step(self, model: LinearQuadratic, weights: Array) -> tuple[Array, Array] | None:
-        """Gauss-Newton's step, with `weights` (nv,) on how far q_k and q_(k+1) part: a whole motion may shift."""
+        """Compute the Gauss-Newton step. `weights` (nv,) penalize changes of q_(k+1) - q_k, but no common shift."""
         apart, hessians = model.F[:, : self.nv] - np.eye(self.nv, 3 * self.nv), np.array(model.hessians)
         hessians[:-1] += (apart.swapaxes(1, 2) * weights) @ apart
         policy = solve_riccati(replace(model, hessians=hessians), 0.0)
         return None if policy is None else follow(model, policy)
 
     def _moved(self, q: Array, d: Array) -> Array:
-        """q (N+1, nq) moved by d (N+1, nv)."""
+        """Move q (N+1, nq) by d (N+1, nv)."""
         coordinates = self.plant.coordinates
         moved = q + (coordinates.rate(q) @ d[..., None])[..., 0]
         for i, _ in coordinates.free:
@@ -496,14 +496,14 @@ class RelaxedSearch:
 
 
 def _conjugate_product(p: Array, q: Array) -> Array:
-    """(..., 4) p * conj(q) of quaternions w x y z."""
+    """Return (..., 4) p * conj(q) of quaternions (w, x, y, z)."""
     w = (p * q).sum(axis=-1)
     vector = q[..., :1] * p[..., 1:] - p[..., :1] * q[..., 1:] - np.cross(p[..., 1:], q[..., 1:])
     return np.concatenate([w[..., None], vector], axis=-1)
 
 
 def between(coordinates: Coordinates, q: Array, q_next: Array) -> tuple[Array, list[Array]]:
-    """(N, nv) the small motion from q to q_next (each (N, nq)), h v' of Drake's step; and the turns (N, 3) in it."""
+    """Return (N, nv) the small motion h v' of Drake's step from q to q_next (N, nq), and its rotations (N, 3)."""
     moves, turns = np.empty((len(q), coordinates.nv)), []
     for i, j in coordinates.single:
         moves[:, j] = q_next[:, i] - q[:, i]
@@ -516,7 +516,7 @@ def between(coordinates: Coordinates, q: Array, q_next: Array) -> tuple[Array, l
 
 
 def slopes_of(coordinates: Coordinates, q: Array, q_next: Array) -> tuple[Array, Array]:
-    """(N, nv, nv) the derivatives of `between` by small motions of q and of q_next."""
+    """Return (N, nv, nv) the derivatives of `between` with respect to small motions of q and of q_next."""
     _, turns = between(coordinates, q, q_next)
     first = np.repeat(-np.eye(coordinates.nv)[None], len(q), axis=0)
     second = -first

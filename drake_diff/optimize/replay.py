@@ -1,17 +1,17 @@
-"""Replay a plan on Drake's double plant: in its own step and finer ones, in continuous time, and under another contact.
+"""Replay a plan on Drake's double plant in its own and finer steps, in continuous time, and with another contact model.
 
-A motion that exists at one step size or in one law of contact only is an artefact of the numerics. A plan holds in a
-variant of the plant if its inputs reach the goal and keep all limits, open loop or under TVLQR about the plan.
+A motion that exists only at one step size or with one contact model is a numerical artefact. A plan holds in a variant
+of the plant if its inputs reach the goal and satisfy all limits, open loop or under TVLQR about the plan.
 
-A plan in steps has to hold at h, h/2 and h/8 and, where nothing can touch, in continuous time. There the inputs lead
-elsewhere than the plan, for which TVLQR has offsets. A plan that does not hold open loop there also has to come near
-its goal without them. A collocated plan has no steps of its own: it has to hold at two successive ones of h, h/2, ...
-h/64. Under feedback less is allowed, since the end then depends on its weights too.
+A discrete plan must hold at h, h/2 and h/8 and, without possible contacts, in continuous time. In the variants finer
+than h, its inputs lead away from the plan, and TVLQR has offsets that correct this. A plan that fails open loop there
+must also come near its goal without offsets. A collocated plan has no step of its own, and must hold at two successive
+steps of h, h/2, ... h/64. Tolerances are tighter under feedback, as the end then also depends on the feedback weights.
 
-The other law of contact is followed by the gains of the plan's own steps: where a foot has just landed, lagged contact
-has derivatives of fifty times the plan's, and its own gains throw the foot up. A step that is right for one law may be
-too long for another, whose foot then goes through the ground. So a plan that does not hold in the other law at h is
-tried in it at h/8, which decides. A plan in continuous time with contact has to hold in another integration of its law.
+Under the other contact model, the gains are those of the plan's own steps: after a landing, lagged contact has
+derivatives fifty times as large as the plan's, and its own gains throw the foot up. A step that suits one model may be
+too long for another, so that a foot passes through the ground. A plan that fails with the other model at h is therefore
+tried at h/8, which decides. A plan in continuous time with contact must hold in another integration.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -43,36 +43,36 @@ from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.problem.terminal import TerminalConstraint
 from drake_diff.optimize.transcription.collocation import EFFORT_WEIGHT, FINAL_WEIGHT
 
-# Of a coordinate's range in the plan: how far from goal, bound or waypoint a replay may be. Discretizations differ by
-# O(h), so nothing tight can be asked of h against h/2; a plan that is wrong is wrong by the order of its range.
+# Largest distance of a replay from a goal, bound or waypoint, as a fraction of a coordinate's range in the plan.
+# Replays at h and h/2 differ by O(h), so that the tolerance cannot be tight; a wrong plan is off by about its range.
 STATE_TOLERANCE = 0.05
-# The same under TVLQR, of the goal alone: where the effort weighs a fourth, a saturated motion was seen to end three
-# times as far off. Who repeats the plan has other weights.
+# The same under TVLQR, for the goal only. With a quarter of the effort's weight, a saturated motion ended three times
+# as far off, and users who repeat the plan have other weights.
 FEEDBACK_TOLERANCE = 0.03
-# Gains alone leave the error of a coarse step where it is, and other simulators have other laws of contact and of joint
-# limits: there a motion may end, and in these also stray, twice as far.
+# Gains without offsets do not correct the error of a coarse step: their motion may end twice as far off. Other
+# simulators have other models of contact and joint limits: their motion may also deviate twice as far on the way.
 WIDER = 2.0
-LEAST_EFFORT = 1e-3  # of the largest input, what a regulator weighs an input by that the plan does not use
-SAME = 1e-2  # the same in the plan's own plant, of every state at every knot, and of the cost
-ANOTHER_PLANT = 0.2  # the same of positions on the way, and of the cost, in another plant, in which a goal decides
-SMALLEST_ENERGY = 1e-9  # [J] less is rounding
-ENERGY_TOLERANCE = 0.1  # of the energy that the motion exchanges: what no force accounts for
-HELD = 1e-3  # of a constraint's scale: it moves at least that far, where a plan stays on it
-PENETRATION_PART = 0.25  # of the thinnest geometry's thickness: beyond half of it contact may push out the other way
+LEAST_EFFORT = 1e-3  # smallest scale of an input in a regulator, as a fraction of the largest input scale
+SAME = 1e-2  # tolerance in the plan's own plant, for every state at every knot and for the cost
+ANOTHER_PLANT = 0.2  # tolerance in another plant, for positions on the way and the cost, if there is no goal
+SMALLEST_ENERGY = 1e-9  # [J] smaller values are rounding
+ENERGY_TOLERANCE = 0.1  # largest unexplained energy, as a fraction of the energy that the motion exchanges
+HELD = 1e-3  # smallest range of a constraint that a plan stays on, as a fraction of its scale
+PENETRATION_PART = 0.25  # fraction of the thinnest geometry's thickness; beyond half, contact may push the other way
 OTHER_APPROXIMATION = {"sap": "lagged", "similar": "sap", "lagged": "sap", "tamsi": "sap"}
-FINE = 8  # parts of a step: what is left of an error of O(h) from there on is a seventh of what is seen up to there
-# Intervals are cut into at most that many steps: a hand that is to be within 5 mm at 1 m/s needs those of 5 ms.
+FINE = 8  # parts of a step; at h/8 the O(h) error that remains is a seventh of the change from h to h/8
+# Largest numbers of steps in an interval. A hand that must be within 5 mm at 1 m/s needs steps of 5 ms.
 FINER, FINEST = 16, 64
-MOST_STEPS = 4000  # of a replay in more than FINER parts of an interval
+MOST_STEPS = 4000  # of a replay with more than FINER parts per interval
 ANOTHER_INTEGRATION, IN_CONTINUOUS_TIME = "by another integration in continuous time", "in continuous time"
-TOLERANCE = 1e-6  # of each step of the integration in continuous time: the motion is judged to 5 %
-EVALUATIONS = 150_000  # of the equations of motion; stiffer ones are followed in the short steps instead
+TOLERANCE = 1e-6  # of each step of the integration in continuous time; the motion is judged to 5 %
+EVALUATIONS = 150_000  # of the equations of motion; stiffer plants are replayed in short steps instead
 OPEN_LOOP, FEEDBACK, GAINS_ALONE = "open loop", "TVLQR", "TVLQR without offsets"
 BROKEN = (SimulationError, ModelError, GradientError, ValueError)
 
 
 class MeasuredMotion(Protocol):
-    """What is measured of a motion: times (n+1,) [s], xs (n+1, nx), us (n, nu) and penetration (n+1,) [m]."""
+    """The measured data of a motion: times (n+1,) [s], xs (n+1, nx), us (n, nu) and penetration (n+1,) [m]."""
 
     @property
     def times(self) -> Array: ...
@@ -86,9 +86,9 @@ class MeasuredMotion(Protocol):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Replay(ShowsItsRepr):
-    """A plan followed in one variant of the plant under one control: its motion and what is checked of it.
+    """The replay of a plan in one variant of the plant under one controller, with its motion and its checks.
 
-    `motion` is None, and the measures infinite, where it could not be taken.
+    If the replay failed, `motion` is None and the measures are infinite.
     """
 
     variant: str
@@ -97,9 +97,9 @@ class Replay(ShowsItsRepr):
     approximation: str
     motion: Any
     checks: tuple[Check, ...]
-    goal_error: float = np.inf  # the largest distance from the goal, free entries apart, in the state's units
+    goal_error: float = np.inf  # the largest distance from the goal, without free entries, in the state's units
     bound_violation: float = np.inf  # the largest excess of a state over a bound, in the state's units
-    energy_error: float = np.inf  # [J] drift of the energy that no force accounts for
+    energy_error: float = np.inf  # [J] energy drift that no force explains
     penetration: float = np.inf  # [m]
 
     @property
@@ -121,10 +121,10 @@ class Replay(ShowsItsRepr):
 
 @dataclass(frozen=True, eq=False)
 class ReplayPlan:
-    """What is replayed: `sample(m)` gives xs (m N + 1, nx) and us (m N, nu) held over each m-th part of an interval.
+    """A plan to replay. `sample(m)` returns xs (m N + 1, nx), and us (m N, nu) held over each m-th part of an interval.
 
-    `time_step` [s] is an interval's length; `continuous` tells that the plan is a motion in continuous time. `cost` is
-    the plan's.
+    `time_step` [s] is an interval's length. `continuous` is true if the plan is a motion in continuous time. `cost` is
+    the plan's cost.
     """
 
     problem: Problem
@@ -136,20 +136,20 @@ class ReplayPlan:
 
     @cached_property
     def scale(self) -> Array:
-        """(nx,) see `Problem.state_scales`."""
+        """(nx,) the scales of the states; see `Problem.state_scales`."""
         return self.problem.state_scales(self.sample(1)[0])
 
     def cost_of(self, xs: Array, us: Array, parts: int) -> float:
-        """The objective of xs (m N + 1, nx) and us (m N, nu), `parts` m of whose steps make an interval of the plan.
+        """Compute the objective of xs (m N + 1, nx) and us (m N, nu), with m = `parts` steps per interval of the plan.
 
-        Of a plan in steps that is the sum over its own knots.
+        For a discrete plan, it is the sum over the plan's own knots.
         """
         every = 1 if self.continuous and self.problem.trajectory_cost is None else parts
         total = self.problem.objective(xs[::every], us[::every], self.time_step * every / parts)
         return total + self.problem.cost_of_parameters(self.vector.values)
 
     def cost_tolerance(self, fraction: float) -> float:
-        """How much the cost changes where each state and input is off by that `fraction` of its range all along."""
+        """Return the change of the cost if each state and input is off by this `fraction` of its range all along."""
         xs, us = self.sample(1)
         cost, total = self.cost_of(xs, us, 1), 0.0
         for values, scale in ((xs, self.scale), (us, np.ptp(us, axis=0))):
@@ -160,42 +160,42 @@ class ReplayPlan:
 
     @cached_property
     def open_loop(self) -> Rollout | None:
-        """The plant's own motion under the inputs at the plan's own step; None if it cannot be taken."""
+        """The plant's open-loop motion at the plan's own step, or None if the simulation fails."""
         try:
             xs, us = self.sample(1)
             with self.applied_to(self.model_at(1)) as model:
                 return _rolled(self.problem, model, xs[0], us, len(us))
         except (SimulationError, ModelError, ValueError):
-            return None  # not finite, or beyond what Drake can step: recorded as missing, never as zero
+            return None  # not finite, or Drake cannot step it: recorded as missing, never as zero
 
     def applied_to(self, model: Model) -> AbstractContextManager[Model]:
-        """The model with the plan's parameters, until the context ends."""
+        """Return the model with the plan's parameters, until the context ends."""
         return applied(select(model, self.vector.to_dict()))
 
     @cached_property
     def follower(self) -> "Callable[..., PlanFollower]":
-        """Of `PlanFollower`'s parts and pieces: always the same one, which knows its gains."""
+        """The cached constructor of `PlanFollower` by its parts and pieces, so that gains are computed once."""
         return cache(partial(PlanFollower, self))
 
     @property
     def follower_in_continuous_time(self) -> "PlanFollower":
-        """Of a plan in steps of a model that cannot touch: by a controller in quarters of its steps."""
+        """The follower of a discrete plan without contact, with a controller in quarters of the plan's steps."""
         return self.follower(FINE // 2, 0)
 
     @property
     def own_plant(self) -> str:
-        """The variant in which a plan by steps is made; empty of a collocated one, which no step makes."""
+        """The variant in which a discrete plan was made, or "" for a collocated plan."""
         steps = f"in steps of {self.time_step:.4g} s"
         return "" if self.continuous else ANOTHER_INTEGRATION if self.problem.motion == CONTINUOUS else steps
 
     def model_at(self, parts: int) -> Model:
-        """The model at the m-th part of an interval."""
+        """Return the model with the time step interval / `parts`."""
         model, h = self.problem.model, self.time_step / parts
         return model if h == model.time_step else model.at_time_step(h)
 
 
 def held(xs: Array, us: Array) -> Callable[[int], tuple[Array, Array]]:
-    """`Plan.sample` of states xs (N+1, nx) at the ends of steps over which us (N, nu) is held."""
+    """Return `ReplayPlan.sample` for states xs (N+1, nx) at the ends of steps over which us (N, nu) is held."""
 
     def sample(parts: int) -> tuple[Array, Array]:
         places = np.arange(parts * len(us) + 1) / parts
@@ -206,12 +206,12 @@ def held(xs: Array, us: Array) -> Callable[[int], tuple[Array, Array]]:
 
 
 def replays(plan: ReplayPlan) -> tuple[Replay, ...]:
-    """`plan` in the variants of the plant, open loop and, if there are inputs, under TVLQR."""
+    """Replay `plan` in the variants of the plant, open loop and, if there are inputs, under TVLQR."""
     model, parts = plan.problem.model, 2
     if plan.problem.motion == CONTINUOUS:
         return tuple(plan.follower().in_model(ANOTHER_INTEGRATION, lambda: model))
     rows = plan.follower().in_steps()
-    if not model.can_rebuild:  # a user's diagram is one plant: there are no variants of it to try
+    if not model.can_rebuild:  # a user's diagram has no variants
         return tuple(rows)
     rows += plan.follower(parts).in_steps()
     if plan.continuous:
@@ -234,20 +234,20 @@ def replays(plan: ReplayPlan) -> tuple[Replay, ...]:
 
 
 def finest_parts(plan: ReplayPlan) -> int:
-    """In how many steps an interval of a collocated plan is cut at most."""
+    """Return the largest number of steps in an interval of a collocated plan."""
     return min(FINEST, max(FINER, MOST_STEPS // plan.problem.num_steps))
 
 
 def deciding(plan: ReplayPlan, rows: Sequence[Replay]) -> list[str]:
-    """The variants in which the plan has to hold."""
+    """Return the variants in which the plan must hold."""
     variants = list(dict.fromkeys(r.variant for r in rows))
     if plan.continuous:
-        return variants[-2:] if len(variants) > 1 else []  # the two finest; one alone says nothing
+        return variants[-2:] if len(variants) > 1 else []  # the two finest; a single variant is no evidence
     return [v for v in variants if not any(other.startswith(f"{v} in steps of ") for other in variants)]
 
 
 def judged_replay(plan: ReplayPlan, rows: Sequence[Replay]) -> Replay | None:
-    """The motion that a verdict rests on: open loop where that holds, else under TVLQR; None where neither does."""
+    """Return the replay that decides the verdict: open loop if that holds, else under TVLQR, or None if both fail."""
     decides = deciding(plan, rows)
     for control in dict.fromkeys(r.control for r in rows if r.control != GAINS_ALONE):
         tried = [r for r in rows if r.control == control]
@@ -256,15 +256,15 @@ def judged_replay(plan: ReplayPlan, rows: Sequence[Replay]) -> Replay | None:
     return None
 
 
-# A motion under a control, and what is checked of it besides.
+# A function of a controller's name that returns a motion and additional checks of it.
 Mover = Callable[[str], tuple[MeasuredMotion, list[Check]]]
 
 
 class FollowedPlant(NamedTuple):
-    """Where a plan is followed: the motion that a plant makes, and the model whose contact is like the plant's.
+    """A plant in which a plan is replayed: a function that moves it, and the model whose contact is like the plant's.
 
-    The plant takes `pieces` steps for one of the controller's, of the model's `time_step` [s] where none is given.
-    Tolerances are `wider` than they would be.
+    The plant takes `pieces` steps for each step of the controller. `time_step` [s] is the model's by default. `wider`
+    is a factor on tolerances.
     """
 
     variant: str
@@ -278,9 +278,9 @@ class FollowedPlant(NamedTuple):
 class PlanFollower:
     """A plan under its own controller, in any plant.
 
-    The controller has `parts` steps of `period` [s] in an interval of the plan. Each command is held over one of them.
-    Finer steps than a plan's own do not lead from one of its states to the next (`leads_elsewhere`): TVLQR has offsets
-    for a plant that takes `pieces` of them for one of the controller's, 0 where it moves in continuous time.
+    The controller has `parts` steps of `period` [s] in an interval of the plan, and holds each command over a step.
+    Steps finer than a plan's own do not lead from one planned state to the next (`leads_elsewhere`). TVLQR then has
+    offsets for a plant that takes `pieces` steps per controller step, with 0 for continuous time.
     """
 
     def __init__(self, plan: ReplayPlan, parts: int = 1, pieces: int = 1):
@@ -291,20 +291,20 @@ class PlanFollower:
 
     @cached_property
     def model(self) -> Model:
-        """The model in the controller's steps."""
+        """The model with the controller's time step."""
         return self.plan.model_at(self.parts)
 
     @cached_property
     def plant(self) -> Model:
-        """The model in the plant's steps; in continuous time in the controller's."""
+        """The model with the plant's time step, or with the controller's if the plant moves in continuous time."""
         return self.plan.model_at(self.parts * max(1, self.pieces))
 
     @cached_property
     def gains(self) -> Array:
-        """(m N, nu, nt) of TVLQR in each of the controller's steps.
+        """(m N, nu, nt) the gains of TVLQR in each of the controller's steps.
 
-        A motion in continuous time has gains that are smooth in time: those of halves, in between, are next to those of
-        finer steps.
+        The gains of a motion in continuous time are smooth in time. Gains at finer steps are interpolated from those at
+        half steps, which are almost equal.
         """
         if self.parts <= 2 or not self.plan.continuous:
             return self._regulator.gains
@@ -323,7 +323,7 @@ class PlanFollower:
             return regulator(self.plan, model, self.xs, self.us, defects)
 
     def _ends(self) -> list[Array]:
-        """Where the controller's steps lead from the plan's states."""
+        """Return the ends of the controller's steps from the plan's states."""
         us = [np.tile(u, (max(1, self.pieces), 1)) for u in self.us]
         with self.plan.applied_to(self.plant) as plant:
             steps = DrakeSteps(plant, self.plan.vector)
@@ -331,9 +331,9 @@ class PlanFollower:
             return [states(x, held_us)[-1] for x, held_us in zip(self.xs, us, strict=False)]
 
     def law(self, control: str = FEEDBACK, pieces: int = 1) -> Policy:
-        """u(x, t) for one motion at a time, in a plant that takes `pieces` steps for one of the controller's.
+        """Return the law u(x, t) for a single motion, in a plant that takes `pieces` steps per controller step.
 
-        Under TVLQR it is within the bounds of inputs and the limits of their rates, from the first command on.
+        Under TVLQR, commands keep the bounds of inputs and, from the first command on, the limits of their rates.
         """
         space, last = tangent_space(self.plan.problem.model), list[Any]()
         bounds, slew, us = self.plan.problem.bounds, self._slew, self.us
@@ -358,7 +358,7 @@ class PlanFollower:
 
     @cached_property
     def _slew(self) -> Array:
-        """(nu,) by how much a command may differ from the last one."""
+        """(nu,) the largest change from one command to the next."""
         slew = np.full(self.plan.problem.model.nu, np.inf)
         period = self.period if self.plan.continuous else self.plan.time_step  # held inputs jump at the plan's knots
         for limit in self.plan.problem.rate_limits:
@@ -368,16 +368,16 @@ class PlanFollower:
         return slew
 
     def in_steps(self) -> list[Replay]:
-        """By each control in the controller's own steps."""
+        """Replay under each controller in the controller's own steps."""
         return self.in_model(f"in steps of {self.period:.4g} s", lambda: self.model)
 
     def in_model(self, variant: str, make: Callable[[], Model], pieces: int = 1, enough: bool = False) -> list[Replay]:
-        """`replays` in the steps of a model, which may not be to be had."""
+        """Run `replays` in the steps of the model from `make`. An error in `make` returns missing replays."""
         try:
             model = make()
         except (ModelError, InputError) as error:
             return [missing_replay(self.plan, variant, control, str(error)) for control in self.controls]
-        # A coarse step gains and loses some energy, an artefact all.
+        # Coarse steps gain and lose some energy, which is a numerical artefact.
         with_energy = self.plan.continuous or self.parts * pieces >= FINE or not model.can_rebuild
 
         def move(control: str) -> tuple[MeasuredMotion, list[Check]]:
@@ -391,7 +391,7 @@ class PlanFollower:
         return self.replays(FollowedPlant(variant, model, move, pieces), enough=enough)
 
     def in_continuous_time(self, *, enough: bool = False) -> list[Replay]:
-        """`replays` in the continuous time that Drake's steps stand for; in short steps where there is none."""
+        """Run `replays` in the continuous time that Drake's steps approximate, or in short steps if that fails."""
 
         def move(control: str) -> tuple[MeasuredMotion, list[Check]]:
             law, x0, count = self.law(control), self.xs[0], len(self.us)
@@ -410,9 +410,9 @@ class PlanFollower:
         return short if any(row.motion is not None for row in short) else rows
 
     def replays(self, plant: FollowedPlant, *, enough: bool = False) -> list[Replay]:
-        """By each control, and by gains alone where the inputs lead elsewhere and do not hold.
+        """Replay under each controller, and by gains without offsets if finer steps lead elsewhere and fail open loop.
 
-        With `enough` by TVLQR, and by the inputs alone where that does not hold.
+        With `enough`, replay under TVLQR, and open loop only if TVLQR fails.
         """
         rows = list[Replay]()
         for control in self.controls[::-1] if enough else self.controls:
@@ -424,16 +424,16 @@ class PlanFollower:
         return rows
 
     def replay(self, plant: FollowedPlant, control: str) -> Replay:
-        """The replay in a plant under one control."""
+        """Replay the plan in a plant under one controller."""
         plan, (variant, model, move, pieces, time_step, wider) = self.plan, plant
         every = pieces * self.parts
         try:
             motion, checks = move(control)
-            if control == GAINS_ALONE:  # which stand for any such regulator
+            if control == GAINS_ALONE:  # these gains represent any such regulator
                 off = plan.problem.goal_error(motion.xs[-1])
                 checks = [goal_check(plan, off, WIDER * STATE_TOLERANCE), *comparison_checks(plan, motion, every)]
             elif np.all(np.isfinite(motion.xs)):
-                # Feedback corrects what the laws of contact differ by: there nothing tighter can be asked of it.
+                # Feedback must correct the difference between contact models, so that its tolerance is wider there.
                 tight = control == FEEDBACK and wider == 1 and not _has_another_law(plan, model)
                 fraction = FEEDBACK_TOLERANCE if tight else wider * STATE_TOLERANCE
                 same = variant == plan.own_plant
@@ -457,7 +457,7 @@ def measured_replay(
     checks: Iterable[Check],
     time_step: float | None = None,
 ) -> Replay:
-    """A replay that was taken; `time_step` [s] is the model's unless it is given."""
+    """Return the replay of a completed motion. `time_step` [s] is the model's by default."""
     bounds, feedback = plan.problem.bounds, None if control == OPEN_LOOP else control
     beyond = np.maximum(bounds.x_lower - motion.xs, motion.xs - bounds.x_upper)[1:]
     return Replay(
@@ -475,7 +475,7 @@ def measured_replay(
 
 
 def missing_replay(plan: ReplayPlan, variant: str, control: str, why: str, time_step: float | None = None) -> Replay:
-    """A replay that could not be taken: its measures are infinite, never zero."""
+    """Return a failed replay. Its measures are infinite, never zero."""
     feedback = None if control == OPEN_LOOP else control
     row = replace(check("motion", why, np.inf, 0.0, verdict="undecided"), plant=variant, feedback=feedback)
     h, contact = plan.time_step if time_step is None else time_step, plan.problem.model.contract.contact
@@ -483,7 +483,7 @@ def missing_replay(plan: ReplayPlan, variant: str, control: str, why: str, time_
 
 
 def _rolled(problem: Problem, model: Model, x0: Array, inputs: Array | Policy, count: int) -> Rollout:
-    """The plant's motion by its own steps, or in continuous time by another integration than a plan is made by."""
+    """Simulate the plant in its own steps, or in continuous time by another integration than the plan's."""
     if problem.motion == CONTINUOUS:
         return replayed(model, x0, inputs, count)
     if callable(inputs):
@@ -495,9 +495,9 @@ def _rolled(problem: Problem, model: Model, x0: Array, inputs: Array | Policy, c
 
 
 def regulator(plan: ReplayPlan, model: Model, xs: Array, us: Array, defects: Sequence[Array] | None = None) -> TVLQR:
-    """TVLQR on `model` about xs (N+1, nx) and us (N, nu) of the plan; for `defects` see `TVLQR`."""
+    """Return TVLQR on `model` about the plan's xs (N+1, nx) and us (N, nu). See `TVLQR` for `defects`."""
     Q, R, final = regulator_weights(plan, us)
-    ratio = model.time_step / plan.time_step  # a running cost is summed over more steps where they are finer
+    ratio = model.time_step / plan.time_step  # finer steps add more terms to a running cost
     jacobians = None
     if plan.problem.motion == CONTINUOUS:
         jacobians = intervals_of(model, select(model, ()), CONTINUOUS).jacobians(xs, us)
@@ -505,9 +505,9 @@ def regulator(plan: ReplayPlan, model: Model, xs: Array, us: Array, defects: Seq
 
 
 def regulator_weights(plan: ReplayPlan, us: Array) -> tuple[Array, Array, Array]:
-    """Q (nt, nt), R (nu, nu) and Qf by Bryson's rule, one over the square of each range; a rotation's is a radian.
+    """Return Q (nt, nt), R (nu, nu) and Qf by Bryson's rule, 1 / range^2. The range of a rotation is one radian.
 
-    Where jerks are limited, the end has no weight of its own: the last steps would pull at it.
+    If jerks are limited, the end has no extra weight, because the last steps would react to it.
     """
     space = tangent_space(plan.problem.model)
     effort = plan.problem.input_scales(us)
@@ -517,7 +517,7 @@ def regulator_weights(plan: ReplayPlan, us: Array) -> tuple[Array, Array, Array]
     return Q, EFFORT_WEIGHT * np.diag(1 / effort**2), (1.0 if smooth else FINAL_WEIGHT) * Q
 
 
-# What is checked of a motion.
+# Checks of a motion.
 
 
 def motion_checks(
@@ -530,10 +530,10 @@ def motion_checks(
     *,
     same: bool = False,
 ) -> Iterator[Check]:
-    """All that the problem asks of `motion`, of which `parts` steps make one of the plan's; energy apart.
+    """Check what the problem requires of `motion`, except energy; `parts` of its steps make one step of the plan.
 
-    It may end `fraction` of each state's range from x_goal, or in the `same` plant SAME of its way; every other
-    tolerance is `wider` than a replay's.
+    It may end off x_goal by `fraction` of each state's range, or in the `same` plant by SAME of its travel. `wider` is
+    a factor on all other tolerances of a replay.
     """
     problem = plan.problem
     if not _has_another_law(plan, model):
@@ -556,36 +556,36 @@ def motion_checks(
 
 
 def comparison_checks(plan: ReplayPlan, motion: MeasuredMotion, parts: int, *, same: bool = False) -> Iterator[Check]:
-    """The states at the plan's knots and the cost beside the plan's.
+    """Compare the states at the plan's knots and the cost with those of the plan.
 
-    In the `same` plant all states and the cost agree to SAME, or to a cost that is nothing. In another one the goal
-    decides where there is one. Else positions, the last state and the cost are compared to ANOTHER_PLANT: impacts come
-    at other times there, and a step of another length leads elsewhere by its own error.
+    In the `same` plant, all states and the cost must agree to SAME, or to a negligible cost. In another plant, only the
+    goal decides if the problem has one. Otherwise positions, the last state and the cost are compared to ANOTHER_PLANT,
+    because impacts occur at other times, and a step of another length has another error.
     """
     problem, wanted, fraction = plan.problem, plan.sample(1)[0], SAME if same else ANOTHER_PLANT
     asked = [c for c in problem.kept_goals if not isinstance(c, ClearanceConstraint)]
     if not same and (asked or not np.all(np.isnan(problem.goal))):
-        return  # what is asked decides: feedback costs what it has to
+        return  # the goals decide, as feedback may change the cost
     distances = np.abs(motion.xs[::parts] - wanted[: len(motion.xs[::parts])])
     if not same:
         distances[:-1, problem.model.nq :] = 0.0
-    with np.errstate(invalid="ignore"):  # a plan whose states are not finite
+    with np.errstate(invalid="ignore"):  # for a plan with states that are not finite
         k, i = divmod(int(np.argmax(np.nan_to_num(distances / plan.scale, nan=np.inf))), distances.shape[1])
     where, unit = f"{problem.state_names[i]} at knot {k}", units_of(problem)[i]
     yield check("following", where, distances[k, i], fraction * plan.scale[i], unit)
     with np.errstate(all="ignore"):
         difference = abs(plan.cost_of(motion.xs, motion.us, parts) - plan.cost)
         tolerance = fraction * abs(plan.cost)
-        if not difference <= tolerance:  # as a rule that much is enough
+        if not difference <= tolerance:  # this tolerance usually suffices
             tolerance += problem.least_cost(wanted[0], plan.time_step) if same else plan.cost_tolerance(STATE_TOLERANCE)
     yield check("replayed cost", "the whole motion", difference, tolerance)
 
 
 def goal_check(plan: ReplayPlan, distance: Array, fraction: float = STATE_TOLERANCE, *, same: bool = False) -> Check:
-    """The `distance` (nx,) from the goal of the state that is furthest from it for its tolerance.
+    """Check the `distance` (nx,) from the goal of the state that is furthest off relative to its tolerance.
 
-    That is the problem's `goal_tolerance` where it is given, else in the `same` plant SAME of what the state has to
-    travel, in another one the `fraction` of its range along the plan.
+    The tolerance is the problem's `goal_tolerance` if it is given. Otherwise it is SAME of the state's travel in the
+    `same` plant, and the `fraction` of its range along the plan in another plant.
     """
     problem = plan.problem
     tolerances = problem.goal_tolerances(plan.sample(1)[0])
@@ -596,10 +596,10 @@ def goal_check(plan: ReplayPlan, distance: Array, fraction: float = STATE_TOLERA
 
 
 def bounds_check(plan: ReplayPlan, motion: MeasuredMotion, wider: float = 1.0) -> Check:
-    """The state of the motion, but the first, that is furthest beyond a bound for its range."""
+    """Check the state, except the first, that exceeds a bound most relative to its range."""
     bounds, scale, tolerance = plan.problem.bounds, plan.scale, wider * STATE_TOLERANCE * plan.scale
     excess = np.maximum(np.maximum(bounds.x_lower - motion.xs, motion.xs - bounds.x_upper), 0.0)[1:]
-    if not len(excess):  # it broke off in its first step
+    if not len(excess):  # the motion ended in its first step
         return check("bound", "no state after the first", 0.0, tolerance[0], units_of(plan.problem)[0])
     k, i = divmod(int(np.argmax(np.nan_to_num(excess / scale, nan=np.inf))), excess.shape[1])
     where = f"{plan.problem.state_names[i]} at {motion.times[k + 1]:.3g} s"
@@ -607,7 +607,7 @@ def bounds_check(plan: ReplayPlan, motion: MeasuredMotion, wider: float = 1.0) -
 
 
 def clearance_checks(plan: ReplayPlan, motion: MeasuredMotion) -> Iterator[Check]:
-    """How near the motion comes to obstacles, at its states or between them: it may use the margin up."""
+    """Check how near the motion comes to obstacles, at its states or between them. It may use up the margin."""
     for c in clearances(plan.problem.kept):
         yield c.nearest(*along_steps(motion.times, motion.xs), c.tolerance)
     for goal in plan.problem.goals:
@@ -617,7 +617,7 @@ def clearance_checks(plan: ReplayPlan, motion: MeasuredMotion) -> Iterator[Check
 
 
 def penetration_check(model: Model, motion: MeasuredMotion) -> Check:
-    """The deepest overlap for a quarter of the thinner of the geometries that overlap."""
+    """Check the deepest overlap, relative to a quarter of the thickness of the thinner overlapping geometry."""
     least, name = thinnest_geometry(model)
     deep = list[Check]()
     for k in np.flatnonzero(motion.penetration > PENETRATION_PART * least):
@@ -633,9 +633,9 @@ def penetration_check(model: Model, motion: MeasuredMotion) -> Check:
 
 
 def loop_check(model: Model, motion: MeasuredMotion) -> Check:
-    """How far the points of a loop come apart for a hundredth of the mechanism: Drake's constraints give way to force.
+    """Check how far the points of a loop separate, with a tolerance of a hundredth of the mechanism's size.
 
-    They do so in proportion to the square of the time step.
+    Drake's constraints yield to forces, in proportion to the square of the time step.
     """
     gaps = [gap(model, x[: model.nq]) if np.all(np.isfinite(x)) else (np.inf, 1.0) for x in motion.xs]
     k = int(np.argmax([distance / size for distance, size in gaps]))
@@ -644,19 +644,19 @@ def loop_check(model: Model, motion: MeasuredMotion) -> Check:
 
 
 def energy_check(motion: Rollout) -> Check:
-    """Energy out of nothing, or gone; what constraints (couplers, balls, welds) take is not told."""
+    """Check for unexplained energy. A loss to constraints (couplers, balls, welds) is unknown and not reported."""
     gained, tolerance = motion.energy_drift, energy_tolerance(motion)
     is_measured = gained > 0 or np.all(np.isfinite(motion.constraint_violation))
     return check("energy", "gained" if gained > 0 else "lost", abs(gained) if is_measured else 0.0, tolerance, "J")
 
 
 def energy_tolerance(motion: Rollout) -> float:
-    """[J] how much lasting energy a motion may gain or lose unexplained."""
+    """Return [J] the largest lasting energy that a motion may gain or lose without an explanation."""
     return max(ENERGY_TOLERANCE * motion.energy_exchanged, SMALLEST_ENERGY)
 
 
 def _miss(c: GoalConstraint, motion: MeasuredMotion, plan: ReplayPlan) -> float:
-    """The largest distance of a replay from a goal at the knots of the plan."""
+    """Return the largest distance of a replay from a goal at the knots of the plan."""
     parts = (len(motion.xs) - 1) // plan.problem.num_steps
     knots = plan.problem.knots_of(c, input_at_end=False)
     if c.dwells:
@@ -665,11 +665,11 @@ def _miss(c: GoalConstraint, motion: MeasuredMotion, plan: ReplayPlan) -> float:
 
 
 def _constraint_checks(plan: ReplayPlan, xs: Array, us: Array, wider: float) -> Iterator[Check]:
-    """Of constraints, couplings and waypoints, by a replay's states xs (N+1, nx) and us (N, nu) at the plan's knots."""
+    """Check constraints, couplings and waypoints by a replay's xs (N+1, nx) and us (N, nu) at the plan's knots."""
     problem, tolerances = plan.problem, dict[str, float]()
     planned_xs, planned_us = plan.sample(1)
     spans = problem.spans(planned_xs, planned_us)
-    for c in problem.constraints:  # its range is that along the whole plan: at a single knot it has none
+    for c in problem.constraints:  # the range is that along the whole plan, as a single knot has no range
         with np.errstate(all="ignore"):
             values = np.array([c(x, u) for x, u in zip(planned_xs, [*planned_us, planned_us[-1]], strict=True)])
         values = values[np.isfinite(values).all(axis=1)]
@@ -680,7 +680,7 @@ def _constraint_checks(plan: ReplayPlan, xs: Array, us: Array, wider: float) -> 
         held_at = HELD * float(np.max(coupling.scales(planned_xs, planned_us, spans), initial=0.0))
         reach = max(coupling.reach(planned_xs, planned_us), held_at)
         tolerances[coupling.label] = max(STATE_TOLERANCE * reach, tolerances.get(coupling.label, 0.0))
-    goals = {c.label for c in problem.kept_goals}.difference(tolerances)  # they say themselves how near is near enough
+    goals = {c.label for c in problem.kept_goals}.difference(tolerances)  # goals have tolerances of their own
     for name, (excess, knot) in problem.constraint_excess(xs, us, coupled=couplings).items():
         tolerance = wider * tolerances.get(name, STATE_TOLERANCE * float(np.max(plan.scale)))
         if name not in goals:
@@ -688,5 +688,5 @@ def _constraint_checks(plan: ReplayPlan, xs: Array, us: Array, wider: float) -> 
 
 
 def _largest(values: Array) -> float:
-    """The largest value, at least 0; inf where one is no number."""
+    """Return the largest value, at least 0, or inf if a value is NaN."""
     return float("inf") if np.any(np.isnan(values)) else float(np.max(values, initial=0.0))

@@ -1,4 +1,4 @@
-"""One solve by one method: certify at the guess, search, certify at the result, measure, judge."""
+"""One solve by one method: certify the guess, search, certify the result, verify it and decide its status."""
 
 import dataclasses
 import threading
@@ -51,8 +51,8 @@ from drake_diff.optimize.transcription.steps import solve_shooting
 from drake_diff.optimize.verification import ended, judged, may_be_too_coarse, refused, status_of, unmeasured
 
 NEAR = "a motion near the collocated optimum, but not an optimum in these steps"
-GRACE = 0.05  # of the time limit, beyond it: for measures of what a search found that the limit ended
-# What a solve is made of, in this order; a time limit names what it cut.
+GRACE = 0.05  # extra time, as a fraction of the time limit, for measures of a result that the limit cut off
+# The stages of a solve, in order. A message on the time limit names the stages that were skipped.
 STAGES = ("certificates of the guess", "the search", "certificates of the result", "replays and other measures")
 
 Searcher = Callable[[Problem, Array, Array, Array], tuple[NlpResult, Array, Array]]
@@ -60,17 +60,17 @@ Searcher = Callable[[Problem, Array, Array, Array], tuple[NlpResult, Array, Arra
 
 @dataclass(eq=False)
 class SoFar:
-    """What a run has when the clock ends it, and the stage that it is in; see STAGES."""
+    """The partial result of a run for the case that time runs out, and the current stage; see STAGES."""
 
     stage: int
     draft: Solution
     result: NlpResult | None = None
-    judged: Solution | None = None  # where a finer mesh is tried
+    judged: Solution | None = None  # set while a finer mesh is tried
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One solve by one method: certify at the guess, search, certify at the result, measure, judge."""
+    """One solve by one method: certify the guess, search, certify the result, verify it and decide its status."""
 
     problem: Any  # a Problem, or for collocation a PhasedProblem
     method: str
@@ -78,19 +78,19 @@ class Run:
     solver: str
     limits: Limits
     asked: Options
-    options: dict[str, Any]  # what the record says of the solver
+    options: dict[str, Any]  # the record's options of the solver
     report: Report | None
-    searched: Problem | None = None  # what is solved where that is more than what is asked
-    closest: bool = False  # whether any motion near the guess will do, an optimum or not
+    searched: Problem | None = None  # the problem to solve, if it differs from `problem`
+    closest: bool = False  # whether any motion near the guess suffices, an optimum or not
     start: float = field(default_factory=now)
     started: float = field(default_factory=time.monotonic)
-    certified: dict[bytes, Certificate] = field(default_factory=dict)  # by state, input and parameters
-    reached: list[SoFar] = field(default_factory=list)  # the last is where it is
+    certified: dict[bytes, Certificate] = field(default_factory=dict)  # keyed by state, input and parameters
+    reached: list[SoFar] = field(default_factory=list)  # the last entry is the current stage
 
     def within_time(self, search: Callable[[], Any], guess: Any, begin: Callable[[], None]) -> Any:
-        """What `search`, one of the three below, gives; where the time limit comes first, what there is by then.
+        """Return the result of `search`, one of the three below, or the partial result at the time limit.
 
-        `begin` is called before it; a signal that comes meanwhile leaves the guess, as one that comes later does.
+        `begin` is called before it. A signal during `begin` or later ends the run with the guess.
         """
         self.reached.append(SoFar(0, self._of_guess(guess)))
         with noted_interrupts() as interrupted:
@@ -104,7 +104,7 @@ class Run:
             return self._cut(self.reached[-1], interrupted=isinstance(error, StoppedError))
 
     def _of_guess(self, guesses: Sequence[Guess]) -> Solution:
-        """The draft of a solve that found nothing: its guess, by collocation with an input at the last knot."""
+        """Return the draft of a solve without a result: its guess, for collocation with an input at the last knot."""
         drafts = []
         for problem, guess in zip(self.problem.phases, guesses, strict=True):
             last = guess.us[-1] if guess.u_final is None else np.ravel(guess.u_final)
@@ -113,7 +113,7 @@ class Run:
         return self._joined(drafts)
 
     def _joined(self, drafts: Sequence[Solution], **fields: Any) -> Solution:
-        """The draft of all phases."""
+        """Return the draft of all phases."""
         if not isinstance(self.problem, PhasedProblem):
             return drafts[0]
         fields |= {"options": self.options, "wall_time": time.monotonic() - self.started}
@@ -124,7 +124,7 @@ class Run:
             why = Status.INTERRUPTED.sentence if interrupted else "the time limit came first"
             return reached.judged.noted(f"no finer mesh: {why}")
         result, cut = reached.result, f"not made within the time limit: {', '.join(STAGES[reached.stage :])}"
-        if interrupted:  # which is looked for before a search alone
+        if interrupted:  # signals are only checked before a search
             plan = ended(reached.draft, Status.INTERRUPTED, cut.replace("within the time limit", "before that"))
             if self.report is not None:
                 self.report.found(plan)
@@ -136,19 +136,19 @@ class Run:
         return ended(reached.draft, status, result.message, cut, **fields)
 
     def _left(self) -> Limits:
-        """The limits of a search that begins now."""
+        """Return the limits of a search that begins now."""
         left = self.limits.time_limit - (now() - self.start)
         return dataclasses.replace(self.limits, time_limit=max(left, 0.0))
 
     def collocate(self, guesses: Sequence[Guess]) -> Solution:
-        """In CasADi; SNOPT, which that does not carry, in Drake's own DirectCollocation.
+        """Solve by collocation in CasADi, or with SNOPT, which CasADi does not include, by Drake's DirectCollocation.
 
-        The mesh is refined where `refine` is True; where it is None, for as long as the plan does not hold.
+        The mesh is refined if `refine` is True, or, if it is None, for as long as the plan fails its checks.
         """
         refine = self.asked.refine
         if self.solver == "snopt":
             return self._collocate_in_drake(guesses)
-        with noted_interrupts() as interrupted:  # one that comes before the search ends it at its start
+        with noted_interrupts() as interrupted:  # a signal before the search ends it at its start
             try:
                 with until_set(interrupted):
                     transcription = Transcription(self.searched or self.problem, self.scheme)
@@ -168,7 +168,7 @@ class Run:
         return solution if refine is not None else self._refined(transcription, motion, solution, before)
 
     def _certify_guess(self, transcription: Transcription, guesses: Sequence[Guess]) -> tuple[Certificate, ...]:
-        """Of a problem in phases the result alone is certified."""
+        """Certify the derivatives at the guess. For a problem in phases, only the result is certified."""
         if isinstance(self.problem, PhasedProblem):
             return ()
         guess, task = guesses[0], transcription.tasks[0]
@@ -177,7 +177,7 @@ class Run:
         return certify_equations(self.problem, *point, knots=first_knots(guess.us))
 
     def _begin(self, transcription: Transcription, phase: int, guess: Guess) -> Initial:
-        """Where a phase begins: a motion by the same scheme and in as many steps on its mesh, with its multipliers."""
+        """Return the start of a phase. A motion with the same scheme and steps keeps its mesh and multipliers."""
         fields: dict[str, Any] = {"horizon": guess.horizon, "parameters": guess.parameters, "far": guess.line}
         task, motion = transcription.tasks[phase], guess.motion
         if motion is None:
@@ -192,7 +192,7 @@ class Run:
     def _refined(
         self, transcription: Transcription, motion: Transcribed, solution: Solution, before: tuple[Certificate, ...]
     ) -> Solution:
-        """`solution`, or that on a mesh which is made finer for as long as the plan does not hold."""
+        """Return `solution`, or the solution on a mesh that is refined for as long as the plan fails its checks."""
         rounds, first = list(motion.refinements), motion.count
         for _ in range(self.asked.mesh_rounds):
             finer = self._finer(transcription, motion, solution)
@@ -212,7 +212,7 @@ class Run:
         return solution.noted(f"the mesh was refined from {first} to {motion.count} intervals")
 
     def _finer(self, transcription: Transcription, motion: Transcribed, solution: Solution) -> Transcribed | None:
-        """The motion on finer meshes; None where the plan holds, or where what does not hold is not a mesh's."""
+        """Return the motion on finer meshes, or None if the plan holds or its failure does not depend on the mesh."""
         if solution.status not in PLANS:
             return None
         coarse = [may_be_too_coarse(phase) for phase in solution.phases]
@@ -229,7 +229,7 @@ class Run:
         return transcription.finer(motion, exceeded, self.asked.max_num_steps, self._left(), self.report)
 
     def _collocate_in_drake(self, guesses: Sequence[Guess]) -> Solution:
-        """By Drake's own DirectCollocation."""
+        """Solve by Drake's own DirectCollocation."""
         guess = guesses[0]
         jacobian = EquationsOfMotion(self.problem.model).jacobian
         with noted_interrupts() as interrupted:
@@ -273,7 +273,7 @@ class Run:
         except (GradientError, SimulationError) as refusal:
             error = refusal
         for plan, phase in zip(drafts, motion.phases, strict=True):
-            if self.searched is None and plan.transcribed is not None:  # else it was measured under another cost
+            if self.searched is None and plan.transcribed is not None:  # otherwise it was measured with another cost
                 plan.transcribed.measured_as(phase)
         solution = self._judge(self._joined(drafts, certificates=links), result)
         if error is not None and solution.status in PLANS:
@@ -281,9 +281,9 @@ class Run:
         return solution
 
     def sweep(self, guesses: Sequence[Guess], *, given: bool, stages: Stages) -> Solution:
-        """iLQR; from the states of a `given` guess, which need not be a rollout, else from the rollout of `us`.
+        """Solve by iLQR from the states of a `given` guess, which need not be a rollout, or from the rollout of `us`.
 
-        With `stages` it need not have a gradient.
+        With `stages`, the guess need not have a gradient.
         """
         guess = guesses[0]
         xs, us = guess.xs, guess.us
@@ -296,24 +296,24 @@ class Run:
                 self.options["continuation"] = [asdict(log) for log in logs]
                 return result, xs_found, us
             touches = problem.model.contract.contact.collision_pairs and not moves_shapes(problem)
-            touches = touches and problem.motion == STEPS  # in continuous time a touch is no jump
+            touches = touches and problem.motion == STEPS  # in continuous time, contact causes no jump
             begin = next(first, rolled)
             if touches:
                 return solve_through_jumps(problem, begin, us, limits=limits, report=report, values=values)
             known = guess.multipliers
             return solve_ilqr(problem, begin, us, limits=limits, report=report, values=values, multipliers=known)
 
-        around = given and not stages  # a robot that falls open loop says nothing of the motion that was given
+        around = given and not stages  # the rollout of a robot that falls open loop does not represent the given motion
         return self._through_steps(xs, us, search, guess, may_be_blind=bool(stages), around=around)
 
     def shoot(self, guesses: Sequence[Guess], *, given: bool) -> Solution:
-        """The sparse program through the steps, from the states of the guess.
+        """Solve the sparse program through the steps, from the states of the guess.
 
-        Where no guess is `given`, a few steps of iLQR come first, from the rollout of the inputs and without couplings,
-        which iLQR does not take. If they converge, the program starts from their motion, else from the default guess.
-        Where the problem has inputs, or the motion is in continuous time, the program starts from what iLQR reached in
-        any case. A design that is optimized with the inputs goes without iLQR, which far from its goal leads a jumping
-        leg to a short one, of half the height.
+        Without a `given` guess, a few steps of iLQR come first, from the rollout of the inputs and without couplings,
+        which iLQR does not support. If they converge, the program starts from their motion, and otherwise from the
+        default guess. If the problem gives inputs or the motion is in continuous time, the program starts from iLQR's
+        last motion in any case. Designs that are optimized together with inputs skip iLQR: far from the goal, it leads
+        a jumping leg to a short one, of half the height.
         """
         problem, guess = self.problem, guesses[0]
         co_design = problem.optimizes_controls and problem.optimizes_parameters
@@ -336,7 +336,7 @@ class Run:
     def _few_sweeps(
         self, problem: Problem, x0: Array, us: Array, values: Array
     ) -> tuple[NlpResult, Array, Array] | None:
-        """A few iterations of iLQR from the rollout of `us` (N, nu); None if iLQR does not apply or cannot step."""
+        """Run a few iLQR iterations from the rollout of `us` (N, nu), or return None if iLQR is not possible."""
         problem = dataclasses.replace(problem, couplings=())
         if not takes(problem):
             return None
@@ -358,7 +358,7 @@ class Run:
         may_be_blind: bool = False,
         around: bool = False,
     ) -> Solution:
-        """See `_searched`; a signal that comes before the search ends that at its start, with what it begins with."""
+        """Call `_searched`. A signal before the search ends the search at its start, with the initial motion."""
         options = {"may_be_blind": may_be_blind, "around": around}
         with ExitStack() as until_found:
             interrupted = until_found.enter_context(noted_interrupts())
@@ -376,15 +376,15 @@ class Run:
         may_be_blind: bool,
         around: bool,
     ) -> Solution:
-        """Certify, search, call `after_search`, certify again, on Drake's own steps: at the states that a search gives.
+        """Certify, search, call `after_search` and certify again, on Drake's own steps at the states of the result.
 
-        Of the guess at its rollout, or `around` its states as they are.
+        The guess is certified at its rollout, or at its own states if `around` is set.
         """
         values, first_states = self._first_values(guess), xs
         try:
             with until_set(interrupted):
                 ends = self._with_its_end(xs, us, values) if around else None
-        except SimulationError:  # what no input can hold says nothing of the goal
+        except SimulationError:  # a state that no input can hold gives no information about the goal
             ends = xs
         variables = ShootingVariables(self.problem, around=ends)
         try:
@@ -402,7 +402,7 @@ class Run:
             variables = ShootingVariables(self.problem, around=xs if self.method == "shooting" else None)
             z = variables.pack(xs[0], us, result.parameters)
             result = heard(result, interrupted)
-            if self.report is not None and self.report.plan is not None:  # else it need not be rolled out
+            if self.report is not None and self.report.plan is not None:  # otherwise no rollout is needed
                 drawn = variables.states(z), variables.unpack(z)[1]
                 self._offer(self._draft(*drawn, **self._design_of(variables, z)), result)
             after_search()
@@ -416,24 +416,24 @@ class Run:
         return ended(solution, Status.NO_GRADIENT, blindness) if blindness and solution.success else solution
 
     def _with_its_end(self, xs: Array, us: Array, values: Array) -> Array:
-        """(N+1, nx) the states of a guess with the last one where its inputs lead: its own may be the goal itself."""
+        """Return (N+1, nx) the states of a guess, with the end of its rollout: its own may be the goal itself."""
         with self.problem.intervals(self.problem.design.vector.at(values)) as intervals:
             return np.vstack([xs[:-1], roll(intervals, xs[0], us)[-1:]])
 
     def _design_of(self, variables: ShootingVariables, z: Array) -> dict[str, Any]:
-        """The parameters and the horizon in z."""
+        """Return the parameters and the horizon in z."""
         design, values, horizon = self.problem.design, variables.parameters(z).values, None
         if self.problem.horizon is not None:
             horizon = float(np.clip(design.time_step(values) * self.problem.num_steps, *self.problem.horizon))
         return {"parameters": frozen(design.own(values)), "free_horizon": horizon}
 
     def _offer(self, draft: Solution, result: NlpResult) -> None:
-        """Hand on what a search came to; what it claims is not looked at yet."""
+        """Report the unverified draft to the callback."""
         if self.report is not None:
             self.report.found(unmeasured(draft, result))
 
     def _first_values(self, guess: Guess) -> Array:
-        """(np,) those of the problem's `design` where a search begins."""
+        """Return (np,) the initial values of the problem's `design`."""
         problem, design = self.problem, self.problem.design
         parameters = problem.parameters.values if guess.parameters is None else guess.parameters
         first = problem.start_horizon if guess.horizon is None else guess.horizon
@@ -441,7 +441,7 @@ class Run:
         return np.clip(design.whole(parameters, h), design.lower, design.upper)
 
     def _keeping_clear(self, search: Searcher, xs: Array, us: Array, values: Array) -> tuple[NlpResult, Array, Array]:
-        """What `search` finds; where it comes too near to an obstacle between two states, again with these in view."""
+        """Run `search`, and repeat it with finer checks if a step of its motion comes too near to an obstacle."""
         problem, rounds, guess = self.searched or self.problem, list[list[float]](), (xs, us)
         result, xs, us = search(problem, xs, us, values)
         for parts in self.asked.clearance_parts:
@@ -460,17 +460,17 @@ class Run:
         return result, xs, us
 
     def _values_of(self, result: NlpResult, first: Array) -> Array:
-        """(np,) what a search found, that began at `first`."""
+        """Return (np,) the values that a search found from `first`."""
         return first if result.parameters is None else result.parameters
 
     def _reach(self, stage: int, draft: Solution | None = None, result: NlpResult | None = None) -> None:
-        """Note the stage that begins, and what there is by then."""
+        """Note the stage that begins and the partial result."""
         last = self.reached[-1]
         last.stage = stage
         last.draft, last.result = draft or last.draft, result or last.result
 
     def _judge(self, draft: Solution, result: NlpResult) -> Solution:
-        """`judged`, and no success where the cost asks for a motion that nothing here could have begun."""
+        """Judge the draft. It is no success if the cost demands a motion that no variable of the plan can start."""
         if self.closest:
             outcome = Outcome.SOLVED if result.outcome is Outcome.INACCURATE else result.outcome
             result = dataclasses.replace(result, outcome=outcome, note=NEAR)
@@ -512,9 +512,9 @@ class Run:
     def _look_at(
         self, variables: ShootingVariables, z: Array, *, solved: bool
     ) -> tuple[Array, Array, tuple[Certificate, ...], str]:
-        """xs and us of z, certificates of some of its steps, and why the goal or cost is out of its reach.
+        """Return xs and us of z, certificates of some of its steps, and why the goal or the cost is out of reach.
 
-        Where z was `solved` for, these are the steps that tell most.
+        If z is `solved`, the certified steps are those of `telling_knots`.
         """
         us = variables.unpack(z)[1]
         xs, parameters = variables.states(z), variables.parameters(z).to_dict()
@@ -523,10 +523,10 @@ class Run:
             model = model.at_time_step(float(parameters.pop(TIME_STEP)[0]))
 
         keys: dict[int, bytes] = {}
-        if self.problem.motion == STEPS:  # else see `slope`, of the whole plan
+        if self.problem.motion == STEPS:  # otherwise `doubt_of_the_slope` checks the whole plan
             knots = telling_knots(self.problem, xs[: len(us) + 1]) if solved else first_knots(us)
             keys = {k: xs[k].tobytes() + us[k].tobytes() + repr(parameters).encode() for k in knots.tolist()}
-        # That of a search which ends where it began is known.
+        # The certificates of a search that ends at its initial motion are known.
         new = [k for k, key in keys.items() if key not in self.certified]
         if new:
             taken = certify_steps(model, xs[new], us[new], parameters=parameters)
@@ -536,7 +536,7 @@ class Run:
 
 
 def arrays_of(motion: Collocated) -> dict[str, Any]:
-    """What a Solution has beside its states and inputs."""
+    """Return the fields of a Solution in addition to its states and inputs."""
     task, problem = motion.task, motion.task.problem
     return {
         "u_final": None if problem.is_map else frozen(motion.us[-1]),
@@ -548,10 +548,10 @@ def arrays_of(motion: Collocated) -> dict[str, Any]:
 
 
 def kept_apart(problem: Problem) -> Problem:
-    """`problem` in which links keep clear of each other too, but those that are near each other at its ends.
+    """Return `problem` with constraints that keep links apart, except links that are close at the ends of the motion.
 
     Raises:
-        ModelError: where the links are has no formula.
+        ModelError: the positions of the links have no formula.
     """
     goal = np.array(problem.goal)
     ends = [problem.x0] + [goal] * (not np.any(np.isnan(goal[: problem.model.nq])))
@@ -560,7 +560,7 @@ def kept_apart(problem: Problem) -> Problem:
 
 
 def closest_to(problem: Problem, plan: Solution) -> Problem:
-    """`problem` with the squared distance from `plan`, each value for its range, in place of its costs."""
+    """Return `problem` with the squared distance from `plan`, relative to the ranges, in place of its costs."""
     xs, us = plan.plan.sample(1)
     Q = np.diag(1 / plan.plan.scale**2)
     R = np.diag(1 / problem.input_scales(us) ** 2)
@@ -568,7 +568,7 @@ def closest_to(problem: Problem, plan: Solution) -> Problem:
     values, sizes = plan.step_vector.values, np.ones(len(plan.step_vector.values))
     for _, entries in plan.step_vector.pairs:
         largest = np.max(np.abs(values[entries]))
-        sizes[entries] = largest if largest > 0 else 1.0  # as in the coordinates in which the solver moves it
+        sizes[entries] = largest if largest > 0 else 1.0  # as in the coordinates of the solver
     weights = plan.time_step * len(us) / sizes**2
     return dataclasses.replace(
         problem,
@@ -580,5 +580,5 @@ def closest_to(problem: Problem, plan: Solution) -> Problem:
 
 
 def is_kept_apart(problem: Problem) -> bool:
-    """Whether a goal of `problem` keeps links apart already."""
+    """Return whether a goal of `problem` already keeps links apart."""
     return any(isinstance(goal, SelfCollision) and goal.weight is None for goal in problem.goals)

@@ -1,7 +1,7 @@
-"""How an optimal plan changes with its problem: the derivative of states, inputs, horizon and cost of a solution.
+"""The sensitivity of an optimal plan: the derivatives of a solution's states, inputs, horizon and cost.
 
-It is that of the Karush-Kuhn-Tucker conditions (`transcription.kkt`), by the implicit function theorem, and holds on
-both sides where no active row has a multiplier of 0 and no contact is about to change; else the plan has a corner.
+They follow from the Karush-Kuhn-Tucker conditions (`transcription.kkt`) by the implicit function theorem. They are
+two-sided if no active row has a multiplier of 0 and no contact is about to change. Otherwise the plan has a corner.
 """
 
 from collections.abc import Callable
@@ -29,35 +29,35 @@ from drake_diff.optimize.transcription.steps import WITHIN, StepProgram
 from drake_diff.optimize.transcription.task import OptimalControl
 
 ENDS = ("x0", "goal")
-RESOLVED = (1e-3, 1e-4, NEAREST)  # of max(1, |p|): how far away the problem is solved again
-LEAST = 1e-3  # of a quantity's size per that of p: a column whose entries are less counts as that large
-SAME = 1e-4  # of the largest entry of a column: what a derivative and differences of re-solves may differ by
-EXACT_TOLERANCE = 1e-12  # of re-solves, which begin at an optimum beside theirs
+RESOLVED = (1e-3, 1e-4, NEAREST)  # steps of re-solves, as fractions of max(1, |p|)
+LEAST = 1e-3  # smallest scale of a column, as a fraction of the quantity's size per size of p
+SAME = 1e-4  # largest difference between a derivative and re-solves, as a fraction of a column's largest entry
+EXACT_TOLERANCE = 1e-12  # of re-solves, which begin at a nearby optimum
 EXACT = Limits(100, np.inf, EXACT_TOLERANCE)
-CLOSE = {"ipopt.compl_inf_tol": 1e-14, "ipopt.mu_min": 1e-16}  # a barrier is stiff near a bound that holds nothing
-NEAR = 1e-2  # of max(1, |z|): what a variable may move by as the plan is solved to rounding, or it is another plan
-TWO_SIDED = 10  # times SAME: what the two one-sided slopes differ by at a corner
+CLOSE = {"ipopt.compl_inf_tol": 1e-14, "ipopt.mu_min": 1e-16}  # a barrier is stiff near a bound without force
+NEAR = 1e-2  # largest change of a variable in a re-solve, as a fraction of max(1, |z|); beyond it is another plan
+TWO_SIDED = 10  # times SAME: difference of the one-sided slopes at a corner
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sensitivity(ShowsItsRepr):
-    """What `sensitivity` finds. Units are those of the state, input, time or cost, per that of the column.
+    """The result of `sensitivity`. Units are those of the state, input, time or cost, per unit of the column.
 
     Attributes:
-        solution: The plan whose derivative it is.
-        columns: Names of what the problem changes by.
-        xs: (N+1, nx, p) of the states at the knots.
-        us: (N, nu, p) of the inputs at the knots but the last.
-        u_final: (nu, p) of the last.
-        horizon: (p,) [s] of a free horizon; 0 of one that is given.
-        cost: (p,) of the cost.
-        active: How many bounds and inequalities hold the plan.
-        weak: What makes a corner of the plan, of which this is the derivative of one side: bounds that begin or cease
-            to hold it, and columns whose two sides differ, as where a contact begins.
-        differences: (p,) the largest distance from differences of re-solves, as a part of the column; None if not
-            asked for, NaN where a re-solve failed.
-        derivatives: Where the second derivatives came from.
-        verdict: "agree", "disagree", "discontinuous" where something is weak, or "not certified".
+        solution: The differentiated plan.
+        columns: Names of the quantities that the derivatives are taken with respect to.
+        xs: (N+1, nx, p) the derivatives of the states at the knots.
+        us: (N, nu, p) the derivatives of the inputs at all knots except the last.
+        u_final: (nu, p) the derivatives of the last input.
+        horizon: (p,) the derivatives of a free horizon [s]; 0 for a given horizon.
+        cost: (p,) the derivatives of the cost.
+        active: The number of active bounds and inequalities.
+        weak: The causes of a corner of the plan, where the derivatives are one-sided: bounds that become active or
+            inactive, and columns whose two sides differ, as where a contact begins.
+        differences: (p,) the largest distance from differences of re-solves, as a fraction of the column; None if not
+            requested, NaN if a re-solve failed.
+        derivatives: The source of the second derivatives.
+        verdict: "agree", "disagree", "discontinuous" if `weak` is not empty, or "not certified".
     """
 
     solution: Solution
@@ -74,7 +74,7 @@ class Sensitivity(ShowsItsRepr):
 
     @property
     def verdict(self) -> str:
-        """Whether it is the derivative of what `solve` finds."""
+        """Whether the derivatives agree with re-solves of the problem."""
         if self.weak:
             return "discontinuous"
         if self.differences is None:
@@ -93,25 +93,24 @@ class Sensitivity(ShowsItsRepr):
 
 
 def sensitivity(solution: Solution, by: Any = "x0", *, certified: bool = True) -> Sensitivity:
-    """The derivative of a solution by its first state, its goal, or parameters of its model.
+    """Compute the derivative of a solution with respect to its first state, its goal or parameters of its model.
 
-    Plans of every method have one. That of a plan by iLQR or shooting is of Drake's own steps, contact included.
+    Plans of all methods are supported. For iLQR and shooting, Drake's own steps are differentiated, including contact.
 
     Args:
-        solution: A plan that is a success.
-        by: "x0" or "goal" (of their entries that are given), or names of the model's parameters.
-        certified: Whether the problem is solved again on both sides of each column, and the differences are compared.
+        solution: A successful plan.
+        by: "x0" or "goal" (their given entries), or names of the model's parameters.
+        certified: Whether the problem is solved again on both sides of each column to compare the differences.
 
     Returns:
-        A `Sensitivity`. Where a bound holds the plan without force, or differences of re-solves tell that a contact is
-        about to change, its `verdict` is "discontinuous": a plan that is pushed to one side changes otherwise than one
-        that is pushed to the other.
+        A `Sensitivity`. Its `verdict` is "discontinuous" if an active bound has no force, or if differences of
+        re-solves show that a contact is about to change. The effects of a change to either side then differ.
 
     Raises:
-        InputError: The solution is no success, its cost is one of the whole trajectory, or nothing is asked for.
-        UnknownNameError: There is no such parameter.
-        ModelError: Its equations have no second derivatives here.
-        GradientError: Some change of the plan costs nothing, so that it is not the only optimum, or the plan is no
+        InputError: The solution is not successful, its cost depends on the whole trajectory, or `by` is empty.
+        UnknownNameError: A parameter does not exist.
+        ModelError: The equations have no second derivatives.
+        GradientError: A change of the plan costs nothing, so that the optimum is not unique, or the plan is not a
             stationary point of its problem.
 
     Source:
@@ -162,7 +161,7 @@ def sensitivity(solution: Solution, by: Any = "x0", *, certified: bool = True) -
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """The variables z (n,) of a solution, the program they are of, and whether that is one of discrete steps."""
+    """The variables z (n,) of a solution, a function that makes their program, and whether it is discrete."""
 
     problem: Problem
     make: Callable[[Problem], KnotProgram]
@@ -170,7 +169,7 @@ class _Plan:
     discrete: bool
 
     def derivatives(self, program: KnotProgram) -> str:
-        """Where the second derivatives came from."""
+        """Return the source of the second derivatives."""
         if not isinstance(program, StepProgram):
             return "symbolic"
         return f"the steps' Jacobians by {' and '.join(sorted(program.steps.methods))}"
@@ -197,7 +196,7 @@ def _plan(solution: Solution) -> _Plan:
             "trajectory_cost", got="given", expected="no trajectory_cost, as it joins the states of all steps"
         )
     rounds = solution.options.get("clearance_rounds", ())
-    if rounds:  # what it was searched with besides
+    if rounds:  # the search had these additional constraints
         more = swept(problem.kept, solution.time_step, int(rounds[-1][0]))
         problem = replace(problem, constraints=(*problem.constraints, *more))
     values = problem.design.whole(solution.vector.values, solution.time_step)
@@ -206,7 +205,7 @@ def _plan(solution: Solution) -> _Plan:
 
 
 def _held(plan: _Plan) -> HeldPlan:
-    """The plan, solved to rounding from where `solve` stopped; GradientError if it is no optimum."""
+    """Solve the plan to rounding from the result of `solve`. Raises GradientError if it is not an optimum."""
     held = HeldPlan(plan.problem, plan.make, plan.z)
     sharper, solved = _resolved(held.program, plan.z, held.multipliers)
     if solved and np.all(np.abs(sharper - plan.z) <= NEAR * np.maximum(1.0, np.abs(plan.z))):
@@ -246,9 +245,9 @@ def _change(solution: Solution, by: Any) -> Change:
 
 
 def _differences(plan: _Plan, held: HeldPlan, change: Change, response: Held) -> tuple[Array, list[str]]:
-    """(p,) how far the derivative is from central differences of re-solves, extrapolated, as a part of each column.
+    """Return (p,) the distance of the derivative from extrapolated central differences of re-solves, per column.
 
-    And the columns whose two sides differ, where it is far.
+    Also return the columns whose distance is large and whose two sides differ.
     """
     base, apart, corners = _read(held.program, held.z), [], []
     derivative = [response.dz[held.program.states_at], response.dz[held.program.inputs_at], response.cost[None]]
@@ -256,7 +255,7 @@ def _differences(plan: _Plan, held: HeldPlan, change: Change, response: Held) ->
         unit, ours = max(1.0, abs(value)), [array[..., i] for array in derivative]
         least = [LEAST * _size(array) / unit for array in base]
         off, sides = np.inf, 0.0
-        for fraction in RESOLVED:  # nearer, where another bound begins to hold on the way
+        for fraction in RESOLVED:  # smaller steps, in case another bound becomes active on the way
             slopes = [
                 _one_sided(plan, held, change, i, side * fraction * unit / n, base) for n in (1, 2) for side in (-1, 1)
             ]
@@ -266,7 +265,7 @@ def _differences(plan: _Plan, held: HeldPlan, change: Change, response: Held) ->
             off = _distance(ours, wanted, least)
             if off <= SAME:
                 break
-            # at a corner these go to two limits; elsewhere to one, with the step
+            # at a corner these have two limits as the step shrinks, elsewhere a single one
             left, right = (
                 [2 * b - a for a, b in zip(*pair, strict=True)] for pair in ((low, near_low), (high, near_high))
             )
@@ -282,24 +281,24 @@ def _means(low: list[Array], high: list[Array]) -> list[Array]:
 
 
 def _distance(arrays: list[Array], other: list[Array], least: list[float]) -> float:
-    """The largest of their entries' differences, as a part of the largest entry; NaN where one is no number."""
+    """Return the largest difference of the entries, as a fraction of the largest entry, or NaN if one is NaN."""
     pairs = zip(arrays, other, least, strict=True)
     return float(np.max([_size(a - b) / max(_size(a), _size(b), smallest, 1e-300) for a, b, smallest in pairs]))
 
 
 def _size(values: Array) -> float:
-    """The largest magnitude; NaN where an entry is none."""
+    """Return the largest magnitude, or NaN if an entry is NaN."""
     return float(np.max(np.abs(values), initial=0.0))
 
 
 def _read(program: KnotProgram, z: Array) -> list[Array]:
-    """The states (N+1, nx), the inputs (M, nu) and the cost (1,) of the variables."""
+    """Return the states (N+1, nx), the inputs (M, nu) and the cost (1,) of the variables."""
     cost = np.asarray(program.derivatives(exact=False)["grad_f"](z, [])[0]).ravel()
     return [z[program.states_at], z[program.inputs_at], cost]
 
 
 def _one_sided(plan: _Plan, held: HeldPlan, change: Change, column: int, step: float, base: list[Array]) -> list[Array]:
-    """The quotients of what `_read` gives, from the problem moved by `step`; NaN where that was not solved again."""
+    """Return one-sided quotients of `_read` for the problem moved by `step`, or NaN if the re-solve failed."""
     with change.moved(plan.problem, column, step) as moved:
         program = plan.make(moved)
         z, solved = _resolved(program, held.z, held.multipliers)
@@ -308,7 +307,7 @@ def _one_sided(plan: _Plan, held: HeldPlan, change: Change, column: int, step: f
 
 
 def _resolved(program: KnotProgram, z: Array, multipliers: Multipliers) -> tuple[Array, bool]:
-    """What IPOPT finds from a plan, and whether that is a solution."""
+    """Solve again with IPOPT from a plan, and return the variables and whether they are a solution."""
     more = CLOSE | (WITHIN if isinstance(program, StepProgram) else {})
     exact = not program.why_not
     result = solve_ipopt(program, z, EXACT, None, exact=exact, multipliers=multipliers, more=more)

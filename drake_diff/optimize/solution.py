@@ -1,4 +1,4 @@
-"""What every solver returns, and measures that do not take its word."""
+"""The solution that every solver returns, with measures that do not rely on the solver."""
 
 import copy
 import enum
@@ -29,14 +29,14 @@ from drake_diff.optimize.replay import OPEN_LOOP, Replay, ReplayPlan, held, judg
 from drake_diff.optimize.transcription.between import Excess, violation_between_nodes
 from drake_diff.optimize.transcription.collocation import Collocated, collocated
 
-SAME_COST = 1e-2  # of the larger one: what searches that stop at one optimum on other meshes may differ by
-SAME_MOTION = 5e-2  # of each state's range, the root of the mean square over the knots
+SAME_COST = 1e-2  # largest relative difference in cost between searches that reach one optimum on different meshes
+SAME_MOTION = 5e-2  # largest RMS difference over the knots, as a fraction of each state's range
 # Fields that no measure depends on.
 TOLD = ("cross_checks", "iterations", "message", "notes", "optima", "options", "search", "solver_message", "status")
 
 
 class Status(enum.Enum):
-    """How a solve ended. Only CONVERGED is a success: the solver converged and all measures taken again hold.
+    """The status of a solve. Only CONVERGED is a success: the solver converged and all independent checks pass.
 
     Example:
         >>> dd.Status("iteration_limit").sentence
@@ -55,12 +55,12 @@ class Status(enum.Enum):
 
     @property
     def sentence(self) -> str:
-        """What it means; a solution's notes say what to try."""
+        """A sentence that explains the status. A solution's notes suggest what to try."""
         return _SENTENCES[self]
 
     @property
     def words(self) -> str:
-        """How a message begins: "converged", "not verified", "time limit"."""
+        """The first words of a message: "converged", "not verified", "time limit"."""
         return "not verified" if self is Status.CONVERGED_NOT_VERIFIED else self.value.replace("_", " ")
 
 
@@ -83,9 +83,9 @@ PLANS = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What `solve` was called with, so that it can be called again.
+    """The arguments of a call of `solve`, so that the call can be repeated.
 
-    `arguments` are its keyword arguments as plain data, `guess` is the `initial_guess` that was given.
+    `arguments` are its keyword arguments as plain data. `guess` is the given `initial_guess`.
     """
 
     arguments: dict[str, Any]
@@ -94,32 +94,32 @@ class Search:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Solution(PicklesItsFields, ShowsItsRepr):
-    """The motion that `solve` found, how it was found, and what it measures on Drake's double plant.
+    """The motion that `solve` found, how it was found, and its measures on Drake's double plant.
 
-    `cost`, `defect`, `goal_error`, `bound_violation`, `constraint_violation`, `replays` and the rest are computed from
-    the states and inputs when they are first asked for. They are never taken from the solver, and what cannot be
-    computed is infinite. `success` holds where the solver converged and all of them hold.
+    `cost`, `defect`, `goal_error`, `bound_violation`, `constraint_violation`, `replays` and other measures are computed
+    from the states and inputs on first access. They are never taken from the solver. A measure that cannot be computed
+    is infinite. `success` is true if the solver converged and all checks pass.
 
     Attributes:
-        problem: what was asked.
-        method, solver, scheme: how it was solved; `scheme` is "step" for the discrete methods.
-        status, message: how it ended, as a `Status` and in at most 160 characters.
+        problem: the solved problem.
+        method, solver, scheme: how the problem was solved; `scheme` is "step" for the discrete methods.
+        status, message: how the solve ended, as a `Status` and as text of at most 160 characters.
         xs: (N+1, nx) states at the knots, in the states' units.
-        us: (N, nu) inputs, held over each step by a discrete method. Those of collocation are at the knots and
-            linear in between, or the parabola through `us_mid` (N, nu) at the midpoints (hermite_simpson).
+        us: (N, nu) inputs. A discrete method holds them over each step. In collocation, they are values at the knots of
+            an input that is linear in between, or a parabola through `us_mid` (N, nu) at midpoints (hermite_simpson).
         u_final: (nu,) the input at the last knot, for collocation.
-        mesh: (N+1,) the knots as fractions of the horizon where the mesh was refined, else None: equal intervals.
-        free_horizon: [s] what a `horizon` of the problem came to, else None.
+        mesh: (N+1,) the knots of a refined mesh as fractions of the horizon, or None for equal intervals.
+        free_horizon: [s] the value of the problem's `horizon`, or None if the problem has none.
         parameters: (np,) the values that were found for the problem's parameters.
         iterations: the solver's own table.
-        certificates: of the derivatives that the solver used, at some knots of the guess and of the result.
-        options: what was asked of the solver, and what it chose.
-        wall_time: [s] what the solve took.
-        multipliers: of the bounds and rows of what collocation or iLQR solved, with which a search from here begins.
+        certificates: certificates of the solver's derivatives, at some knots of the guess and of the result.
+        options: the options of the solver, including those that it chose itself.
+        wall_time: [s] the duration of the solve.
+        multipliers: multipliers of the bounds and rows in collocation or iLQR, which warm-start a search from here.
         optima: with `restarts`, the verified solutions that differ in cost or motion, the cheapest first.
-        search: the arguments of `solve`, None of a solution that it did not make.
-        cross_checks: replays in other plants, of a solution that `artifact.cross_check` returned.
-        notes: sentences about the search: what the solver says, what other guesses came to, what to try.
+        search: the arguments of `solve`, or None if the solution was not made by `solve`.
+        cross_checks: replays in other plants, if `artifact.cross_check` returned this solution.
+        notes: sentences about the search: the solver's message, results of other guesses, suggestions.
 
     Example:
         >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
@@ -170,14 +170,14 @@ class Solution(PicklesItsFields, ShowsItsRepr):
             *(str(c) for c in self.plan_checks.failing),
             f"{len(self.iterations)} iterations in {self.wall_time:.2g} s; certificates: {certified}",
         ]
-        if "replays" in vars(self) and self.replays:  # they take time: a printed line starts none
+        if "replays" in vars(self) and self.replays:  # replays take time, so that printing does not start them
             lines.append(f"replays: {sum(r.holds for r in self.replays)} of {len(self.replays)} hold")
             lines += [str(r) for r in self.replays if not r.holds]
         lines += [f"cross-checked {row}" for row in self.cross_checks]
         return "\n  ".join(lines)
 
     def told(self, **fields: Any) -> "Solution":
-        """The same motion with other `fields` out of TOLD: its measures stay. UnknownNameError of others."""
+        """Return the same motion and measures with other `fields` out of TOLD. UnknownNameError for other names."""
         for name in fields:
             if name not in TOLD:
                 raise UnknownNameError("field of a Solution", got=name, known=TOLD)
@@ -186,31 +186,31 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         return changed
 
     def noted(self, *notes: str) -> "Solution":
-        """The same motion with more `notes`."""
+        """Return the same motion with more `notes`."""
         return self.told(notes=(*self.notes, *notes))
 
     @property
     def phases(self) -> tuple["Solution", ...]:
-        """Itself: a problem that is not a `PhasedProblem` is one phase."""
+        """The solution itself: a problem that is not a `PhasedProblem` has one phase."""
         return (self,)
 
     @property
     def success(self) -> bool:
-        """Whether the solver converged and everything measured again holds."""
+        """Whether the solver converged and all independent checks pass."""
         return self.status is Status.CONVERGED
 
     @property
     def plant(self) -> str:
-        """Where the plan is to hold: in the "steps" of the model or map, or in "continuous" time."""
+        """The plant in which the plan must hold: the "steps" of the model or map, or "continuous" time."""
         if self.scheme == "step":
             return "steps" if self.problem.motion == STEPS else "continuous"
         return "steps" if self.problem.is_map else "continuous"
 
     @property
     def feedback(self) -> str | None:
-        """The feedback that the plan needs in its plant: None where it holds open loop there, else "TVLQR".
+        """The feedback that the plan needs in its plant: None if it holds open loop there, else "TVLQR".
 
-        Replays of the plan are taken for it. `success` says whether it holds under that feedback.
+        This property replays the plan. `success` tells whether the plan holds under that feedback.
         """
         rows = self.following or [c for r in self.replays[:1] for c in r.checks]
         open_loop = [c.passes for c in rows if c.feedback is None]
@@ -218,30 +218,30 @@ class Solution(PicklesItsFields, ShowsItsRepr):
 
     @property
     def vector(self) -> ParameterVector:
-        """The problem's parameters as they were found."""
+        """The problem's parameters with the values that were found."""
         return self.problem.parameters if self.parameters is None else self.problem.parameters.at(self.parameters)
 
     @property
     def step_vector(self) -> ParameterVector:
-        """The parameters of discrete steps: `vector`, and the step's length where a horizon is asked for."""
+        """The parameters of discrete steps: `vector`, and the length of a step if the problem has a horizon."""
         design = self.problem.design
         return design.vector.at(design.whole(self.vector.values, self.time_step))
 
     @property
     def horizon(self) -> float:
-        """[s] from the first state to the last."""
+        """The duration [s] from the first state to the last."""
         return self.problem.start_horizon if self.free_horizon is None else self.free_horizon
 
     @property
     def time_step(self) -> float:
-        """[s] between two of the problem's knots: the model's own, to the last bit, where no horizon is asked for."""
+        """The time [s] between two of the problem's knots; without a horizon, exactly the model's time step."""
         return self.problem.time_step if self.free_horizon is None else self.free_horizon / self.problem.num_steps
 
     @cached_property
     def cost(self) -> float:
-        """The objective of xs and us, as `Problem` defines it; inf where it is not finite.
+        """The objective of xs and us, as `Problem` defines it, or inf if it is not finite.
 
-        In collocation the running cost is integrated along the motion that the dynamics make from each knot.
+        In collocation, the running cost is integrated along the motion of the dynamics from each knot.
         """
         if not self._is_whole:
             return float("inf")
@@ -255,11 +255,11 @@ class Solution(PicklesItsFields, ShowsItsRepr):
 
     @cached_property
     def cost_error(self) -> float:
-        """How far `cost` may be from what was minimized and from its own true value; inf where it is not known.
+        """The largest distance of `cost` from the minimized cost and from its own true value, or inf if it is unknown.
 
-        Of a collocated plan, the distance of the scheme's quadrature from the integral along the motion of the
-        dynamics, and what is left of that integral's errors: of features that are wider than a 1e-4 of each state's
-        range along the motion. Of a plan in steps, a bound of the rounding of its sum.
+        For a collocated plan, it is the distance of the scheme's quadrature from the integral along the motion of the
+        dynamics, plus the remaining error of that integral, for features that are wider than 1e-4 of each state's range
+        along the motion. For a discrete plan, it is a bound on the rounding of the sum.
         """
         if not np.isfinite(self.cost):
             return float("inf")
@@ -269,7 +269,7 @@ class Solution(PicklesItsFields, ShowsItsRepr):
 
     @cached_property
     def cost_scale(self) -> float:
-        """What the parts of the cost come to without their signs."""
+        """The sum of the magnitudes of the cost's parts."""
         if self.transcribed is not None:
             return max(abs(self.cost), self.transcribed.cost_scale)
         parts = [
@@ -280,14 +280,14 @@ class Solution(PicklesItsFields, ShowsItsRepr):
 
     @property
     def times(self) -> Array:
-        """(N+1,) [s] of the states."""
+        """(N+1,) the times [s] of the states."""
         if self.mesh is not None:
             return np.asarray(self.horizon * self.mesh, dtype=float)
         return np.asarray(self.time_step * np.arange(len(self.xs)), dtype=float)
 
     @property
     def knots(self) -> Indices:
-        """(problem.num_steps + 1,) the rows of `xs` that are the problem's own knots: all, but on a refined mesh."""
+        """(problem.num_steps + 1,) the rows of `xs` at the problem's own knots: all rows, except on a refined mesh."""
         whole = np.arange(self.problem.num_steps + 1)
         if self.mesh is None:
             return whole
@@ -295,27 +295,27 @@ class Solution(PicklesItsFields, ShowsItsRepr):
 
     @property
     def inputs_at_knots(self) -> Array:
-        """The inputs at the knots: (N, nu) held ones, (N+1, nu) those of collocation."""
+        """The inputs at the knots: (N, nu) for held inputs, (N+1, nu) for collocation."""
         return self.us if self.u_final is None else np.vstack([self.us, self.u_final])
 
     @cached_property
     def transcribed(self) -> Collocated | None:
-        """The motion of a collocation scheme, from xs, us, us_mid and u_final; None where they are no such motion."""
+        """The motion of a collocation scheme from xs, us, us_mid and u_final, or None if they are not such a motion."""
         if self.scheme == "step" or not self._is_whole:
             return None
         mesh, us = np.linspace(0, 1, len(self.xs)) if self.mesh is None else self.mesh, self.inputs_at_knots
-        if self.problem.is_map:  # after the last step there is no input
+        if self.problem.is_map:  # a map has no input after its last step
             us = np.vstack([us, np.clip(0.0, self.problem.bounds.u_lower, self.problem.bounds.u_upper)])
         return collocated(self.problem, self.scheme, self.xs, us, self.us_mid, self.horizon, mesh, self.vector.values)
 
     def trajectory(self) -> "Trajectories":
-        """The state and the input as Drake's piecewise polynomials, for its own controllers and `Simulator`.
+        """Return the state and the input as Drake's piecewise polynomials, for its own controllers and `Simulator`.
 
-        States of collocation are cubics with the dynamics' slopes at the knots, its inputs lines, or parabolas through
-        the midpoints. Those of a discrete method are lines between its states, under inputs that are held.
+        States of collocation are cubics with the slopes of the dynamics at the knots. Its inputs are linear, or
+        parabolas through the midpoints. States of a discrete method are linear between knots, and its inputs are held.
 
         Raises:
-            ModelError: The solution is not whole: it has states or inputs that are no numbers.
+            ModelError: The solution is incomplete, or has states or inputs that are not finite.
 
         Source:
             Kelly, "An Introduction to Trajectory Optimization", SIAM Review 59(4), 2017, sections 3.4 and 4.4.
@@ -334,16 +334,16 @@ class Solution(PicklesItsFields, ShowsItsRepr):
 
     @property
     def defects(self) -> Array:
-        """(N,) how far each interval is from the dynamics, as a state change, in the worst coordinate's unit.
+        """(N,) the defect of each interval from the dynamics, as a state change in the worst coordinate's unit.
 
-        Discrete: |x_(k+1) - step(x_k, u_k)|, the step being that of the problem's `motion`. Collocation: the scheme's
-        own equations.
+        Discrete: |x_(k+1) - step(x_k, u_k)|, with the step of the problem's `motion`. Collocation: the scheme's own
+        equations.
         """
         return np.max(self.defects_of_states, axis=1)
 
     @cached_property
     def defects_of_states(self) -> Array:
-        """(N, nx) the same of each state, in its unit."""
+        """(N, nx) the defects of each state, in its unit."""
         if not self._is_whole:
             return np.full((self._num_intervals, self.problem.nx), np.inf)
         if self.transcribed is not None:
@@ -362,9 +362,9 @@ class Solution(PicklesItsFields, ShowsItsRepr):
 
     @cached_property
     def integration_errors(self) -> Array:
-        """(N,) distance of knot k+1 from an accurate integration of the dynamics from knot k.
+        """(N,) the distance of knot k+1 from an accurate integration of the dynamics from knot k.
 
-        Of a discrete method the step is the dynamics, and this is its defect.
+        For a discrete method, the step is the dynamics, and this is its defect.
         """
         return self.defects if self.transcribed is None else self.transcribed.errors
 
@@ -375,23 +375,23 @@ class Solution(PicklesItsFields, ShowsItsRepr):
 
     @cached_property
     def integrated(self) -> Array | None:
-        """(N+1, nx) where x' = f(x, u) leads from xs[0] under the plan's input; None of a discrete method.
+        """(N+1, nx) the integral of x' = f(x, u) from xs[0] under the plan's input, or None for a discrete method.
 
-        NaN from where the motion leaves all finite numbers. An unstable motion drifts off here whatever is right: it
-        is reported, and `integration_errors`, which start anew at each knot, decide.
+        It is NaN after the motion diverges. An unstable motion drifts off even if the plan is correct. The drift is
+        only reported, and `integration_errors`, which restart at each knot, decide.
         """
         return None if self.transcribed is None else self.transcribed.open_loop
 
     @cached_property
     def bound_violation(self) -> float:
-        """The largest excess over a bound of a state that is not given, an input, or a parameter."""
+        """The largest excess over a bound of a free state, an input or a parameter."""
         return max((excess for excess, _ in self.bound_excess.values()), default=0.0)
 
     @cached_property
     def bound_excess(self) -> dict[str, tuple[float, int]]:
         """The largest excess over a bound and its knot, by the state's, input's or parameter's name, where above 0.
 
-        States that are given have none; collocation's midpoints count to the knot before them.
+        Given states have no excess. Midpoints of collocation are assigned to the knot before them.
         """
         b, states, names = self.problem.bounds, self.problem.state_names, self.problem.input_names
         free = self.problem.initial_state_mask
@@ -399,7 +399,7 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         given[0] = ~free
         inside = np.clip(0.0, b.x_lower, b.x_upper)
         sides = [(states, np.where(given, inside, self.xs), b.x_lower, b.x_upper)]
-        if self.transcribed is not None and not self.transcribed.task.scheme.input_is_linear:  # Drake bounds knots
+        if self.transcribed is not None and not self.transcribed.task.scheme.input_is_linear:  # Drake only bounds knots
             sides += [(states, xs, b.x_lower, b.x_upper) for xs in [self.transcribed.xs_mid] if xs is not None]
         sides += [(names, us, b.u_lower, b.u_upper) for us in (self.inputs_at_knots, self.us_mid) if us is not None]
         sides.append((self.vector.names, self.vector.values[None], *self.problem.bounds_of_parameters()))
@@ -418,7 +418,7 @@ class Solution(PicklesItsFields, ShowsItsRepr):
     def constraint_excess(self) -> dict[str, tuple[float, int]]:
         """The largest excess and its knot of each of the problem's constraints and waypoints.
 
-        Collocation keeps constraints of all knots at its midpoints too, which count to the knot before them.
+        Collocation also enforces constraints of all knots at midpoints, which are assigned to the knot before them.
         """
         if self.transcribed is None or self.problem.is_map:
             coupled = self.problem.coupled_steps(self.time_step)
@@ -430,29 +430,29 @@ class Solution(PicklesItsFields, ShowsItsRepr):
 
     @property
     def constraint_violation(self) -> float:
-        """The largest excess over a bound of a constraint, or distance from a waypoint, in its own unit."""
+        """The largest excess of a constraint over a bound or distance from a waypoint, in its own unit."""
         return max((excess for excess, _ in self.constraint_excess.values()), default=0.0)
 
     @cached_property
     def between_nodes(self) -> Excess | None:
-        """How far a collocated motion leaves bounds and constraints between its nodes; None of a discrete method."""
+        """The violation of bounds and constraints between nodes in collocation, or None for a discrete method."""
         return None if self.transcribed is None else violation_between_nodes(self.transcribed)
 
     @cached_property
     def plan_checks(self) -> Checks:
-        """What is checked of the states and inputs themselves; replays apart."""
+        """Checks of the states and inputs themselves, without replays."""
         return Checks(plan_checks(self))
 
     @cached_property
     def following(self) -> list[Check]:
-        """Of a collocated plan: whether its dynamics follow it from its first state, open loop and else under TVLQR."""
+        """Checks of whether the dynamics follow a collocated plan from its first state, open loop or under TVLQR."""
         return [] if self.transcribed is None else following_checks(self, self.transcribed)
 
     @property
     def checks(self) -> Checks:
-        """Everything that was checked, the worst first: of the plan, of each replay and of other plants.
+        """All checks of the plan, of each replay and of other plants, the worst first.
 
-        Replays are taken when they are first asked for.
+        Replays are computed on first access.
 
         Example:
             >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
@@ -469,20 +469,20 @@ class Solution(PicklesItsFields, ShowsItsRepr):
 
     @cached_property
     def goal_error(self) -> float:
-        """The largest distance of the final state from the goal, free entries apart."""
+        """The largest distance of the final state from the goal, without free entries."""
         return _largest(np.abs(self.problem.goal_error(self.xs[-1])))
 
     @cached_property
     def initial_state_error(self) -> float:
-        """The largest distance of xs[0] from the problem's x0, free entries apart."""
+        """The largest distance of xs[0] from the problem's x0, without free entries."""
         fixed = ~self.problem.initial_state_mask
         return _largest(np.abs(self.xs[0] - self.problem.x0)[fixed])
 
     @cached_property
     def final_state_norms(self) -> Array | Refusal:
-        """(N+1,) |d x_N / d x_k| at the problem's own knots, by the plant's steps from the plan's states; else why not.
+        """(N+1,) |d x_N / d x_k| at the problem's own knots, by the plant's steps from the plan's states, or a Refusal.
 
-        Where they grow going back, early inputs decide all; where they vanish, nothing that is early matters.
+        If they grow towards the start, early inputs dominate. If they vanish there, early inputs have no effect.
         """
         if not self.problem.has_model:
             return Refusal("plain dynamics have no discrete step")
@@ -499,9 +499,9 @@ class Solution(PicklesItsFields, ShowsItsRepr):
 
     @cached_property
     def optimality(self) -> Optimality | Refusal:
-        """How far a discrete plan is from a stationary point, by our own multipliers; why not, where that is not known.
+        """The distance of a discrete plan from a stationary point, with our own multipliers, or a Refusal.
 
-        Collocation has another Lagrangian, that of its scheme: its multipliers are the solver's.
+        Collocation has another Lagrangian, that of its scheme, and its multipliers come from the solver.
         """
         if self.scheme != "step":
             return Refusal("only discrete steps have it, as the Lagrangian of a collocation belongs to its scheme")
@@ -514,41 +514,39 @@ class Solution(PicklesItsFields, ShowsItsRepr):
 
     @cached_property
     def plan(self) -> ReplayPlan:
-        """What is replayed: states, and inputs held over each step, or their means over the parts of an interval."""
+        """The plan for replays: states, and inputs held over each step or averaged over parts of an interval."""
         continuous = self.transcribed is not None
         sample = held(self.xs, self.us) if self.transcribed is None else self.transcribed.sample
         return ReplayPlan(self.problem, self.vector, self.time_step, sample, continuous, self.cost)
 
     @cached_property
     def replay(self) -> Rollout | None:
-        """The plant's own open-loop motion from xs[0]; None where it cannot be taken.
+        """The plant's own open-loop motion from xs[0], or None if the simulation fails.
 
-        It is the discrete plant's; of a problem whose motion is continuous, another integration than the plan's. An
-        input that changes between knots is held at its mean over each step. Plain dynamics have no plant to step: see
-        `integrated`.
+        The discrete plant is simulated. A problem in continuous time uses another integration than the plan. An input
+        that changes between knots is held at its mean over each step. Plain dynamics have no plant: see `integrated`.
         """
         return self.plan.open_loop if self.problem.has_model else None
 
     @cached_property
     def replays(self) -> tuple[Replay, ...]:
-        """The plan in every variant of the plant (step, half step, other contact), open loop and under TVLQR.
+        """The replays in every variant of the plant (step, half step, other contact), open loop and under TVLQR.
 
-        Of a plan in continuous time there is one, by another integration than that which made it.
-
-        None of plain dynamics, which have no such variants.
+        A plan in continuous time has a single variant, which is another integration than the plan's. Plain dynamics
+        have no variants, and the tuple is empty.
         """
         return replays(self.plan) if self.problem.has_model else ()
 
     @property
     def judged_replay(self) -> Replay | None:
-        """The replay that a success rests on: open loop where that holds, else under TVLQR; None where neither does."""
+        """The replay that decides success: open loop if that holds, else under TVLQR, or None if both fail."""
         return judged_replay(self.plan, self.replays) if self.problem.has_model else None
 
     @property
     def half_step_error(self) -> float:
-        """How far from xs[-1] the same held inputs lead at half the time step: what a step size decided.
+        """The distance from xs[-1] of the end under the same held inputs at half the time step.
 
-        inf where that replay cannot be taken, NaN of a motion in continuous time, which has no steps.
+        It shows the effect of the step size. It is inf if that replay fails, and NaN for a motion in continuous time.
         """
         if self.problem.motion != STEPS:
             return float("nan")
@@ -564,7 +562,7 @@ class Solution(PicklesItsFields, ShowsItsRepr):
 
     @property
     def _is_whole(self) -> bool:
-        """Whether xs and the inputs have the problem's shapes, and all of collocation's are numbers."""
+        """Whether xs and the inputs have the problem's shapes, and are finite in collocation."""
         count, nx, nu = self._num_intervals, self.problem.nx, self.problem.nu
         if self.us.shape != (count, nu) or self.xs.shape != (count + 1, nx):
             return False
@@ -574,20 +572,20 @@ class Solution(PicklesItsFields, ShowsItsRepr):
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
-    """A verified solution, the first guess that led to it first, and how many did."""
+    """A verified solution, the first initial guess that led to it, and the number of guesses that did."""
 
     solution: Solution
     guess: str
     count: int
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data."""
+        """Return the optimum as plain data."""
         s = self.solution
         return {"cost": s.cost, "horizon": s.horizon, "guess": self.guess, "count": self.count}
 
 
 def distinct(pairs: Sequence[tuple[Solution, str]]) -> list[Optimum]:
-    """Those of the verified solutions and their guesses that are no other's motion, the cheapest first."""
+    """Return the verified solutions with different motions, and their guesses, the cheapest first."""
     optima: list[Optimum] = []
     for solution, guess in pairs:
         if not solution.success:
@@ -603,7 +601,7 @@ def distinct(pairs: Sequence[tuple[Solution, str]]) -> list[Optimum]:
 
 
 def _are_same(solution: Solution, other: Solution) -> bool:
-    """Whether two solutions of one problem have one cost and one motion at its knots."""
+    """Return whether two solutions of one problem have the same cost and the same motion at its knots."""
     room = solution.problem.least_cost(solution.xs[0], solution.horizon / solution.problem.num_steps)
     if abs(solution.cost - other.cost) > SAME_COST * max(abs(solution.cost), abs(other.cost)) + room:
         return False
@@ -613,14 +611,14 @@ def _are_same(solution: Solution, other: Solution) -> bool:
 
 
 class Trajectories(NamedTuple):
-    """A motion as two of Drake's trajectories over the same time [s]."""
+    """A motion as two Drake trajectories over the same time [s]."""
 
     state: PiecewisePolynomial
     input: PiecewisePolynomial
 
 
 def trajectories(solution: Solution) -> Trajectories:
-    """See `Solution.trajectory`."""
+    """Return the result of `Solution.trajectory`."""
     times, motion = solution.times, solution.transcribed
     xs, us = np.asarray(solution.xs), np.asarray(solution.inputs_at_knots)
     if motion is None or solution.problem.is_map:
@@ -640,6 +638,6 @@ def trajectories(solution: Solution) -> Trajectories:
 
 
 def _largest(values: Array) -> float:
-    """The largest value; inf where one is not a number, 0 where there is none."""
+    """Return the largest value, inf if a value is NaN, or 0 without values."""
     values = np.asarray(values, dtype=float)
     return float("inf") if np.any(np.isnan(values)) else float(np.max(values, initial=0.0))

@@ -1,4 +1,4 @@
-"""The door: check what is asked, choose a method or a chain of them, search, measure the result again, judge it."""
+"""The entry point: validate the input, choose a method or a chain of methods, search, and verify the result."""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -32,16 +32,16 @@ from drake_diff.optimize.solution import PLANS, Search, Solution, Status, distin
 from drake_diff.optimize.transcription.task import MAP, SCHEMES, OptimalControl, default_scheme
 from drake_diff.optimize.verification import advice, limits_of, not_in_steps, overlaps
 
-COMPILED = 0.5  # [s] that are worth a word
+COMPILED = 0.5  # [s] a longer compilation is reported
 DEFAULTS = Options()
 METHODS = ("auto", "collocation", "shooting", "ilqr")
 DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": "ipopt", "ilqr": "riccati"}
 OTHER_GUESS = "another first guess"
-REFINING = 30  # iterations from a collocated plan to the optimum in steps; well-posed problems take ten
+REFINING = 30  # iterations from a collocated plan to the optimum in discrete steps; well-posed problems take ten
 NOT_FOUND = (Status.INFEASIBLE, Status.ITERATION_LIMIT, Status.DIVERGED, Status.FAILED)
 BLIND = (Status.NO_GRADIENT, Status.DIVERGED)
 ENDED = (Status.CONVERGED, Status.INTERRUPTED, Status.TIME_LIMIT)
-# The order in which a chain that ends without a verified motion prefers what it has.
+# The order of preference among the solutions of a chain that ends without a verified motion.
 PREFERENCE = (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED, Status.INTERRUPTED, Status.TIME_LIMIT)
 
 Progress = Callable[[str], None]
@@ -51,7 +51,7 @@ Progress = Callable[[str], None]
 def solve(problem: Problem, **asked: Any) -> Solution: ...
 @overload
 def solve(problem: PhasedProblem, **asked: Any) -> PhasedSolution: ...
-def solve(  # type: ignore[misc]  # its keywords are written here alone
+def solve(  # type: ignore[misc]  # only this signature lists the keywords
     problem: Problem | PhasedProblem,
     *,
     method: str = "auto",
@@ -65,50 +65,50 @@ def solve(  # type: ignore[misc]  # its keywords are written here alone
     callback: Callable[[Iteration], None] | None = None,
     view: bool | Callable[[str], None] = False,
 ) -> Solution | PhasedSolution:
-    """Solve `problem`, certify the derivatives that were used, and measure the result again on Drake's plant.
+    """Solve `problem`, certify the derivatives that were used, and verify the result on Drake's plant.
 
-    "auto" chains methods until one is verified: collocation where the model is smooth, or where every coordinate is
-    driven and nothing touches in x0; shooting where inputs are commanded positions and nothing touches in x0; else, or
-    where that fails, iLQR (with a continuation where the guess touches nothing that matters), whose result the next
-    one starts from.
-    A collocation that finds no motion from a straight line is tried from other first guesses, random ones by `seed`.
-    `Solution.options["chain"]` says what was tried, why, and how it ended.
+    "auto" chains methods until a result is verified. It chooses collocation if the model is smooth, or if every
+    coordinate is driven and no bodies touch in x0. It chooses shooting if inputs are commanded positions and no bodies
+    touch in x0. Otherwise, or if that fails, it uses iLQR (with a continuation if the guess makes no relevant contact),
+    and the next method starts from iLQR's result. A collocation that finds no motion from a straight line is repeated
+    from random initial guesses by `seed`. `Solution.options["chain"]` lists all attempts, their reasons and how they
+    ended.
 
     Args:
-        problem: what to optimize, of a model or of plain `Dynamics`; or an `optimize.PhasedProblem`, which collocation
-            takes and of which the solution is an `optimize.PhasedSolution`.
+        problem: the problem of a model or of plain `Dynamics`, or an `optimize.PhasedProblem`, which requires
+            collocation and whose solution is an `optimize.PhasedSolution`.
         method: "collocation" (in continuous time, for models without contact and for plain dynamics), "shooting"
             (through Drake's own steps, contact included), "ilqr" (the same by Riccati sweeps) or "auto".
-        initial_guess: None (a straight line to the goal with inputs near zero; a `TrackingCost`'s reference), a
-            Solution of any method, number of steps and horizon, a pair of Drake's trajectories (state, input) as
-            `Solution.trajectory` gives, or (xs, us) with shapes (N+1, nx) and (N, nu). Collocation also takes us
-            (N+1, nu), and a third entry, the horizon [s]. In phases: a PhasedSolution, or a list, one for each phase.
-        max_iterations: of the solver, and of each round of a refinement.
-        time_limit: [s] of the whole solve, but for what Numba compiles, once on a machine; a note says how long.
-        seed: of the noise in a default guess, and of the other first guesses.
-        restarts: how many more first guesses are tried, one after the other, smooth random ones by `seed`, also where
-            one was verified: the cheapest verified plan is kept, and `Solution.optima` has those that differ.
-        options: what the algorithms are told beside that, an `optimize.Options`: schemes, tolerances, continuations
-            through contact, refinement of meshes.
-        progress: True prints a line a few times a second, a function gets each line.
-        callback: gets an `optimize.Iteration` for each of the solver's, with the motion there: times, xs, us, contacts.
-            SNOPT, and IPOPT by shooting, evaluate without saying where an iteration ends: of these it gets the point
-            of an evaluation, a few times a second. Relaxed stages give none. What it raises ends the solve.
-        view: True serves a page for browsers on this machine and prints its address, a function gets the address: the
-            iterates in Drake's Meshcat beside their cost and violation, and at the end the motion of the plan, to be
-            played. It changes nothing of what is found, but takes time. It is served until the process ends. Plain
-            dynamics and phases have no such page.
+        initial_guess: None (a straight line to the goal with inputs near zero, or a `TrackingCost`'s reference), a
+            Solution of any method, number of steps and horizon, a pair of Drake trajectories (state, input) as in
+            `Solution.trajectory`, or (xs, us) with shapes (N+1, nx) and (N, nu). Collocation also takes us (N+1, nu),
+            and a third entry, the horizon [s]. For phases: a PhasedSolution, or a list with a guess for each phase.
+        max_iterations: the iteration limit of the solver, and of each round of a refinement.
+        time_limit: [s] of the whole solve. Numba's compilation, once per machine, is excluded, and a note reports it.
+        seed: the seed of the noise in a default guess, and of random initial guesses.
+        restarts: the number of further initial guesses, smooth random ones by `seed`, all tried in turn even if a plan
+            is verified. The cheapest verified plan is returned, and `Solution.optima` has those that differ.
+        options: further options of the algorithms, an `optimize.Options`: schemes, tolerances, continuations through
+            contact, refinement of meshes.
+        progress: True prints a line a few times a second. A function is called with each line.
+        callback: called with an `optimize.Iteration` for each iteration of the solver, with its times, xs, us and
+            contacts. SNOPT, and IPOPT in shooting, do not report the ends of iterations. For these, it is called with
+            an evaluated point a few times a second. Relaxed stages do not call it. An exception from it ends the solve.
+        view: True serves a page for browsers on this machine and prints its address. A function is called with the
+            address. The page shows the iterates in Drake's Meshcat with their cost and violation, and at the end the
+            motion of the plan for playback. It takes time, but does not change the result. It is served until the
+            process ends. Plain dynamics and phases have no page.
 
     Returns:
-        A `Solution`, whatever happened: how the solve ended is its `status`, `message` and `notes`.
+        A `Solution` in all cases. Its `status`, `message` and `notes` describe how the solve ended.
 
     Raises:
-        InputError: something that was asked for does not fit; nothing ran.
-        ModelError: the model cannot do what the method needs.
+        InputError: an argument is invalid; nothing ran.
+        ModelError: the model does not support the method.
 
     Source:
-        The schemes of collocation: Kelly, "An Introduction to Trajectory Optimization", SIAM Review 59(4), 2017.
-        The refinement of meshes: Betts, "Practical Methods for Optimal Control", ch. 4.
+        Collocation schemes: Kelly, "An Introduction to Trajectory Optimization", SIAM Review 59(4), 2017.
+        Mesh refinement: Betts, "Practical Methods for Optimal Control", ch. 4.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.05)
@@ -149,7 +149,7 @@ def solve(  # type: ignore[misc]  # its keywords are written here alone
     if view is False:
         solution = _solved(problem, asked, limits, restarts, report, chosen.on_start)
         return _with_compilation(solution, uncounted() - compiled, report)
-    from drake_diff.optimize.live import LiveSearch  # loads a web server
+    from drake_diff.optimize.live import LiveSearch  # imports a web server
 
     live = LiveSearch(problem, _print_address if view is True else view)
     with live.running(chosen.on_start) as start:
@@ -159,7 +159,7 @@ def solve(  # type: ignore[misc]  # its keywords are written here alone
 
 
 def _with_compilation(solution: Solution | PhasedSolution, seconds: float, report: Report) -> Solution | PhasedSolution:
-    """Say for how long Numba compiled, where that is worth a word; a note of a solve that the limit ended does."""
+    """Report a long compilation by Numba, and add a note to a solution that the time limit ended."""
     if seconds < COMPILED:
         return solution
     note = f"Numba compiled for {seconds:.2g} s, once on this machine, which no time limit counts"
@@ -181,7 +181,7 @@ def _solved(
     report: Report,
     on_start: Callable[[], None] | None,
 ) -> Solution | PhasedSolution:
-    """What `solve` gives, whose arguments, those of `report.asked`, have been checked one by one."""
+    """Solve with the arguments of `report.asked`, which have been validated one by one."""
     arguments, initial_guess = report.asked.arguments, report.asked.guess
     task = _Task(problem, limits, asked.seed, report, on_start)
     if isinstance(problem, PhasedProblem):
@@ -222,7 +222,7 @@ def _check_common(problem: Any, seed: Any, callback: Any, progress: Any, view: A
 
 
 def _takes(problem: Problem, method: str) -> bool:
-    """Whether `method` can be asked for `problem`, and says anything of its contact."""
+    """Return whether `method` accepts `problem` and does not ignore its contact."""
     if method == "collocation" and problem.has_model and problem.model.contract.contact.collision_pairs:
         return False
     return _is_possible(problem, Attempt(method, ""))
@@ -238,28 +238,28 @@ def _is_possible(problem: Problem, attempt: "Attempt") -> bool:
 
 @dataclass(frozen=True)
 class Attempt:
-    """One method with its options, and why it is taken; with `max_iterations` where they are fewer than the task's."""
+    """A method with its options and a reason. `max_iterations` is set if it is less than the task's."""
 
     method: str
     reason: str
     options: Options = DEFAULTS
     seed: int = 0
     max_iterations: int | None = None
-    apart: bool = False  # whether links are kept from each other that nothing else keeps apart
-    closest: bool = False  # whether the motion nearest to the guess is searched, whatever it costs
+    apart: bool = False  # whether additional constraints keep links apart
+    closest: bool = False  # whether to search for the motion nearest to the guess, regardless of its cost
 
     def told(self, in_phases: bool) -> dict[str, str]:
-        """What the chain says of it."""
+        """Return the attempt's entry in the chain."""
         return {"guess": self.reason} if in_phases else {"method": self.method, "reason": self.reason}
 
     def by(self, method: str, reason: str) -> "Attempt":
-        """The attempt by a `method` that is chosen, with the options that it takes."""
+        """Return the attempt with a chosen `method` and the options that it accepts."""
         return replace(self, method=method, reason=reason, options=self.options.of_method(method))
 
 
 @dataclass(eq=False)
 class _Task:
-    """What all attempts at a problem share."""
+    """The data that all attempts at a problem share."""
 
     problem: Any
     limits: Limits
@@ -270,17 +270,17 @@ class _Task:
 
     @property
     def is_late(self) -> bool:
-        """Whether the time is over."""
+        """Return whether the time limit has passed."""
         return now() - self.start > self.limits.time_limit
 
     def begin(self) -> None:
-        """Tell once that the work begins."""
+        """Call `on_start` once, when the work begins."""
         on_start, self.on_start = self.on_start, None
         if on_start is not None:
             on_start()
 
     def prepare(self, attempt: Attempt, given: Any) -> Callable[[], Any]:
-        """Check that `attempt` can be made from the guess `given`; what is returned makes it."""
+        """Check that `attempt` is possible from the guess `given`, and return a function that runs it."""
         problem, method = self.problem, attempt.method
         scheme = _check_attempt(problem, attempt)
         guesses = first_guesses(problem, method, given, self.seed)
@@ -321,20 +321,20 @@ class _Task:
         return make
 
     def _is_default(self, given: Any) -> bool:
-        """Whether a search begins from the guess that is made where none is asked for; in phases, from any such."""
+        """Return whether a search begins from a default guess. For phases, this depends on the user's guess only."""
         return (self.report.asked.guess if isinstance(self.problem, PhasedProblem) else given) is None
 
     def _limits_of(self, attempt: Attempt) -> Limits:
-        """What is left for an attempt."""
+        """Return the limits that remain for an attempt."""
         left = self.limits.time_limit - (now() - self.start)
         most = min(attempt.max_iterations or self.limits.max_iterations, self.limits.max_iterations)
         return replace(self.limits, time_limit=max(left, 0.0), max_iterations=most)
 
 
 def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Any:
-    """Attempt after attempt until one is verified; the best of them, with what was tried in its options.
+    """Run attempts until a result is verified, and return the best result, with all attempts in its options.
 
-    A collocation that was asked for is tried from other first guesses alone.
+    If collocation was requested, only other initial guesses are tried.
     """
     chain: list[dict[str, str]] = []
     in_phases = isinstance(task.problem, PhasedProblem)
@@ -351,7 +351,7 @@ def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Any:
 
 
 def _attempted(task: _Task, asked: Attempt, given: Any, chain: list[dict[str, str]]) -> list[Any]:
-    """The solutions of all attempts, the last of which may be verified; `chain` gets a row for each attempt."""
+    """Return the solutions of all attempts, of which the last may be verified. `chain` gets a row for each attempt."""
     solutions: list[Any] = []
     in_phases = isinstance(task.problem, PhasedProblem)
     for attempt, guess in _attempts(task.problem, asked, given, solutions):
@@ -378,11 +378,11 @@ def _attempted(task: _Task, asked: Attempt, given: Any, chain: list[dict[str, st
 
 
 def _in_steps(task: _Task, asked: Attempt, plan: Solution, chain: list[dict[str, str]]) -> Solution:
-    """A collocated plan of a model, refined into the model's own steps: their optimum, else their nearest motion.
+    """Refine a collocated plan into the model's own steps: to their optimum, or else to their nearest motion.
 
-    Far from small steps the optimum may live from their errors. A plan that no such steps repeat is not verified. One
-    whose horizon is asked for or whose jerk is limited, which jumps with an input that is held, or that the steps
-    cannot take, stays in continuous time.
+    If steps are not small, their optimum may exploit their errors. A plan that no such steps repeat is not verified. A
+    plan stays in continuous time if the problem has a horizon, if its jerk is limited (jerk jumps with a held input),
+    or if the steps do not support the problem.
     """
     problem = task.problem
     has_steps = problem.has_model and problem.horizon is None and all(limit.of_inputs for limit in problem.rate_limits)
@@ -410,7 +410,7 @@ def _in_steps(task: _Task, asked: Attempt, plan: Solution, chain: list[dict[str,
 
 
 def _best_of(solutions: list[Solution]) -> Solution:
-    """The one that is preferred; where a signal ended what was tried after it, a note says so."""
+    """Return the preferred solution, with a note if a signal ended the attempts after it."""
     best = min(solutions, key=_preference) if len(solutions) > 1 else solutions[0]
     if solutions[-1].status is Status.INTERRUPTED and best is not solutions[-1]:
         return best.noted(f"what was tried after it: {Status.INTERRUPTED.sentence}")
@@ -418,9 +418,9 @@ def _best_of(solutions: list[Solution]) -> Solution:
 
 
 def _restarted(task: _Task, asked: Attempt, first: Solution, restarts: int) -> Solution:
-    """The cheapest verified of a solution and of `count` more by the same method, with all optima that were found.
+    """Return the cheapest verified solution of `first` and `restarts` more by the same method, with all optima found.
 
-    Ctrl-C and the time limit end it; an attempt that fails is told in the chain.
+    Ctrl-C and the time limit end the restarts. The chain lists attempts that fail.
     """
     first_link = {"method": first.method, "reason": asked.reason, "ended": first.status.value}
     chain = list(first.options.get("chain", (first_link,)))
@@ -459,13 +459,13 @@ def _restarted(task: _Task, asked: Attempt, first: Solution, restarts: int) -> S
 
 
 def _preference(solution: Solution) -> tuple[int, float, float]:
-    """The order of solutions, the best first: how they ended, how wrong they are where that is no plan, the cost."""
+    """Return the sort key of a solution, best first: its status, its errors if it is no success, and its cost."""
     rank = PREFERENCE.index(solution.status) if solution.status in PREFERENCE else len(PREFERENCE)
     return rank, 0.0 if solution.success else solution.defect + solution.goal_error, solution.cost
 
 
 def _attempts(problem: Any, asked: Attempt, given: Any, solutions: list[Any]) -> Iterator[tuple[Attempt, Any]]:
-    """What to try next and from which guess, by what the attempts before, in `solutions`, came to."""
+    """Yield the next attempt and its initial guess, depending on the `solutions` of the attempts before."""
     if asked.method == "collocation" or isinstance(problem, PhasedProblem):
         yield asked, given
         yield from _other_guesses(problem, asked, given, solutions)
@@ -485,7 +485,7 @@ def _attempts(problem: Any, asked: Attempt, given: Any, solutions: list[Any]) ->
     if solutions[-1].status is Status.NO_GRADIENT and method == "ilqr":
         touching = replace(first.options, continuation="auto")
         yield replace(first, reason="the guess has no gradient", options=touching), given
-    if method == "shooting" or not problem.has_model or problem.couplings:  # which iLQR does not take
+    if method == "shooting" or not problem.has_model or problem.couplings:  # iLQR does not support couplings
         return
     if method == "collocation":
         reason = "collocation was not verified: a guess for it"
@@ -501,7 +501,7 @@ def _attempts(problem: Any, asked: Attempt, given: Any, solutions: list[Any]) ->
 def _without_contact(
     problem: Problem, asked: Attempt, given: Any, solutions: list[Any]
 ) -> Iterator[tuple[Attempt, Any]]:
-    """Before a method by steps: collocation of a fully driven model, or shooting of servos from a straight line."""
+    """Yield attempts before discrete steps: collocation of a fully driven model, or shooting of servos from a line."""
     free = asked.by("collocation", "nothing touches at first, and every coordinate is driven")
     if _is_free_at_first(problem) and _is_possible(problem, free):
         yield free, given
@@ -514,7 +514,7 @@ def _without_contact(
 def _in_continuous_time(
     problem: Problem, first: Attempt, given: Any, solutions: list[Solution]
 ) -> Iterator[tuple[Attempt, Any]]:
-    """One method, shooting from what iLQR found, and other first guesses: one that touches nothing has no slope."""
+    """Yield one method, shooting from iLQR's motion, and random guesses, as a guess without contact has no gradient."""
     yield first, given
     most = first.options.other_guesses
     for number in range(most + 1):
@@ -533,7 +533,7 @@ def _in_continuous_time(
 
 
 def _rolled_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:
-    """Another first guess for steps; of a motion in continuous time the motion itself, where its states have one."""
+    """Return a random guess for steps. In continuous time, its states are a rollout, if that succeeds."""
     xs, us = another_guess(problem, seed, number)[:2]
     us = us[:-1]
     if problem.motion == CONTINUOUS:
@@ -545,7 +545,7 @@ def _rolled_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:
 def _other_guesses(
     problem: Problem | PhasedProblem, attempt: Attempt, given: Any, solutions: list[Any]
 ) -> Iterator[tuple[Attempt, Any]]:
-    """A collocation from other first guesses than a straight line, from which no motion was found."""
+    """Yield collocation attempts from random initial guesses, if no motion is found from a straight line."""
     if given is not None or attempt.options.solver == "snopt":
         return
     most = attempt.options.other_guesses
@@ -560,7 +560,7 @@ def _other_guesses(
 
 
 def _another_may_do(solution: Solution, options: Options) -> bool:
-    """Whether nothing was found, or in phases a plan that no mesh made hold."""
+    """Return whether no plan was found, or in phases whether a plan fails on every mesh."""
     in_phases = isinstance(solution, PhasedSolution)
     if not in_phases or solution.status is not Status.CONVERGED_NOT_VERIFIED or options.refine is False:
         return solution.status in NOT_FOUND
@@ -569,7 +569,7 @@ def _another_may_do(solution: Solution, options: Options) -> bool:
 
 
 def _kept_apart(problem: Problem, attempt: Attempt, solutions: list[Solution]) -> Iterator[tuple[Attempt, Any]]:
-    """A collocation whose links went through each other, from where it ended, with these kept apart."""
+    """Yield a collocation that keeps links apart, from a result in which links passed through each other."""
     last = solutions[-1]
     if isinstance(problem, PhasedProblem):
         return
@@ -580,7 +580,7 @@ def _kept_apart(problem: Problem, attempt: Attempt, solutions: list[Solution]) -
 
 
 def _touches_at_first(problem: Problem) -> bool:
-    """Whether geometries touch in x0, so that collocation, which leaves contact out, is no plan of the model."""
+    """Return whether geometries touch in x0, so that collocation, which ignores contact, cannot plan for the model."""
     model = problem.model
     if not (model.contract.contact.collision_pairs and problem.optimizes_controls and model.can_rebuild):
         return False
@@ -590,9 +590,9 @@ def _touches_at_first(problem: Problem) -> bool:
 
 
 def _is_free_at_first(problem: Problem) -> bool:
-    """Whether contact is there to be avoided: nothing needs to be pushed, and in x0 nothing touches.
+    """Return whether contact can be avoided: every coordinate is driven, and nothing touches in x0.
 
-    A collocated motion in which geometries overlap is not verified, so that one which is has no contact.
+    A collocated motion with overlapping geometries is not verified, so that a verified one has no contact.
     """
     model = problem.model
     contract = model.contract
@@ -605,7 +605,7 @@ def _is_free_at_first(problem: Problem) -> bool:
 
 
 def _check_attempt(problem: Problem | PhasedProblem, attempt: Attempt) -> str:
-    """The scheme, "step" of the discrete methods; refuses what the method cannot take, and what is another's."""
+    """Return the scheme ("step" for discrete methods). Raises an error for input that the method does not accept."""
     method = attempt.method
     if isinstance(problem, PhasedProblem):
         return _check_phases(problem, attempt)
@@ -633,7 +633,7 @@ def _check_attempt(problem: Problem | PhasedProblem, attempt: Attempt) -> str:
 
 
 def _check_motion(attempt: Attempt) -> None:
-    """What does not go along the motion in continuous time."""
+    """Raise InputError for options that do not support motion in continuous time."""
     if attempt.method == "collocation":
         expected = 'method="ilqr" or "shooting" for motion="continuous": collocation leaves contact out'
         raise InputError("method", got='"collocation"', expected=expected)
@@ -651,8 +651,8 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
     if not problem.optimizes_controls:
         raise InputError("optimize", got=list(problem.optimize), expected='"controls" for method="collocation"')
     _check_timed_cost(problem)
-    OptimalControl(problem, scheme)  # raises where a cost is no function that can be differentiated
-    if attempt.options.solver == "snopt":  # Drake's DirectCollocation gets bounds, ends and costs alone
+    OptimalControl(problem, scheme)  # raises an error if a cost cannot be differentiated
+    if attempt.options.solver == "snopt":  # Drake's DirectCollocation only gets bounds, ends and costs
         left_out = {
             "dynamics": not problem.has_model,
             "waypoints": problem.waypoints,
@@ -703,7 +703,7 @@ def _check_timed_cost(problem: Problem) -> None:
 
 
 def choose_method(problem: Problem) -> tuple[str, str]:
-    """(method, why)."""
+    """Return (method, reason)."""
     if not problem.has_model:
         reason = "a discrete map is one sparse program" if problem.is_map else "plain dynamics have no discrete step"
         return "collocation", reason

@@ -1,4 +1,4 @@
-"""Decide how a solve ended: what the solver says, cut down to what the checks of its plan allow."""
+"""Decide the status of a solve from the solver's outcome and the checks of its plan."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -19,19 +19,19 @@ from drake_diff.optimize.replay import FEEDBACK, GAINS_ALONE, OPEN_LOOP, Replay,
 from drake_diff.optimize.solution import Solution, Status
 
 FINER = "pass refine=True, or take more steps (num_steps)"
-REFINED = "raise max_num_steps, or take more steps (num_steps)"  # where it was refined
+REFINED = "raise max_num_steps, or take more steps (num_steps)"  # if the mesh was already refined
 SHORTER = "take a smaller time step"
 _ALIKE = ("ITERATION_LIMIT", "TIME_LIMIT", "INFEASIBLE", "INTERRUPTED", "DIVERGED", "NO_GRADIENT", "FAILED")
-# Where the solver stopped short of its own tolerance: our own measures say at what.
+# The solver stopped before it met its own tolerance, and independent measures decide whether the plan is a solution.
 STOPPED = (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.NO_GRADIENT, Outcome.FAILED)
-ON_A_BOUND = 1e-6  # of a horizon's bound: so near it the bound decides
-STATIONARY = 1e-6  # of the terms of the Lagrangian's gradient: what is left to gain is of its square
+ON_A_BOUND = 1e-6  # relative distance of a horizon from its bound, below which it counts as on the bound
+STATIONARY = 1e-6  # fraction of the terms of the Lagrangian's gradient; the remaining gain is about its square
 _STATUSES = {Outcome.UNBOUNDED: Status.DIVERGED, **{Outcome[name]: Status[name] for name in _ALIKE}}
 
 
 @dataclass(frozen=True)
 class PlantTrial:
-    """A plan in one plant under one feedback, and what is checked of it there."""
+    """A plan in one plant under one feedback, with its checks."""
 
     plant: str
     feedback: str | None
@@ -52,10 +52,10 @@ class PlantTrial:
 
 
 def trials(s: Solution) -> list[list[PlantTrial]]:
-    """The plan in each plant in which it has to hold, under one feedback at least; the plan's own plant comes first.
+    """Return the plan's trials in each plant in which it must hold under at least one feedback, its own plant first.
 
-    A plan by shooting has to hold open loop at its own step: its states are those of the step. A collocated plan has to
-    hold where its equations are integrated and, of a model, in the two finest steps of Drake that were taken.
+    A plan by shooting must hold open loop at its own step, from which its states result. A collocated plan must hold in
+    an integration of its equations and, for a model, in the two finest steps of Drake that were tried.
     """
     feedbacks = dict.fromkeys(c.feedback for c in s.following)
     following = [PlantTrial("in continuous time", f, [c for c in s.following if c.feedback == f]) for f in feedbacks]
@@ -65,7 +65,7 @@ def trials(s: Solution) -> list[list[PlantTrial]]:
         for v in variants:
             rows = [r for r in s.replays if r.variant == v]
             plants.append([_trial(r) for r in rows if r.control != GAINS_ALONE])
-            if any(r.control == GAINS_ALONE for r in rows):  # open loop, or under each of the two
+            if any(r.control == GAINS_ALONE for r in rows):  # open loop, or under both other controllers
                 plants.append([_trial(r) for r in rows if r.control != FEEDBACK])
     if plants and s.method == "shooting" and s.scheme == "step":
         plants[0] = [trial for trial in plants[0] if trial.feedback is None]
@@ -78,9 +78,9 @@ def _trial(r: Replay) -> PlantTrial:
 
 
 def judged(draft: Solution, result: NlpResult) -> Solution:
-    """The draft with the status that the solver's outcome and the checks allow.
+    """Return the draft with the status that the solver's outcome and the checks allow.
 
-    Replays are taken of a plan only that passes all other checks.
+    Replays are only computed for a plan that passes all other checks.
     """
     fields = {"iterations": result.iterations, "solver_message": result.message}
     failing = draft.plan_checks.failing
@@ -104,7 +104,7 @@ def judged(draft: Solution, result: NlpResult) -> Solution:
 
 
 def _holding(s: Solution, plants: list[list[PlantTrial]]) -> str:
-    """Under which feedback a plan holds in each plant; where a collocated plan fails at the model's own step."""
+    """Describe the feedback under which a plan holds in each plant, and a failure at the model's own step."""
     by_feedback: dict[str | None, list[str]] = {}
     for plant in plants:
         trial = next(trial for trial in plant if trial.holds)
@@ -119,7 +119,7 @@ def _holding(s: Solution, plants: list[list[PlantTrial]]) -> str:
 
 
 def _remedy(draft: Solution, failing: list[Check]) -> str:
-    """What to try against what fails between knots."""
+    """Suggest a remedy for a failure between knots."""
     if draft.problem.is_map or not any(c.what in ("cost", "integration") or c.plant != PLAN for c in failing):
         return ""
     if draft.transcribed is None:
@@ -128,25 +128,25 @@ def _remedy(draft: Solution, failing: list[Check]) -> str:
 
 
 def status_of(outcome: Outcome) -> Status | None:
-    """What a solver's outcome is by itself; None where it says that it found a solution."""
+    """Return the status of a solver's outcome, or None if the solver reports a solution."""
     return _STATUSES.get(outcome)
 
 
 def _by_our_measures(draft: Solution, result: NlpResult) -> tuple[Outcome, tuple[str, ...]]:
-    """The outcome of a solve whose plan keeps all that was asked, and how that differs from what the solver says."""
+    """Return the outcome of a solve whose plan passes its checks, and a note if it differs from the solver's."""
     if result.outcome not in STOPPED:
         return result.outcome, ()
     optimality = draft.optimality
     ratio = result.stationarity if isinstance(optimality, Refusal) else optimality.ratio
-    if not ratio <= STATIONARY:  # NaN where it is not known
-        goes_on = result.outcome in (Outcome.ITERATION_LIMIT, Outcome.NO_GRADIENT)  # the words say why it did not
+    if not ratio <= STATIONARY:  # NaN if unknown
+        goes_on = result.outcome in (Outcome.ITERATION_LIMIT, Outcome.NO_GRADIENT)  # these say why the solver stopped
         return result.outcome if goes_on else Outcome.INACCURATE, ()
     sentence = f"what was asked is kept, and the Lagrangian's gradient is {ratio:.1g} of its terms"
     return Outcome.SOLVED, (f"by our own measures, where the solver says {result.message!r}: {sentence}",)
 
 
 def not_in_steps(plan: Solution, refined: Solution) -> Solution:
-    """A collocated plan that no motion in the model's own steps repeats, with the steps in which it holds."""
+    """Return a collocated plan that no motion in the model's own steps repeats, and the steps in which it holds."""
     holding = (f"this plan holds {messages.under(t.feedback)} {t.plant}" for t in map(_trial, plan.replays) if t.holds)
     where = next(holding, "this plan holds in no steps that were tried")
     step = messages.in_milliseconds(plan.time_step)
@@ -155,7 +155,7 @@ def not_in_steps(plan: Solution, refined: Solution) -> Solution:
 
 
 def may_be_too_coarse(solution: Solution) -> bool:
-    """Whether a collocated plan keeps all that was asked at its nodes, and yet is none: a finer mesh may mend that."""
+    """Return whether a collocated plan passes all checks at its nodes but fails others, which a finer mesh may fix."""
     motion = solution.transcribed
     if solution.status is not Status.CONVERGED_NOT_VERIFIED or motion is None or motion.task.is_map:
         return False
@@ -164,25 +164,25 @@ def may_be_too_coarse(solution: Solution) -> bool:
 
 
 def overlaps(solution: Solution) -> bool:
-    """Whether geometries overlap in a collocated motion, which leaves contact out."""
+    """Return whether geometries overlap in a collocated motion, which ignores contact."""
     return any(c.what == "overlap" and not c.passes for c in solution.plan_checks)
 
 
 def unmeasured(draft: Solution, result: NlpResult) -> Solution:
-    """The draft as the solver leaves it: nothing of it is measured, so that it is no success."""
+    """Return the draft with the solver's outcome. It is not measured yet, and therefore no success."""
     status = _STATUSES.get(result.outcome, Status.CONVERGED_NOT_VERIFIED)
     fields = {"iterations": result.iterations, "solver_message": result.message}
     return ended(draft, status, result.message, "nothing was measured yet", **fields)
 
 
 def refused(draft: Solution, error: Exception) -> Solution:
-    """The draft of a solve that ended because a step or its derivative was refused."""
+    """Return the draft of a solve that ended because a step failed or had no derivative."""
     status = Status.NO_GRADIENT if isinstance(error, GradientError) else Status.DIVERGED
     return ended(draft, status, str(error))
 
 
 def ended(draft: Any, status: Status, *sentences: str, **fields: Any) -> Any:
-    """The draft with its final status and the first of `sentences` as the message; those that do not fit are notes."""
+    """Return the draft with its final status. The first of `sentences` is the message, and the others are notes."""
     text, *others = [s for s in sentences if s] or [""]
     message = headline(status.words, text)
     cut = [text] if text not in message else []
@@ -190,7 +190,7 @@ def ended(draft: Any, status: Status, *sentences: str, **fields: Any) -> Any:
 
 
 def limits_of(solution: Solution, restarts: int) -> Iterator[str]:
-    """What limits a verified plan: the bound of its horizon, inputs without limits, the only guess that was tried."""
+    """Yield the limitations of a verified plan: a horizon on its bound, unlimited inputs, a single initial guess."""
     problem = solution.problem
     if not solution.success or isinstance(problem, PhasedProblem):
         return
@@ -207,9 +207,9 @@ def limits_of(solution: Solution, restarts: int) -> Iterator[str]:
 
 
 def advice(solution: Solution, arguments: dict[str, Any], other_methods: Sequence[str]) -> str:
-    """A clause that says what to try; empty after a success or Ctrl-C.
+    """Return a clause that suggests what to try, or "" after a success or Ctrl-C.
 
-    `arguments` are those of `solve`, `other_methods` those that take the problem and were not tried.
+    `arguments` are those of `solve`. `other_methods` accept the problem and were not tried.
     """
     remedies = list(_remedies(solution, arguments, other_methods))
     return f"to try: {', or '.join(dict.fromkeys(remedies))}" if remedies else ""
@@ -224,7 +224,7 @@ def _remedies(solution: Solution, arguments: dict[str, Any], other_methods: Sequ
         yield 'method="ilqr" with continuation="auto"'
     if status is Status.ITERATION_LIMIT:
         most = arguments["max_iterations"]
-        if solution.options.get("max_iterations", most) < most:  # an attempt that was to find a guess
+        if solution.options.get("max_iterations", most) < most:  # an attempt that searches for a guess
             yield f'method="{solution.method}", which then gets all {most} iterations'
         else:
             yield f"max_iterations above {most}"
@@ -244,7 +244,7 @@ def _remedies(solution: Solution, arguments: dict[str, Any], other_methods: Sequ
 
 
 def _nearer_goals(solution: Solution) -> Iterator[str]:
-    """The goals that the plan does not come near to."""
+    """Yield suggestions for the goals that the plan misses."""
     for c in solution.problem.kept_goals:
         knots = solution.problem.knots_of(c, input_at_end=False)
         miss = max(c.miss(solution.xs[solution.knots[k]]) for k in knots)
@@ -253,7 +253,7 @@ def _nearer_goals(solution: Solution) -> Iterator[str]:
 
 
 def _may_continue(solution: Solution, other_methods: Sequence[str]) -> bool:
-    """Whether iLQR takes the problem, and no attempt was a continuation."""
+    """Return whether iLQR accepts the problem and no attempt was a continuation."""
     chain = solution.options.get("chain", ())
     tried = "continuation" in solution.options or any("continuation" in link for link in chain)
     return not tried and (solution.method == "ilqr" or "ilqr" in other_methods)
