@@ -1,4 +1,4 @@
-"""Is a derivative true? And what a model has in it that cannot be differentiated."""
+"""Certificates of derivatives, and audits of models for properties that prevent derivatives."""
 
 from drake_diff._base import attach_stub as _attach_stub
 

@@ -1,8 +1,8 @@
-"""Before anything runs: what in a model cannot be differentiated, or would be differentiated wrongly, and what to do.
+"""Audit a model: list the properties that prevent its derivatives or make them wrong, each with a remedy.
 
-`audit` runs a list of checks, each a function of a `Point` that yields its findings: of the step, of contact
-(`contact_checks`), and of what a robot file says. A stranger's file loads, and then cannot be driven, falls through the
-floor, or has masses that nobody wrote.
+`audit` runs a list of checks. Each check is a function that takes a `Point` and yields findings about the step, about
+contact (`contact_checks`), or about the robot file. A file that loads may still describe a robot that has no actuators,
+falls through the ground, or has default masses that the file does not give.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from drake_diff.model.parameters import IDENTITY_OFFSET
 from drake_diff.model.plant import FLOATING, actuators, bodies, instances, joints
 from drake_diff.model.step import advance, check_point, set_state
 
-AT_LIMIT = 1e-6  # [m or rad] from a joint's limit
-HUGE = 1e3  # of an entry of A or B: sap's reach 14, lagged contact's 4e4
-SAME_MASS = 1e-6  # relative: a file's mass and trace of inertia against the plant's
-NO_MASS = 1e-12  # [kg or kg m^2] of a joint's own entry of the mass matrix
+AT_LIMIT = 1e-6  # [m or rad] distance to a joint limit within which the joint counts as at the limit
+HUGE = 1e3  # smallest entry of A or B that is reported; entries reach 14 with sap, 4e4 with lagged
+SAME_MASS = 1e-6  # relative tolerance between the file's and the plant's mass, and trace of the inertia
+NO_MASS = 1e-12  # [kg or kg m^2] diagonal entry of the mass matrix below which a joint moves no mass
 IGNORED = re.compile(r"ignored|not currently support|only supports|unsupported|Skipping transmission", re.IGNORECASE)
-SKIPPED = re.compile(r"\d+ collision meshes skipped")  # those that exist and that Drake cannot use
+SKIPPED = re.compile(r"\d+ collision meshes skipped")  # mesh files that exist but that Drake cannot use
 HARMLESS = (
     *("safety_controller", "calibration", "found in a 'link'", "fixed joint", "texture", "material", "transmission'"),
     *("only Gazebo reads", "camera", "light", "visual", "'site'", "sensor", "statistic", "timestep", "integrator"),
@@ -51,18 +51,18 @@ HARMLESS = (
 
 
 def audit(model: Model, x: ArrayLike | None = None, u: ArrayLike | None = None) -> Findings:
-    """List what stands in the way of gradients of a model at a point, the worst first.
+    """List the problems that a model has with gradients at a point, the most severe first.
 
     Args:
-        model: the model to look at; it is left as it was.
-        x: (nx,) the state [q; v], the model's default state if left out.
-        u: (nu,) [N or N m] the input, zero, or where servos are, if left out.
+        model: The model to check. It is not changed.
+        x: (nx,) The state [q; v]. The default is the model's default state.
+        u: (nu,) [N or N m] The input. The default is zero, or the current position for servos.
 
     Returns:
-        A list of `Finding`, sorted by severity; empty if there is nothing to say. It prints one below the other.
+        A list of `Finding`, sorted by severity. It is empty if the checks find nothing.
 
     Raises:
-        ShapeError, NonFiniteError: a bad x or u. Whatever Drake refuses is a finding instead.
+        ShapeError, NonFiniteError: x or u is invalid. An error raised by Drake becomes a finding instead.
 
     Example:
         >>> model = dd.load_model("models/cart_pole.urdf", time_step=0.01)
@@ -75,7 +75,7 @@ def audit(model: Model, x: ArrayLike | None = None, u: ArrayLike | None = None) 
     point = Point(model, *check_point(model, x, model.neutral_input(x) if u is None else u))
     checks = _CHECKS if point.has_poses else _CHECKS_WITHOUT_POSES
     findings = [finding for check in checks for finding in check(point)]
-    if not model.can_rebuild:  # a diagram has no arguments
+    if not model.can_rebuild:  # a model from a diagram was not loaded with arguments of load_model
         findings = [replace(finding, arguments={}) for finding in findings]
     return Findings(sorted(findings, key=lambda f: (SEVERITIES.index(f.severity), f.subject, f.code)))
 
@@ -137,13 +137,13 @@ def _saturated_effort(point: Point) -> Found:
         return
     is_effort = model.inputs.actuator >= 0
     index = model.inputs.actuator[is_effort]
-    efforts = point.u[is_effort]  # [N or N m] with PD control, clamped; u alone if no step succeeds
+    efforts = point.u[is_effort]  # [N or N m], replaced below by the clamped effort with PD control if a step succeeds
     if point.step_error is None:
         advance(twin, point.x, point.u)
         efforts = np.array(plant.get_net_actuation_output_port().Eval(twin.context))[index]
     set_state(twin, np.concatenate([point.x[: model.nq], np.zeros(model.nv)]))
     twin.set_input(point.u)
-    # The efforts nearest to what no acceleration at rest takes.
+    # The efforts that hold the robot at rest without acceleration, in the least-squares sense.
     hold = np.linalg.lstsq(model.actuation[:, is_effort], twin.inverse_dynamics(np.zeros(model.nv)), rcond=None)[0]
     every = actuators(plant)
     for i, u, effort, rest in zip(index, point.u[is_effort], efforts, hold, strict=True):
@@ -246,7 +246,7 @@ def _undriven(point: Point) -> Found:
 
 def _left_out_actuators(point: Point) -> Found:
     missing = [row.name for row in point.joints if row.left_out and not row.driven]
-    others = any(not joint for _, joint in point.model.file_facts.left_out)  # of tendons and sites
+    others = any(not joint for _, joint in point.model.file_facts.left_out)  # actuators of tendons and sites
     for note in point.model.notes:
         match = re.match(r"(\d+ actuators left out)[^:]*: (.*)\.$", note)
         if match and (missing or others):
@@ -289,7 +289,7 @@ def _massless(point: Point) -> Found:
 
 
 def _fixed(point: Point, names: list[str]) -> dict[str, Any]:
-    """The argument that fixes these joints, none where nothing could move then."""
+    """Return the argument that fixes these joints, or {} if no joint could move then."""
     return {"fix_joints": names} if len(names) < point.model.plant.num_velocities() else {}
 
 
@@ -319,7 +319,7 @@ def _lost_shapes(point: Point) -> Found:
 
 
 def _has_usable_meshes(point: Point) -> bool:
-    """Whether collision meshes were left out that `meshes="convex"` would take."""
+    """Return whether collision meshes were skipped that `meshes="convex"` would load."""
     return any(SKIPPED.match(note) for note in point.model.notes)
 
 

@@ -1,6 +1,6 @@
-"""Compare a derivative with difference quotients, entry by entry, and say whether it may be used.
+"""Compare a derivative with difference quotients, entry by entry, and decide whether it may be used.
 
-What the differences say is in `differences`; `judge` makes the verdict, and `Certificate` says what it means.
+`differences` computes the difference quotients, `judge` decides the verdict, and `Certificate` documents the verdicts.
 """
 
 from __future__ import annotations
@@ -21,35 +21,35 @@ from drake_diff.certificates.differences import DIFFERENCES, TINY, Neighbourhood
 from drake_diff.exceptions import CertificateError, GradientError, InputError, ShapeError
 from drake_diff.model.contact import Pair
 
-VERDICTS = ("agree", "undecided", "not_converged", "disagree", "discontinuous")  # from good to bad
+VERDICTS = ("agree", "undecided", "not_converged", "disagree", "discontinuous")  # from best to worst
 
 
 @dataclass(frozen=True)
 class VerdictOptions:
-    """What makes a verdict of differences."""
+    """Thresholds that turn differences into a verdict."""
 
-    power: float = 1e-2  # of an entry: an error as large as this must be noticed
-    exact: float = 1e-6  # of an entry: no derivative need be better
-    trusted: float = 3.0  # times the uncertainty of a plateau
+    power: float = 1e-2  # relative to an entry: an error of this size must be noticeable
+    exact: float = 1e-6  # relative to an entry: an error of this size is always allowed
+    trusted: float = 3.0  # multiple of a plateau's uncertainty that is allowed
     early: float = 1000.0  # for this and the next two see `judge`
     stopped: float = 4e-3
     doubtful: float = 9e-3
-    doubtless: float = 10.0  # times the tolerance: a gap that large is an error though the differences do not tell 1 %
-    negligible: float = 1e-4  # of the largest of the row and of the column
-    unseen: float = 1e-8  # of the largest of the row, whatever the column's
-    visible: float = 1e-12  # of a value: a smaller jump is rounding
-    products: float = 3.3e-15  # of the products in a row: what sums of 30 of them may be off
-    nearer: float = 0.5  # of the gap to wide differences: a derivative so much nearer to narrow ones is theirs
-    gone: float = 0.1  # of a gap over the next larger step: what a jump between the two steps leaves
-    rounded: float = 1e-6  # of the largest of the row: rounding excuses no more
-    vanishing: float = 1e-5  # of the quotient over the widest step
-    resolved: float = 1e-4  # of an entry: a smaller corner is none
+    doubtless: float = 10.0  # a gap above this multiple of the tolerance is an error even if 1 % is not resolved
+    negligible: float = 1e-4  # relative to the largest entry of the row and of the column
+    unseen: float = 1e-8  # relative to the largest entry of the row, regardless of the column
+    visible: float = 1e-12  # relative to a value: a smaller jump is rounding
+    products: float = 3.3e-15  # relative rounding error of a sum of 30 products in a row
+    nearer: float = 0.5  # a derivative belongs to narrow steps if its gap there is below this part of the wide gap
+    gone: float = 0.1  # part of the gap at the next larger step that is left when a jump lies between the two steps
+    rounded: float = 1e-6  # relative to the largest entry of the row: upper bound of the allowance for rounding
+    vanishing: float = 1e-5  # relative to the quotient over the widest step
+    resolved: float = 1e-4  # relative to an entry: a smaller corner is ignored
     corner: float = 0.25
-    jump: float = -0.5  # one-sided quotients part as h^corner or less at a corner, and grow as h^jump at a jump
-    significant: float = 30.0  # times the scatter: what can be told from it
-    jitter_change: float = 0.1  # of an entry, 1e-9 beside the point
-    mixed: float = 1e-9  # of the largest entry of all: what as large a mixed derivative makes 1e-9 beside the point
-    jitter: float = 1e-9  # of the scale: how far beside the point the derivative is taken once more
+    jump: float = -0.5  # exponent of h, at most: of the gap at a corner (`corner`), of the quotients at a jump (`jump`)
+    significant: float = 30.0  # multiple of the scatter above which a change is significant
+    jitter_change: float = 0.1  # relative to an entry: change at a distance of 1e-9 from the point
+    mixed: float = 1e-9  # relative to the largest entry of all: effect of a mixed derivative of that size at 1e-9
+    jitter: float = 1e-9  # relative to the scale: distance from the point at which the derivative is taken again
 
 
 LIMITS = VerdictOptions()
@@ -64,9 +64,9 @@ Scales = tuple[Array, Array]
 
 @dataclass(frozen=True)
 class Judgement:
-    """Of every entry (m, n): the differences' value, the gap that is allowed, and the verdict as an index of VERDICTS.
+    """The value from differences, the allowed gap, and the verdict (an index into VERDICTS) of every entry (m, n).
 
-    `noticeable` is the smallest error that would have been noticed, and `size` what an error is measured by.
+    `noticeable` is the smallest error that would have been noticed. Errors are measured relative to `size`.
     """
 
     difference: Array
@@ -74,18 +74,18 @@ class Judgement:
     noticeable: Array
     size: Array
     codes: Codes
-    reasons: dict[tuple[int, int], str]  # of every entry that is discontinuous
+    reasons: dict[tuple[int, int], str]  # of every discontinuous entry
 
 
 def judge(
     around: Neighbourhood, a: Array, beside: Array | None = None, stopped: float = 0.0, second: Scales | None = None
 ) -> Judgement:
-    """Judge the derivative `a` (m, n); `beside` (m, n) is what it is 1e-9 away, if that is known.
+    """Judge the derivative `a` (m, n). `beside` (m, n) is the derivative at a distance of 1e-9, if it is known.
 
-    `stopped` says how early, of the momentum, a solver stopped whose solution `a` was taken at. That much of the
-    largest entry of the row is allowed, a thousand times, but no more than 0.4 % of the entry; up to 0.9 % of it, that
-    much is no error for certain. `second` are the units (m,) of the rows and (n,) of the columns by which entries are
-    weighed as well: see `_matters`.
+    `stopped` is the residual, relative to the momentum, at which the solver stopped whose solution `a` was taken at.
+    A gap of 1000 `stopped` times the largest entry of the row is allowed, but no more than 0.4 % of the entry. Between
+    0.4 % and 0.9 % of the entry, such a gap is undecided. `second` contains the units of the rows (m,) and of the
+    columns (n,) for a second comparison of the entries, see `_matters`.
     """
     difference, doubt = _nearest(around, a, second)
     size, least = _matters(around, a, difference, second)
@@ -100,7 +100,7 @@ def judge(
     tells = LIMITS.trusted * doubt <= LIMITS.power * size
     codes = np.full(a.shape, UNDECIDED)
     codes[(gap <= tolerance) & (noticeable <= LIMITS.power * size)] = AGREE
-    # The function does not depend on the variable: to the last bit it is the same at every step.
+    # The function does not depend on the variable if its values at all steps are identical to the last bit.
     unchanged = np.all((around.forward == 0) & (around.backward == 0), axis=0)
     left_out = (a == 0) & unchanged & (noticeable <= LIMITS.exact * np.abs(difference).max(initial=0))
     codes[left_out] = AGREE
@@ -119,9 +119,10 @@ def judge(
 
 
 def _nearest(around: Neighbourhood, a: Array, second: Scales | None) -> tuple[Array, Array]:
-    """The differences' value (m, n) and its uncertainty.
+    """Return the value from differences (m, n) and its uncertainty.
 
-    The limit is at the smallest steps that tell 1 %; of the plateaus that agree with that one the best is taken.
+    The reference is the plateau at the smallest steps that resolve 1 %. The result is the plateau with the smallest
+    uncertainty among those that agree with the reference.
     """
     values, uncertainty = around.plateaus()
 
@@ -138,31 +139,31 @@ def _nearest(around: Neighbourhood, a: Array, second: Scales | None) -> tuple[Ar
 
 
 def _matters(around: Neighbourhood, a: Array, difference: Array, second: Scales | None) -> tuple[Array, Array]:
-    """(m, n) what an error of each entry is measured by, and the least of that.
+    """Return the size (m, n) that errors of each entry are measured by, and its lower bound.
 
-    It is the entry itself, but no less than
+    The size is the magnitude of the entry, but at least
 
-    - 1e-4 of the largest entry of its row or of its column, whichever is smaller, and 1e-8 of its row's. A row's
-      entries are compared after each column was moved by its scale: 1 m, rad, m/s, rad/s, N or N m, or the variable's
-      magnitude where that is more. Where `second` says what the units are with time counted in steps, an entry must be
-      negligible both so and in seconds: h in x' = x + h v is small in seconds, h k / m in v' in steps, and both matter;
-    - 1e-5 of its own quotient over the widest step, a hundredth of that scale, where the slope is zero at the point;
-    - the rounding of the largest entry of all, where a row is nothing but rounding, as of a moment that is zero;
-    - what rounding leaves of a row in which products cancel, as of two opposite thrusters on a satellite: 3.3e-15 of
-      what the row's second differences over 1e-2 show of these products. That scales as the row does;
-    - what the smallest step of the widest plateau leaves of the rounding of the value, which is measured, up to 1e-6
-      of the largest entry of the row.
+    - 1e-4 of the largest entry of its row or of its column, whichever is smaller, and 1e-8 of the largest entry of its
+      row. Each column is first multiplied by its scale, which is 1 m, rad, m/s, rad/s, N or N m, or the variable's
+      magnitude if that is larger. If `second` gives the units with time counted in steps, an entry is negligible only
+      if it is small in both units of time: h in x' = x + h v is small in seconds, h k / m in v' in steps;
+    - 1e-5 of its own quotient over the widest step (1e-2 of the scale), if the slope is zero at the point;
+    - the rounding of the largest entry of all, if a row is only rounding, such as a moment that is zero;
+    - the rounding of a row in which products cancel, such as two opposite thrusters on a satellite. It is 3.3e-15 of
+      these products, which are estimated from the row's second differences over 1e-2. It scales with the row;
+    - the measured rounding of the value divided by the smallest step of the widest plateau, up to 1e-6 of the largest
+      entry of the row.
     """
     largest = np.abs(difference).max(axis=1, keepdims=True, initial=0)
     rounding = (LIMITS.significant * around.finest / DIFFERENCES.steps[3] / LIMITS.power)[:, None]
     widest = LIMITS.vanishing * np.maximum(np.abs(around.forward[0]), np.abs(around.backward[0]))
-    products = 4 / LIMITS.power * LIMITS.products * around.products[:, None]  # which leaves differences three of four
+    products = 4 / LIMITS.power * LIMITS.products * around.products[:, None]  # 4: three of them for the differences
     floor = np.maximum(np.maximum(widest, products), np.minimum(rounding, LIMITS.rounded * largest))
     return weigh(a, difference, second, floor)
 
 
 def weigh(a: Array, difference: Array, second: Scales | None, floor: Array | float = 0.0) -> tuple[Array, Array]:
-    """(m, n) what an error of each entry is measured by, and the least of that: see `_matters`."""
+    """Return the size (m, n) that errors of each entry are measured by, and its lower bound, see `_matters`."""
     magnitude = np.abs(difference)
     small = _small(magnitude)
     if second is not None:
@@ -174,18 +175,18 @@ def weigh(a: Array, difference: Array, second: Scales | None, floor: Array | flo
 
 
 def _small(magnitude: Array) -> Array:
-    """(m, n) what is negligible beside the largest of the row and of the column."""
+    """Return (m, n) the magnitude that is negligible compared with the largest of the row and of the column."""
     by_row, by_column = magnitude.max(axis=1, keepdims=True, initial=0), magnitude.max(axis=0, keepdims=True, initial=0)
     return np.asarray(LIMITS.negligible * np.minimum(by_row, by_column))
 
 
 def _beside(around: Neighbourhood, a: Array, gap: Array, codes: Codes) -> dict[tuple[int, int], str]:
-    """Entries of which the derivative is that over small steps and not over larger ones.
+    """Return the entries whose derivative is the slope over small steps but not over larger steps.
 
-    There is a break beside the point, nearer than differences resolve. It is a steep slope, a corner or a jump where
-    the differences' value is another one, by `gap` (m, n): the smallest step counts at which scatter cannot bridge that
-    gap, so that what is wrong there too stays wrong. Where they have no value it is a jump alone, of which the gap
-    grows as the step shrinks, and then is gone.
+    The function then has a break near the point, at a distance that the differences do not resolve. If the differences
+    have a value, which differs from the derivative by `gap` (m, n), the break is a steep slope, a corner or a jump. The
+    entry is compared at the smallest step at which scatter is less than the gap, so that an entry that is wrong there
+    stays wrong. If the differences have no value, only a jump counts, whose gap grows as the step shrinks and vanishes.
     """
     steps, gaps = np.array(DIFFERENCES.steps)[:, None, None], np.abs((around.forward + around.backward) / 2 - a)
     scatter = LIMITS.significant * np.maximum(around.finest, DIFFERENCES.last_place * around.size)[:, None]
@@ -200,17 +201,17 @@ def _beside(around: Neighbourhood, a: Array, gap: Array, codes: Codes) -> dict[t
 
 
 def _broken(around: Neighbourhood, a: Array, difference: Array, size: Array) -> dict[tuple[int, int], str]:
-    """Entries at a corner or a jump of the function, and the numbers that tell it."""
+    """Return the entries at a corner or a jump of the function, each with the quotients that show it."""
     forward, backward = around.forward, around.backward
     values = around.size + np.max(np.abs(forward[0]), axis=1, initial=0) * DIFFERENCES.steps[0]
     noise = np.maximum(LIMITS.significant * around.finest, LIMITS.visible * values)
     reasons: dict[tuple[int, int], str] = {}
     least = LIMITS.resolved * np.maximum(np.abs(a), np.abs(difference)) + LIMITS.power * size
-    # A jump that is the same on both sides shows in no gap, but in quotients that grow without end.
+    # A jump by the same amount on both sides leaves no gap between the quotients, but both grow as the step shrinks.
     for gap, steepest in ((np.abs(forward - backward), LIMITS.corner), (np.abs(forward + backward) / 2, LIMITS.jump)):
         for i, j, s in _does_not_shrink(gap, least, noise, steepest):
             h, ahead, behind = DIFFERENCES.steps[s], forward[s, i, j], backward[s, i, j]
-            grows = gap[s, i, j] > 3 * gap[s - 2, i, j]  # tenfold at a jump, over a decade
+            grows = gap[s, i, j] > 3 * gap[s - 2, i, j]  # tenfold at a jump, as the steps are a decade apart
             jump = f"the value jumps by {(ahead + behind) * h:.3g}" if steepest == LIMITS.jump else "the value jumps"
             kind = jump if grows else "the slope has a corner"
             reasons.setdefault((i, j), f"{kind}: {ahead:.6g} ahead, {behind:.6g} behind, with steps of {h:.1g}")
@@ -218,10 +219,10 @@ def _broken(around: Neighbourhood, a: Array, difference: Array, size: Array) -> 
 
 
 def _does_not_shrink(gap: Array, least: Array, noise: Array, steepest: float) -> list[tuple[int, int, int]]:
-    """Entries whose gap, over the four smallest steps at which it stands above `noise` (m,), goes as h^`steepest` or
-    less, each with the smallest of those steps.
+    """Return the entries whose gap scales as h^`steepest` or less, each with its smallest significant step.
 
-    The gap of a smooth entry shrinks as h, that of a corner at the point stays, that of a jump grows as 1/h.
+    The exponent is fitted over the four smallest steps at which the gap exceeds `noise` (m,). The gap shrinks as h if
+    the function is smooth, is constant at a corner, and grows as 1/h at a jump.
     """
     steps = np.array(DIFFERENCES.steps)[:, None, None]
     tells = gap * steps > noise[None, :, None]
@@ -229,18 +230,18 @@ def _does_not_shrink(gap: Array, least: Array, noise: Array, steepest: float) ->
     last = len(DIFFERENCES.steps) - 1 - np.argmax(tells[::-1, i, j], axis=0)
     i, j, last = (numbers[last >= 3] for numbers in (i, j, last))
     gaps = gap[last + np.arange(-3, 1)[:, None], i, j]
-    # Where it would still tell at the next smaller step, and does not: it is beside the point.
+    # If the gap should exceed the noise at the next smaller step but does not, the break is not at the point.
     after = np.minimum(last + 1, len(DIFFERENCES.steps) - 1)
     ends_early = (last + 1 < len(DIFFERENCES.steps)) & (gaps[-1] * np.array(DIFFERENCES.steps)[after] > 2 * noise[i])
     significant = ~ends_early & (gaps[-1] > least[i, j]) & (gaps.min(axis=0, initial=np.inf) > 0)
-    # The slope of the line through the four points; their steps are half a decade apart.
+    # The slope of the line through the four points, whose steps are half a decade apart.
     slope = np.array([1.5, 0.5, -0.5, -1.5]) @ np.log(gaps[:, significant]) / (5 * np.log(10) / 2)
     i, j, last = (numbers[significant][slope < steepest] for numbers in (i, j, last))
     return list(zip(i.tolist(), j.tolist(), last.tolist(), strict=True))
 
 
 def _stairs(around: Neighbourhood, size: Array) -> dict[tuple[int, int], str]:
-    """The entries of rows on a staircase whose slope is another on the stair than over many; else the whole row."""
+    """Return the entries whose slope within one stair differs from the slope over many stairs, or the whole row."""
     reasons: dict[tuple[int, int], str] = {}
     values, _ = around.plateaus()
     for i, why in around.stairs.items():
@@ -251,12 +252,12 @@ def _stairs(around: Neighbourhood, size: Array) -> dict[tuple[int, int], str]:
 
 
 def _jittery(around: Neighbourhood, a: Array, beside: Array) -> Flags:
-    """Entries that are another number right beside the point than the function's slopes around it explain."""
+    """Return the entries that change by more at a distance of 1e-9 than the slopes around the point explain."""
     change, size = np.abs(a - beside), np.abs(a) + np.abs(beside)
     reach = np.maximum(np.abs(around.forward), np.abs(around.backward)).max(axis=0, initial=0)
     row_size = size.max(axis=1, keepdims=True, initial=0)
-    # A smooth entry changes by 1e-9 of its slope here, and by 1e-2 of it over the widest quotient; by 1e-9 of mixed
-    # derivatives, too, which its own quotients do not show: dq/dt of a quaternion by itself, at rest.
+    # A smooth entry changes by 1e-9 of its slope at this distance and by 1e-2 of it over the widest quotient. Mixed
+    # derivatives add 1e-9 of their size, which its own quotients do not show: d(dq/dt)/dq of a quaternion at rest.
     smooth = np.maximum(LIMITS.resolved * reach, LIMITS.mixed * size.max(initial=0))
     return np.asarray(
         (change > smooth) & (change > LIMITS.jitter_change * size) & (size > LIMITS.negligible * row_size)
@@ -265,7 +266,7 @@ def _jittery(around: Neighbourhood, a: Array, beside: Array) -> Flags:
 
 @dataclass(frozen=True)
 class Entry:
-    """One entry of a derivative, the differences' value of it, the gap that is allowed, and what would be noticed."""
+    """An entry of a derivative with its value from differences, the allowed gap, and the smallest noticeable error."""
 
     row: str
     column: str
@@ -274,7 +275,7 @@ class Entry:
     tolerance: float
     noticeable: float  # the smallest error that would have been noticed
     verdict: str
-    reason: str = ""  # of "discontinuous": which kind, with numbers
+    reason: str = ""  # for "discontinuous": the kind of discontinuity, with numbers
 
     def __str__(self) -> str:
         why = f" ({self.reason})" if self.reason else ""
@@ -286,13 +287,13 @@ class Entry:
 
 @dataclass(frozen=True)
 class ModeChange:
-    """One pair's contact mode at the point and beside it, and the rows that the derivative misses there."""
+    """A pair's contact modes at the point and near it, and the rows that the derivative predicts wrongly there."""
 
     pair: Pair
     before: str
     after: str
     column: str
-    displacement: float  # in the column's own unit
+    displacement: float  # in the unit of the column
     rows: tuple[str, ...]
 
     def __str__(self) -> str:
@@ -305,22 +306,21 @@ class ModeChange:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Certificate(ShowsItsRepr):
-    """One derivative (m, n), compared with difference quotients; `codes` (m, n) are indices into VERDICTS.
+    """A derivative (m, n), compared with difference quotients. `codes` (m, n) are indices into VERDICTS.
 
-    How far the differences can be trusted is measured at the point: by how much they depend on their step, and by how
-    much the function's values scatter. From that comes `noticeable`, the smallest error of each entry that would have
-    been noticed. It is weighed by `size`: the entry itself, but no less than a millionth of the largest entry of its
-    row and of its column, the columns being moved by 1 SI unit, or by the variable's magnitude where that is more.
-    The verdict of an entry is
+    The accuracy of the differences is measured at the point, from their dependence on the step size and from the
+    scatter of the function's values. It yields `noticeable`, the smallest error of each entry that would have been
+    noticed. Errors are measured relative to `size`: the magnitude of the entry, but at least 1e-4 of the largest entry
+    of its row or of its column, whichever is smaller. For this comparison, each column is multiplied by 1 SI unit, or
+    by the variable's magnitude if that is larger. The verdict of an entry is
 
-    - "agree": it is the differences' value, and an error of 1 % of `size` would have been noticed;
-    - "undecided": the differences do not tell 1 %. Undecided does not pass;
-    - "not_converged": it agrees, but a rollout's gradient changes at a finer time step or in stiffer contact;
-    - "disagree": it is another value than the differences';
-    - "discontinuous": the function has a corner, a jump or stairs at the point, or the derivative is another one 1e-9
-      beside it; or the derivative is the slope over small steps, and not the one that larger steps settle at; or a jump
-      is nearer than 1e-6, which differences do not resolve. The entry's `reason` says which. A jump or a corner farther
-      away does not matter: the derivative is judged by the steps that do not reach it.
+    - "agree": it equals the value from differences, and an error of 1 % of `size` would have been noticed;
+    - "undecided": the differences do not resolve 1 %, so that the entry is not certified;
+    - "not_converged": it agrees, but a rollout's gradient does not converge to the slope of the continuous motion;
+    - "disagree": it differs from the value from differences;
+    - "discontinuous": the function has a corner, a jump or a staircase at the point, or a jump nearer than 1e-6, which
+      differences do not resolve. Or the derivative changes at a distance of 1e-9, or it is the slope over small steps
+      only. The entry's `reason` gives the case. Jumps and corners farther away have no effect on the verdict.
 
     Example:
         >>> from drake_diff.certificates import certify_jacobian
@@ -341,14 +341,14 @@ class Certificate(ShowsItsRepr):
     codes: Codes
     method: str
     subject: str
-    scale: Array  # (n,) of the displacements by which entries are compared
-    reasons: dict[tuple[int, int], str] = field(default_factory=dict)  # of the entries that are discontinuous
-    # In displacements of which one changes a column by its `scale`; None where the differences are of another motion,
-    # or along directions alone: `difference` then is the matrix nearest to the derivative that has their slopes.
+    scale: Array  # (n,) displacement of each variable for which the entries are compared
+    reasons: dict[tuple[int, int], str] = field(default_factory=dict)  # of the discontinuous entries
+    # In units of `scale` per column. None if the differences are of another motion or only along random directions, in
+    # which case `difference` is the matrix nearest to the derivative that has the measured slopes.
     around: Neighbourhood | None = None
-    stopped: float = 0.0  # how early the solver stopped where the derivative was taken, as a part of the momentum
-    second: Scales | None = None  # units of rows and columns by which entries are weighed as well
-    told: str = ""  # whose differences these are, where it is not plain
+    stopped: float = 0.0  # relative to the momentum: residual of the solution at which the derivative was taken
+    second: Scales | None = None  # units of rows and columns for a second comparison of the entries
+    told: str = ""  # note on the source of the differences
     mode_changes: tuple[ModeChange, ...] = ()  # of contact, within 1e-4 of the point
 
     @property
@@ -358,17 +358,17 @@ class Certificate(ShowsItsRepr):
 
     @property
     def power(self) -> float:
-        """The smallest error, as a part of what it is weighed by, that would have been noticed in every entry."""
+        """The smallest error, relative to `size`, that would have been noticed in every entry."""
         return float(np.max(self.noticeable / self.size, initial=0.0))
 
     @cached_property
     def entries(self) -> tuple[Entry, ...]:
-        """Every entry, row by row."""
+        """All entries, row by row."""
         return tuple(self.entry(i, j) for i in range(len(self.rows)) for j in range(len(self.columns)))
 
     @property
     def worst(self) -> Entry:
-        """The entry with the worst verdict; among equals, the one that is most wrong, or least known, for its size."""
+        """The entry with the worst verdict and, among these, the largest error or uncertainty relative to its size."""
         gap = np.abs(self.derivative - self.difference)
         excess = np.where(gap > self.tolerance, gap, self.noticeable) / self.size
         rank = self.codes + excess / (1 + excess)
@@ -376,14 +376,14 @@ class Certificate(ShowsItsRepr):
         return self.entry(int(i), int(j))
 
     def entry(self, row: int, column: int) -> Entry:
-        """The entry at (`row`, `column`)."""
+        """Return the entry at (`row`, `column`)."""
         numbers = (self.derivative, self.difference, self.tolerance, self.noticeable)
         a, d, t, n = (float(values[row, column]) for values in numbers)
         verdict, reason = VERDICTS[self.codes[row, column]], self.reasons.get((row, column), "")
         return Entry(self.rows[row], self.columns[column], a, d, t, n, verdict, reason)
 
     def of(self, derivative: ArrayLike) -> Certificate:
-        """The certificate of another `derivative` (m, n) at this point, by the same differences."""
+        """Return the certificate of another `derivative` (m, n) at this point, from the same differences."""
         if self.around is None:
             raise InputError("of", got="a certificate without differences of each entry", expected="one by `certify`")
         a = finite_array("derivative", derivative, self.derivative.shape) * self.scale
@@ -391,11 +391,11 @@ class Certificate(ShowsItsRepr):
         return certificate_of(self.around, a, None, **{name: getattr(self, name) for name in names})
 
     def count(self, verdict: str) -> int:
-        """How many entries have this verdict."""
+        """Return the number of entries with this verdict."""
         return int((self.codes == VERDICTS.index(verdict)).sum())
 
     def require(self) -> Certificate:
-        """This certificate if every entry agrees; otherwise CertificateError, which names the worst entry."""
+        """Return this certificate if every entry agrees, and raise CertificateError with the worst entry otherwise."""
         if self.verdict != "agree":
             raise CertificateError(f"{self.subject}: {self}")
         return self
@@ -434,23 +434,23 @@ def certify_jacobian(
     """Certify the Jacobian of any function R^n -> R^m at a point.
 
     Args:
-        f: the function, (n,) -> (m,); if `batched`, (K, n) -> (K, m), and it is called once for all points.
-        x: (n,) the point.
-        jacobian: (m, n), or a function of x that gives it, which is then also asked 1e-9 beside `x`.
-        batched: whether `f` takes many points at once.
+        f: The function, (n,) -> (m,). If `batched`, (K, n) -> (K, m), and it is called with many points at once.
+        x: (n,) The point.
+        jacobian: (m, n) The Jacobian, or a function of x that returns it, which is also called 1e-9 away from `x`.
+        batched: Whether `f` takes many points at once.
         rows: m names of the function's values.
         columns: n names of the variables.
-        solver_tolerance: how accurately `f` is solved, relative to max(1, |f|), if it is solved iteratively.
-        method: how the Jacobian was computed, for the record.
-        subject: what is certified, for messages.
-        scale: (n,) sizes of the variables, which differences move by parts of; max(1, |x|) where not given.
+        solver_tolerance: Relative tolerance of the values, with respect to max(1, |f|), if `f` is solved iteratively.
+        method: Name of the method that computed the Jacobian, which the certificate records.
+        subject: Name of the derivative in messages.
+        scale: (n,) Scales of the variables, to which the difference steps are relative. The default is max(1, |x|).
 
     Returns:
-        The certificate; its derivatives have the units of `f` per unit of `x`.
+        The certificate. Its derivatives have the units of `f` per unit of `x`.
 
     Raises:
-        ShapeError: the Jacobian does not have m rows and n columns.
-        GradientError: the Jacobian is not finite.
+        ShapeError: The Jacobian does not have m rows and n columns.
+        GradientError: The Jacobian is not finite.
 
     Source:
         Richardson, "The approximate arithmetical solution by finite differences", 1911.
@@ -508,11 +508,11 @@ def certify_displacement(
     point: Array | None = None,
     **named: Any,
 ) -> Certificate:
-    """Certify `derivative` (m, n) of `f` at 0, a function of scaled displacements (K, n) with values (K, m).
+    """Certify the `derivative` (m, n) at 0 of `f`, a function of scaled displacements (K, n) with values (K, m).
 
-    `minus` subtracts two values of `f`, on a tangent space if need be; `unsolved` (m,) is how wrong a value of `f` may
-    be because a solver stopped early; `point` (n,) is what is displaced, in the same units, if it is numbers that are
-    rounded. The others are arguments of `certificate_of`.
+    `minus` subtracts two values of `f`, for example in a tangent space. `unsolved` (m,) bounds the error of a value of
+    `f` due to a solver that stops early. `point` (n,) is the displaced point in the same units, if its entries are
+    rounded. The other arguments are those of `certificate_of`.
     """
     if derivative.shape != (len(rows), len(columns)):
         raise ShapeError("derivative", got=derivative.shape, expected=(len(rows), len(columns)))
@@ -532,7 +532,7 @@ def certificate_of(
     second: Scales | None = None,
     **named: Any,
 ) -> Certificate:
-    """The verdict on a `derivative` (m, n) by displacements in parts of `scale` (n,): see `judge`."""
+    """Return the certificate of a `derivative` (m, n) with respect to displacements in units of `scale` (n,)."""
     by = judge(around, derivative, beside, stopped, second)
     numbers = unscaled(scale, derivative, by.difference, by.tolerance, by.noticeable, by.size)
     more: dict[str, Any] = {"around": around, "scale": scale, "stopped": stopped, "second": second}
@@ -542,12 +542,12 @@ def certificate_of(
 def unscaled(
     scale: Array, derivative: Array, difference: Array, tolerance: Array, noticeable: Array, size: Array
 ) -> dict[str, Any]:
-    """A certificate's numbers (m, n) by its columns, of those by scaled displacements."""
+    """Convert the numbers (m, n) of a certificate from scaled displacements to the units of its columns."""
     numbers = {"derivative": derivative, "difference": difference, "tolerance": tolerance}
     numbers |= {"noticeable": noticeable, "size": size}
     return {name: frozen(values / scale) for name, values in numbers.items()}
 
 
 def jitter(scale: Array) -> Array:
-    """(n,) entries between a half and all of 1e-9 `scale` (n,), of either sign, always the same ones."""
+    """Return a fixed displacement (n,) with entries of either sign, between half of 1e-9 `scale` (n,) and all of it."""
     return LIMITS.jitter * scale * line(len(scale), 0)

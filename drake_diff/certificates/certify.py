@@ -1,4 +1,4 @@
-"""Certify the derivative of steps before they are used: of one entry by entry, of many along a few directions first."""
+"""Certify the derivatives of steps: of a single step entry by entry, of many steps along a few directions first."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ SHARED = (
 
 @dataclass(frozen=True)
 class CertifyOptions:
-    """Where a step is differenced, and what around it is told."""
+    """Distances and tolerances for the differences of a step."""
 
-    limit_reach: float = 0.05  # [m or rad] a joint limit this near may hold the joint in one of the displaced steps
-    effort_room: float = 0.02  # of an input's scale: twice the widest step of the differences
-    effort_part: float = 0.5  # of an effort limit at most, however small that is
-    leap: float = 1e-6  # of what an entry is weighed by: of another derivative at a limit than beside it
-    neighbourhood: float = 1e-4  # in scaled coordinates: how far away a change of contact mode is looked for
-    touched: float = 1e-2  # by what part of the larger one a row's change departs from the derivative's prediction
+    limit_reach: float = 0.05  # [m or rad] a joint limit within this distance may act in one of the displaced steps
+    effort_room: float = 0.02  # relative to the scale of an input: twice the widest step of the differences
+    effort_part: float = 0.5  # relative to an effort limit: upper bound of this distance for small limits
+    leap: float = 1e-6  # relative to an entry's size: ignored change of a derivative from an effort limit to inside it
+    neighbourhood: float = 1e-4  # in scaled coordinates: distance at which changes of the contact mode are searched
+    touched: float = 1e-2  # relative error of the derivative's prediction above which a row counts as affected
 
 
 STEP = CertifyOptions()
@@ -59,21 +59,21 @@ def certify(
     """Compare the Jacobians of one step with differences of the double step, entry by entry.
 
     Args:
-        model: the model whose step it is.
-        x: (nx,) the state [q; v].
-        u: (nu,) [N or N m] the input; may be left out where the model has none.
-        parameters: names, or values by name, of the parameters to differentiate by too.
-        method: as in `differentiate_step`.
-        derivatives: what to certify, instead of what `differentiate_step` gives.
+        model: The model.
+        x: (nx,) The state [q; v].
+        u: (nu,) [N or N m] The input; optional if the model has no inputs.
+        parameters: Names, or values by name, of the parameters that the step is also differentiated with respect to.
+        method: As in `differentiate_step`.
+        derivatives: The derivatives to certify. The default is the result of `differentiate_step`.
 
     Returns:
-        The certificate: rows are the next state's, columns those of [x; u; parameters], states on the tangent space
+        The certificate. Its rows are the next state, its columns [x; u; parameters], with states on the tangent space
         (a quaternion has three entries).
 
     Raises:
-        UnknownNameError: a method or parameter that does not exist.
-        ShapeError, NonFiniteError: a bad x or u.
-        GradientError, SimulationError: the step, or its derivative, is refused.
+        UnknownNameError: A method or parameter does not exist.
+        ShapeError, NonFiniteError: x or u is invalid.
+        GradientError, SimulationError: The step or its derivative cannot be computed.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -94,7 +94,7 @@ def _certified(
     derivatives: StepDerivatives | None,
     look_beside: bool,
 ) -> Certificate:
-    """`certify`; `look_beside` the point too, at the derivative 1e-9 away by `method`."""
+    """Implement `certify`. `look_beside` also computes the derivative at a distance of 1e-9 by `method`."""
     with applied(vector) as model:
         step, nx = StepAround.of_point(model, vector, x, u), model.nx
         d, beside = derivatives or step_jacobians(model, vector, x, u, method), None
@@ -114,12 +114,12 @@ def _certified(
 
 
 def _joined(*texts: str) -> str:
-    """Those that are not empty, as one."""
+    """Join the texts that are not empty."""
     return "; ".join(text for text in texts if text)
 
 
 def _limits_that_act(model: Model, x: Array) -> str:
-    """Which positions are at or beyond a joint limit, where a step has a corner and its forces are stiff."""
+    """Describe the positions at or beyond a joint limit, where a step has a corner and its forces are stiff."""
     limits = []
     for name, q, low, high in zip(model.position_names, x, *model.position_limits, strict=False):
         reach = STEP.neighbourhood * max(1.0, abs(q))
@@ -132,11 +132,11 @@ def _limits_that_act(model: Model, x: Array) -> str:
 def certify_inside(
     model: Model, x: Array, u: Array, *, parameters: Parameters = (), derivatives: StepDerivatives | None = None
 ) -> Certificate:
-    """`certify`, on the inner side of effort limits: a plan's inputs end up exactly at them, and never go beyond.
+    """Certify a step as `certify` does, but inside the effort limits, as the inputs of a plan often are at a limit.
 
-    Drake cuts inputs off at the limit, which is a corner: differences are taken beside it, where they have room. By
-    what the derivative exactly at the limit differs from the one just inside, what is certified is off. `derivatives`
-    are those on the inner side, where they are known.
+    Drake clips inputs at the limit, which is a corner. The differences are therefore taken at a distance from the
+    limit. If the derivative at the limit differs from the derivative just inside it, this difference is added to the
+    certified derivative. `derivatives` are the derivatives inside the limits, if they are known.
     """
     inside = _with_room(model, u)
     certificate = _certified(model, x, inside, select(model, parameters), "auto", derivatives, look_beside=True)
@@ -151,24 +151,24 @@ def certify_inside(
 
 
 def _beside_limits(model: Model, at_limit: NDArray[np.bool_]) -> str:
-    """What a certificate says of inputs that are at the limit of their effort."""
+    """Return the note of a certificate on inputs at their effort limit."""
     return f"{', '.join(np.array(model.input_names)[at_limit])} certified beside the limit of its effort"
 
 
 def _input_scale(model: Model, us: Array) -> Array:
-    """(..., nu) how far inputs (..., nu) are moved relative to the step: 1, or the effort limit where that is less."""
+    """Return the scale (..., nu) of inputs (..., nu): their magnitude, but at least min(1, effort limit)."""
     return np.maximum(np.minimum(1.0, form_of(model).cut), np.abs(us))
 
 
 def _with_room(model: Model, us: Array) -> Array:
-    """Inputs (..., nu) that leave differences room to effort limits."""
+    """Move inputs (..., nu) inside the effort limits by a margin for differences."""
     limits = form_of(model).cut
     room = np.minimum(STEP.effort_room * _input_scale(model, us), STEP.effort_part * limits)
     return np.minimum(np.maximum(us, room - limits), limits - room)
 
 
 def _leap_at_limits(model: Model, x: Array, u: Array, inward: Array, parameters: Parameters) -> Array:
-    """The derivative at u (nu,) less that 1e-9 of u away, to the side that the signs `inward` (nu,) say."""
+    """Return the derivative at u (nu,) minus that at a relative distance of 1e-9, to the side of `inward` (nu,)."""
     vector = select(model, parameters)
     beside = u + LIMITS.jitter * _input_scale(model, u) * inward
     with applied(vector) as model:
@@ -179,9 +179,9 @@ def _leap_at_limits(model: Model, x: Array, u: Array, inward: Array, parameters:
 
 
 def certify_steps(model: Model, xs: Array, us: Array, *, parameters: Parameters = ()) -> tuple[Certificate, ...]:
-    """`certify_inside` at each of xs (N, nx) and us (N, nu), by a first look where that leaves no doubt.
+    """Certify the steps at xs (N, nx) and us (N, nu), along a few directions where these leave no doubt.
 
-    The derivatives are taken in one call, as by a search. What is in doubt is looked at as it is, not taken anew.
+    The derivatives are computed in one call, as in an optimization. `certify_inside` reuses them for steps in doubt.
     """
     inside, certificates = _with_room(model, us), []
     for x, u, within, look in zip(xs, us, inside, first_looks(model, xs, inside, parameters), strict=True):
@@ -197,11 +197,11 @@ def certify_steps(model: Model, xs: Array, us: Array, *, parameters: Parameters 
 
 
 class UnsolvedError(Exception):
-    """A step is not known to rounding; it says why."""
+    """A step cannot be solved to rounding. The message gives the reason."""
 
 
 def solved(refined: RefinedSteps) -> RefinedSteps:
-    """`refined`; raises UnsolvedError where a step is refused."""
+    """Return `refined`, or raise UnsolvedError if a step is refused."""
     for k, why in refined.refused.items():
         raise UnsolvedError(f"{why} (step {k})" if len(refined.refused) < len(refined.left) else str(why))
     return refined
@@ -209,7 +209,7 @@ def solved(refined: RefinedSteps) -> RefinedSteps:
 
 @dataclass(frozen=True)
 class StepAround:
-    """A step's end as a function of scaled displacements of [x; u; parameters] from `point` (nx + nu + np,)."""
+    """The next state as a function of scaled displacements of [x; u; parameters] from `point` (nx + nu + np,)."""
 
     model: Model
     vector: ParameterVector
@@ -219,24 +219,24 @@ class StepAround:
 
     @classmethod
     def of_point(cls, model: Model, vector: ParameterVector, x: Array, u: Array) -> StepAround:
-        """Around the step from x (nx,) under u (nu,), `vector` being applied."""
+        """Create the function around the step from x (nx,) under u (nu,), while `vector` is applied."""
         space = tangent_space(model)
         scale = np.concatenate([state_scale(space, x), _input_scale(model, u), vector.difference_scale()])
         return cls(model, vector, space, np.concatenate([x, u, vector.values]), scale)
 
     @property
     def units(self) -> tuple[Array, Array]:
-        """Of the state (size,), and of all columns, where time is counted in steps."""
+        """The units of the state (size,) and of all columns, with time counted in steps."""
         size, nv = self.space.size, self.model.nv
         state = np.where(np.arange(size) < size - nv, 1.0, 1 / self.model.time_step)
         return state, np.concatenate([state, np.ones(len(self.scale) - size)])
 
     def jacobian(self, d: StepDerivatives, x: Array) -> Array:
-        """(size, n) of derivatives at x (nx,), by scaled displacements."""
+        """Return the Jacobian (size, n) of derivatives at x (nx,) with respect to scaled displacements."""
         return self.space.jacobian(x, d.x_next, d.A, d.B, d.C) * self.scale
 
     def labels(self, d: StepDerivatives, note: str) -> dict[str, Any]:
-        """What a certificate of `d` is called, and what it rests on."""
+        """Return the names, the scale and the notes of a certificate of `d`."""
         return {
             "scale": self.scale,
             "rows": self.space.names,
@@ -247,15 +247,15 @@ class StepAround:
         }
 
     def moved(self, displacement: Array) -> Array:
-        """(nx + nu + np,) the point at a displacement (n,)."""
+        """Return the point (nx + nu + np,) at a displacement (n,)."""
         return move(self.space, self.model.nx, self.point, self.scale * displacement)
 
     def drake(self, displacement: Array) -> Array:
-        """(nx,) where Drake's own step leads, on the double twin, which is left there."""
+        """Return the next state (nx,) of Drake's own step. The double twin keeps the context of this step."""
         return step_at(self.model, self.vector, *self._split(self.moved(displacement)))
 
     def solved(self, displacements: Array, held: Array | None = None) -> RefinedSteps:
-        """The steps at displacements (K, n) to rounding, with a momentum that is held back in their balance."""
+        """Solve the steps at displacements (K, n) to rounding, with the residual momentum `held` in their balance."""
         points = self._split(np.array([self.moved(d) for d in displacements]))
         momenta = None if held is None else np.repeat(held, len(displacements), axis=0)
         return solved(refine_steps(self.model, self.vector, *points, momenta))
@@ -266,12 +266,12 @@ class StepAround:
 
     @property
     def tolerance(self) -> float:
-        """How accurately Drake solves the step."""
+        """The relative tolerance with which Drake solves the step."""
         return solver_tolerance(self.model, *self._split(self.point)[:2])
 
     def look_around(self) -> tuple[Neighbourhood, str, float]:
-        """The differences of the step, to rounding if that can be had, whose steps they are of, and what Drake's own
-        step leaves at the point, of the momentum."""
+        """Return the differences of the step, solved to rounding if possible, a note on their source, and the residual
+        of Drake's own step at the point, relative to the momentum."""
         space, n, tolerance = self.space, len(self.scale), self.tolerance
         if not tolerance:
             return look_around(one_by_one(self.drake), n, space.minus), "", 0.0
@@ -283,7 +283,7 @@ class StepAround:
             return refined.x_next
 
         try:
-            left = float(self.solved(np.zeros((1, n))).left[0])  # what is never known is told by the first
+            left = float(self.solved(np.zeros((1, n))).left[0])  # raises UnsolvedError early
             around = look_around(ends, n, space.minus)
         except UnsolvedError as why:
             size = np.delete(np.maximum(1.0, np.abs(self.drake(np.zeros(n)))), list(space.quaternions))
@@ -292,10 +292,10 @@ class StepAround:
         return around, differences_of_solved(max(left, *worst)), left
 
     def ends(self) -> Callable[[Array], tuple[Array, float]]:
-        """Where steps lead from displacements (K, n), with what Drake's own leave of the momentum.
+        """Return a function from displacements (K, n) to next states and the residual of Drake's own steps.
 
-        They leave what Drake's own leaves at the point, so that they begin there; a negative number where nothing is
-        solved for. Raises UnsolvedError.
+        The steps keep the residual of Drake's own step at the point, so that they agree with it there. The residual is
+        relative to the momentum, and negative if the step has no solver. Raises UnsolvedError.
         """
         if not self.tolerance:
             return lambda displacements: (np.array([self.drake(d) for d in displacements]), -1.0)
@@ -308,11 +308,11 @@ class StepAround:
         return held
 
     def first_look(self, derivative: Array) -> Looked:
-        """What the step does along a few directions, what Drake's own steps leave, and why that is in doubt.
+        """Check the derivative along a few directions. Return the result, the residual of Drake's steps and the doubt.
 
-        What is in doubt is looked at once more over a tenth of the widths, where a contact that begins or slides a
-        little farther away is not met. Stairs that are longer than these are met there neither, nor is a corner by a
-        column of small weight: they are sought along a line, as by a look at every entry.
+        In case of doubt, the comparison is repeated over a tenth of the widths, which do not reach a contact that
+        begins or slides a little farther away. These widths would also miss wider stairs, and corners in a column of
+        small weight. Both are therefore searched along a line, as in the comparison of every entry.
         """
         look, left, doubt = None, -1.0, ""
         try:
@@ -342,17 +342,17 @@ Looked = tuple[FirstLook | None, float, str]
 
 @dataclass(frozen=True, eq=False)
 class StepLook:
-    """A step along a few directions: its certificate, or why every entry has to be looked at."""
+    """The comparison of a step along a few directions: its certificate, or why every entry must be compared."""
 
     step: StepAround
     derivatives: StepDerivatives
-    look: FirstLook | None  # None where the steps are not known to rounding
-    left: float  # what Drake's own leave of the momentum
+    look: FirstLook | None  # None if the steps cannot be solved to rounding
+    left: float  # residual of Drake's own steps, relative to the momentum
     doubt: str
 
     @property
     def certificate(self) -> Certificate | None:
-        """That the derivative is the step's; None where that is in doubt."""
+        """The certificate that the derivative is correct, or None in case of doubt."""
         if self.look is None or self.doubt:
             return None
         note = differences_of_solved(self.left) if self.left >= 0 else ""
@@ -360,7 +360,7 @@ class StepLook:
 
 
 def first_looks(model: Model, xs: Array, us: Array, parameters: Parameters) -> list[StepLook]:
-    """Each of the steps from xs (N, nx) under us (N, nu) along a few directions."""
+    """Compare the derivatives of the steps from xs (N, nx) under us (N, nu) along a few directions."""
     vector, looks = select(model, parameters), []
     with applied(vector) as model:
         derivatives = derivatives_along(model, xs[0], us, vector=vector, xs=xs)
@@ -371,7 +371,7 @@ def first_looks(model: Model, xs: Array, us: Array, parameters: Parameters) -> l
 
 
 def differences_of_solved(left: float) -> str:
-    """Whose differences those are of which Drake's own steps left at most `left` of the momentum."""
+    """Return the note on differences of solved steps, for which Drake's own steps have at most the residual `left`."""
     return (
         f"differences of the step's equation solved to rounding, which Drake's own steps keep to {left:.1g} of the "
         f"momentum (its solver stops at {SAP_RELATIVE_TOLERANCE:g})"
@@ -379,7 +379,7 @@ def differences_of_solved(left: float) -> str:
 
 
 def differences_of_drake(why: str) -> str:
-    """Whose differences they are where the steps are not known to rounding, and `why`."""
+    """Return the note on differences of Drake's own steps, and `why` the steps are not solved to rounding."""
     return f"differences of Drake's own steps, which end at {SAP_RELATIVE_TOLERANCE:g} of the momentum: {why}"
 
 
@@ -403,7 +403,7 @@ def _find_mode_changes(step: StepAround, derivative: Array) -> tuple[ModeChange,
 
 
 def solver_tolerance(model: Model, x: Array, u: Array) -> float:
-    """How accurately the step at (`x`, `u`) is solved: SAP's tolerance if SAP has anything to solve, else 0."""
+    """Return the relative tolerance of the step at (`x`, `u`): SAP's tolerance if SAP may have a problem, else 0."""
     advance(model.double, x, u)
     q, reach = x[: model.nq], STEP.limit_reach + 2 * model.time_step * np.abs(x[model.nq :]).max(initial=0)
     lower, upper = model.position_limits
@@ -413,12 +413,12 @@ def solver_tolerance(model: Model, x: Array, u: Array) -> float:
 
 
 def state_scale(space: TangentSpace, x: Array) -> Array:
-    """(size,) how far a coordinate is moved relative to the step: its magnitude, at least 1; rotations 1."""
+    """Return the scale (size,) of each coordinate: its magnitude, at least 1, and 1 for rotations."""
     magnitude = np.maximum(1.0, np.abs(x))
     magnitude[[i for q in space.quaternions for i in range(q, q + 4)]] = 1.0
     return np.delete(magnitude, list(space.quaternions))
 
 
 def move(space: TangentSpace, nx: int, point: Array, displacement: Array) -> Array:
-    """[x; u; ...] moved by a displacement, of the state (nx,) on its tangent space."""
+    """Return [x; u; ...] moved by a displacement. The state (nx,) is moved on its tangent space."""
     return np.concatenate([space.plus(point[:nx], displacement[: space.size]), point[nx:] + displacement[space.size :]])

@@ -1,4 +1,4 @@
-"""The checks of an audit that concern contact; their numbers were measured on the Drake of this package's tests."""
+"""The audit's checks of contact. Their thresholds were measured with the Drake version of this package's tests."""
 
 import re
 from collections.abc import Iterator
@@ -18,30 +18,30 @@ from drake_diff.model.step import set_state
 
 @dataclass(frozen=True)
 class ContactCheckOptions:
-    """What the checks of contact take for near and many."""
+    """Thresholds of the contact checks."""
 
-    pairs: int = 6  # of links, each with a finding of its own; a humanoid has hundreds
-    nearly_parallel: float = 1e-2  # [rad]: jumps were measured up to 1e-3 and beyond
-    in_plane: float = 1e-6  # [m] from a plane of symmetry
+    pairs: int = 6  # number of link pairs that get separate findings; a humanoid has hundreds of pairs
+    nearly_parallel: float = 1e-2  # [rad]; jumps were measured up to 1e-3 and beyond
+    in_plane: float = 1e-6  # [m] distance from a plane of symmetry
     reach: float = 1e-3  # [m] faces nearer than this count as touching
-    on_axis: float = 1e-9  # [m] from a sphere's centre to a cylinder's axis
-    touch: float = 1e-9  # [m] of signed distance, where Drake computes it exactly
-    rough_touch: float = 1e-6  # [m] where it iterates (measured: 1e-7 off for an ellipsoid)
+    on_axis: float = 1e-9  # [m] distance between a sphere's centre and a cylinder's axis
+    touch: float = 1e-9  # [m] signed distance, for shapes for which Drake computes it exactly
+    rough_touch: float = 1e-6  # [m] the same, for iterative distances (measured error for an ellipsoid: 1e-7)
 
 
 OPTIONS = ContactCheckOptions()
 ROUND = ("Sphere", "Ellipsoid", "Capsule")
 UNITS = dict(zip(PROXIMITY, ("", " N/m", " s/m", " s", " Pa"), strict=True))
-CORNER = re.compile(r"_corner_\d+ \(Sphere\)$")  # what replace_collision_geometry calls its spheres
+CORNER = re.compile(r"_corner_\d+ \(Sphere\)$")  # names of the spheres of replace_collision_geometry
 
 
 def short(error: DrakeDiffError) -> str:
-    """The first sentence of an error of a step."""
+    """Return the first sentence of a step's error message."""
     return str(error).removeprefix("Drake cannot take this step: ").split(". ")[0].rstrip(".")
 
 
 def refused_pairs(point: Point) -> Iterator[Finding]:
-    """Pairs that AutoDiffXd refuses, by their links."""
+    """Find pairs that Drake does not support with AutoDiffXd, grouped by their links."""
     by_choice = point.model.contact_geometry == "differences"
     groups: dict[tuple[str, str], list[ColliderPair]] = {}
     for pair in point.pairs:
@@ -68,7 +68,7 @@ def refused_pairs(point: Point) -> Iterator[Finding]:
 
 
 def _route(point: Point, pairs: list[ColliderPair]) -> dict[str, Any]:
-    """The arguments with which these pairs are differentiated."""
+    """Return the arguments of `load_model` with which these pairs can be differentiated."""
     kinds, source = {kind for pair in pairs for kind in pair.kinds}, point.model.source
     if point.model.plant.get_contact_model() != ContactModel.kPoint:
         return {"contact_geometry": "hydroelastic"}
@@ -95,7 +95,7 @@ def _refusal(point: Point, pairs: list[ColliderPair]) -> str:
 
 
 def aligned_faces(point: Point) -> Iterator[Finding]:
-    """Flat faces that meet in hydroelastic contact, where the step jumps."""
+    """Find flat faces that may meet in hydroelastic contact, where the step jumps."""
     remedy = (
         'load_model(..., contact_model="point", contact_geometry="corner_spheres") replaces one of them by spheres; or '
         "start tilted by 0.03 rad or more (cylinder on cylinder 0.04) and `certify` the poses in contact"
@@ -117,10 +117,10 @@ def aligned_faces(point: Point) -> Iterator[Finding]:
 
 
 def _alignment(pair: ColliderPair) -> tuple[float | None, float]:
-    """The angle [rad] between the two nearest face normals, and the gap [m] along them; None without flat faces.
+    """Return the smallest angle [rad] between two face normals, None without flat faces, and the gap [m] along them.
 
-    The gap is negative where the boxes overlap. Drake's mesh of a round shape counts as flat too, where its centre
-    lies in a plane of symmetry of a box's mesh or in an upright one of a cylinder's.
+    The gap is negative if the bounding boxes overlap. Drake's mesh of a round shape counts as flat if its centre lies
+    in a plane of symmetry of a box's mesh, or in a plane of symmetry through the axis of a cylinder's mesh.
     """
     for first, other in ((pair.a, pair.b), (pair.b, pair.a)):
         if first.kind in ROUND and other.kind in ("Box", "Cylinder"):
@@ -138,7 +138,7 @@ def _alignment(pair: ColliderPair) -> tuple[float | None, float]:
 
 
 def _normals(collider: Collider, other: Collider) -> list[Array]:
-    """The normals of its flat faces, or of the planes that its mesh lines up with."""
+    """Return the normals of the collider's flat faces, or of the planes with which its mesh is aligned."""
     meshed = other.kind in ("Box", "Cylinder")
     if collider.kind == "Box" or (collider.kind in ("Sphere", "Ellipsoid") and meshed):
         return [collider.axis(i) for i in range(3)]
@@ -147,7 +147,7 @@ def _normals(collider: Collider, other: Collider) -> list[Array]:
 
 
 def spheres_on_axes(point: Point) -> Iterator[Finding]:
-    """Spheres on a cylinder's axis, where AutoDiffXd is singular."""
+    """Find spheres on a cylinder's axis, where AutoDiffXd is singular."""
     distances: dict[str, float] = {}  # [m]
     for pair in point.pairs:
         both = pair.in_order("Sphere", "Cylinder")
@@ -168,11 +168,11 @@ def spheres_on_axes(point: Point) -> Iterator[Finding]:
 
 
 def contact_defaults(point: Point) -> Iterator[Finding]:
-    """Contact numbers that nobody gave."""
+    """Find contact parameters that are not set, so that defaults apply."""
     groups: dict[tuple[str, ...], list[Collider]] = {}
     for collider in point.colliders:
         contacts = {pair.contact for pair in point.pairs if collider in (pair.a, pair.b)}
-        read = ["friction", "relaxation_time" if point.is_sap else "dissipation"]  # by the step
+        read = ["friction", "relaxation_time" if point.is_sap else "dissipation"]  # properties that the step uses
         read += ["stiffness"] * ("point" in contacts)
         read += ["hydroelastic_modulus"] * ("hydroelastic" in contacts and collider.compliance == "compliant")
         if missing := tuple(name for name in read if not collider.has(name)):
@@ -189,7 +189,7 @@ def contact_defaults(point: Point) -> Iterator[Finding]:
 
 
 def _value(collider: Collider, name: str) -> str:
-    """The number that Drake uses, with its unit."""
+    """Return the value that Drake uses, with its unit."""
     if not collider.used.HasProperty(*PROXIMITY[name]):
         return "(Drake's own)"
     value = collider.used.GetProperty(*PROXIMITY[name])
@@ -197,7 +197,7 @@ def _value(collider: Collider, name: str) -> str:
 
 
 def unread_compliance(point: Point) -> Iterator[Finding]:
-    """A dissipation that the contact approximation does not read."""
+    """Find a dissipation property that the contact approximation does not read."""
     given, read = ("dissipation", "relaxation_time") if point.is_sap else ("relaxation_time", "dissipation")
     names = [collider.label for collider in point.colliders if collider.has(given) and not collider.has(read)]
     if names:
@@ -208,13 +208,13 @@ def unread_compliance(point: Point) -> Iterator[Finding]:
 
 
 def pairs_at_touch(point: Point) -> Iterator[Finding]:
-    """Pairs exactly at touch, where the derivative is that of one side."""
+    """Find pairs with a signed distance of zero, where the derivative is one-sided."""
     set_state(point.model.double, point.x)
     unmeasured = []
     for pair in point.pairs:
         try:
             distance = point.query.ComputeSignedDistancePairClosestPoints(pair.a.id, pair.b.id).distance
-        except RuntimeError:  # no such distance between these shapes
+        except RuntimeError:  # Drake computes no signed distance for these shapes
             unmeasured.append(pair.label)
             continue
         exact = (pair.kinds <= MEETS_A_SPHERE and "Sphere" in pair.kinds) or pair.kinds == {"Box"}
@@ -231,14 +231,14 @@ def pairs_at_touch(point: Point) -> Iterator[Finding]:
 
 
 def inseparable(point: Point) -> Iterator[Finding]:
-    """Pairs that overlap wherever the joints are."""
+    """Find pairs that overlap at all joint positions."""
     model = point.model
     if model.double.scene_graph is None or not model.contract.contact.collision_pairs:
         return
     try:
         pairs = inseparable_pairs(model.plant, model.diagram)
     except ModelError:
-        return  # as no step of it can be taken then, which is a finding of its own
+        return  # no step can be taken then, which another check reports
     if pairs:
         message = (
             f"the links overlap at all joint positions (pairs of shapes: {len(pairs)}) and push each other apart in "
@@ -250,7 +250,7 @@ def inseparable(point: Point) -> Iterator[Finding]:
 
 
 def corners_on_both_sides(point: Point) -> Iterator[Finding]:
-    """Two trees that touch by the spheres in their corners alone."""
+    """Find two kinematic trees that can only touch at the spheres in their corners."""
     plant = point.model.plant
     fixed = {body.name() for body in plant.GetBodiesWeldedTo(plant.world_body())}
     above = {joint.child_body().name(): joint.parent_body().name() for joint in joints(plant)}

@@ -1,13 +1,13 @@
-"""What a function does around a point: its difference quotients, how much its values scatter, and where it is broken.
+"""Measure a function around a point: its difference quotients, the scatter of its values, and its discontinuities.
 
 The function is differenced at 13 step sizes, half a decade apart. With C(h) the central quotient and r = sqrt(10),
 Richardson's D(h) = C(h/r) + (C(h/r) - C(h)) / (r^2 - 1) has an error of order h^4. Three neighbouring D that lie close
 together are a plateau.
 
-How far they can be trusted is measured: along one random line the function is taken at eight equal steps to each side
-of the point, 1e-9, 1e-7, 1e-5 and 1e-3 apart. High differences of eight values vanish where the function is smooth, so
-that what is left is scatter (More and Wild, "Estimating computational noise", 2011). What is far more at larger
-spacings is a corner, a jump or a staircase; halving the interval tells which.
+The accuracy of the quotients is measured along a random line. The function is evaluated at eight equal steps to each
+side of the point, with spacings of 1e-9, 1e-7, 1e-5 and 1e-3. High-order differences of eight values leave only the
+scatter of a smooth function (More and Wild, "Estimating computational noise", 2011). If they are much larger at larger
+spacings, the function has a corner, a jump or a staircase, which bisection distinguishes.
 """
 
 from collections.abc import Callable
@@ -22,29 +22,29 @@ from drake_diff._base.differences import Difference, Many, richardson, sweep_of
 
 @dataclass(frozen=True)
 class DifferenceOptions:
-    """How a function is differenced around a point, and what of it is noise."""
+    """Step sizes of the differences around a point, and thresholds for noise."""
 
     steps: tuple[float, ...] = tuple(10.0 ** (-k / 2) for k in range(4, 17))  # 1e-2 ... 1e-8
     spacings: tuple[float, ...] = (1e-9, 1e-7, 1e-5, 1e-3)  # of the values along a line
-    rounded_point: float = 4 * np.finfo(float).eps  # of a point's entries: what displacing them to both sides rounds
+    rounded_point: float = 4 * np.finfo(float).eps  # relative rounding of a point's entries, displaced to both sides
     values: int = 8  # at each spacing, to each side
-    orders: tuple[int, ...] = (4, 5, 6)  # of the differences that tell scatter
+    orders: tuple[int, ...] = (4, 5, 6)  # of the differences from which scatter is estimated
     last_place: float = 1.1e-16  # half a unit in the last place of 1
-    safety: float = 3.0  # scatter is a standard deviation, from a few values
-    significant: float = 30.0  # times the scatter: a corner or jump that can be told from it
-    visible: float = 1e-10  # of a value: smaller stairs are its rounding, magnified
+    safety: float = 3.0  # multiple of the scatter, which is a standard deviation estimated from a few values
+    significant: float = 30.0  # multiple of the scatter above which a corner or a jump is significant
+    visible: float = 1e-10  # relative to a value: smaller stairs are magnified rounding
     fine: float = 1e-5  # for this and the next see `_stairs`
     flat: float = 1e-2
-    shrinks: float = 0.7  # or more at a corner; 0.56 of |x|^1.5, which has none, 0.32 of what is smooth
-    near: int = 2  # spacings at which what is no scatter, but a corner or stairs, is as a rule not met
+    shrinks: float = 0.7  # ratio of gaps at a corner, at least; it is 0.56 for |x|^1.5, 0.32 for a smooth function
+    near: int = 2  # number of the finest spacings, which usually do not reach a corner or a staircase
     halvings: int = 24
-    seeds: tuple[int, ...] = (2, 3, 4, 5)  # of lines of second differences, of which products cancel along few
-    stairs: int = 3  # jumps to each side, each in another interval, make a staircase: one alone is a contact's onset
+    seeds: tuple[int, ...] = (2, 3, 4, 5)  # of lines for second differences: products cancel along few of them
+    stairs: int = 3  # jumps to each side, in different intervals, of a staircase; a single one is the start of contact
 
 
 DIFFERENCES = DifferenceOptions()
 
-TINY = 1e-300  # no number that means anything is smaller
+TINY = 1e-300  # below every meaningful number
 
 
 @dataclass(frozen=True)
@@ -52,23 +52,23 @@ class Neighbourhood:
     """The difference quotients of a function R^n -> R^m around a point, and the scatter of its values."""
 
     centre: Array  # the value at the point
-    size: Array  # (m,) the values' magnitude, which rounding goes by
+    size: Array  # (m,) magnitude of the values, which determines their rounding
     forward: Array  # (s, m, n) one-sided quotients at DIFFERENCES.steps
     backward: Array  # (s, m, n)
-    scatter: Array  # (m,) of a value, over 1e-6, or what a solver leaves
-    finest: Array  # (m,) over 1e-8
-    products: Array  # (m,) second derivatives along random lines, over 1e-2: how large terms are that may cancel
-    stairs: dict[int, str]  # rows that jump to both sides of the point, and how
+    scatter: Array  # (m,) scatter of the values within 1e-6, or the error that a solver leaves if that is larger
+    finest: Array  # (m,) the same within 1e-8
+    products: Array  # (m,) second derivatives along random lines, over 1e-2: size of the terms that may cancel
+    stairs: dict[int, str]  # rows that jump on both sides of the point, with a description
 
     def plateaus(self) -> tuple[Array, Array]:
-        """(w, m, n) the middle one of three neighbouring Richardson values, from wide steps to small, and how far it
-        may be off: the spread of the three, the scatter and what the solver left, over the step.
+        """Return the middle of three neighbouring Richardson values (w, m, n), from wide to small steps, and its
+        uncertainty (w, m, n): the spread of the three, plus the scatter and the solver's error divided by the step.
         """
         central = (self.forward + self.backward) / 2
         values = richardson(central)
         three = np.array([values[w : w + 3] for w in range(len(values) - 2)])
         steps = np.array(DIFFERENCES.steps)[:, None, None]
-        # An entry's own values scatter no more than they change at all: many entries are zero, and solved exactly.
+        # The scatter of an entry's values is at most their total change, as many entries are zero and solved exactly.
         change = (steps * np.maximum(np.abs(self.forward), np.abs(self.backward))).max(axis=0)
         noise = np.maximum(
             np.minimum(DIFFERENCES.safety * self.scatter[:, None], 2 * change),
@@ -78,10 +78,10 @@ class Neighbourhood:
         return three[:, 1], three.max(axis=1) - three.min(axis=1) + doubt
 
     def _corners(self) -> Array:
-        """(w, m, n) half the gap between one-sided quotients where it does not shrink with the step.
+        """Return (w, m, n) half the gap between one-sided quotients where it does not shrink with the step, else 0.
 
-        A smooth function's is smaller by r at the next step. Beside a corner it stays, and central quotients have a
-        plateau at the mean of two slopes.
+        The gap of a smooth function is smaller by r at the next step. At a corner the gap is constant, and central
+        quotients have a plateau at the mean of two slopes.
         """
         gap = np.abs(self.forward - self.backward)[1:-1]
         shrinks = gap[1:] <= DIFFERENCES.shrinks * gap[:-1]
@@ -91,10 +91,10 @@ class Neighbourhood:
 def look_around(
     f: Many, n: int, minus: Difference = np.subtract, unsolved: Array | float = 0.0, point: Array | None = None
 ) -> Neighbourhood:
-    """Take `f`, a function of displacements (K, n) with values (K, m), around 0.
+    """Evaluate `f`, a function of displacements (K, n) with values (K, m), around 0.
 
-    `unsolved` (m,) is how wrong a value may be at most because a solver stopped early: such jumps are no stairs. Nor is
-    what comes of rounding the displaced `point` (n,), which is more than the value's own rounding where terms cancel.
+    `unsolved` (m,) bounds the error of a value due to a solver that stops early. Jumps of that size are no staircase.
+    Neither is the effect of rounding the displaced `point` (n,), which exceeds the value's rounding if terms cancel.
     """
     sweep = sweep_of(f, n, DIFFERENCES.steps, minus=minus)
     centre, ahead = sweep.centre, sweep.forward
@@ -118,9 +118,9 @@ def look_around(
 
 
 def is_broken(changes: Many, n: int) -> str:
-    """How a function of displacements (K, n) is no smooth one, by its `changes` from the point (K, m) along one line.
+    """Describe how a function of displacements (K, n) is not smooth, from its `changes` (K, m) along one line.
 
-    It is a staircase, or has a corner or a jump within 1e-6 of the point; empty where it is neither.
+    It may be a staircase, or have a corner or a jump within 1e-6 of the point. The result is "" if it is smooth.
     """
     direction, line_changes = line(n), changes(_along(n))
     unsolved = np.zeros(line_changes.shape[1])
@@ -135,7 +135,7 @@ def is_broken(changes: Many, n: int) -> str:
 
 
 def _along(n: int) -> Array:
-    """(K, n) places along a line to both sides of the point, at each of DIFFERENCES.spacings."""
+    """Return places (K, n) along a line to both sides of the point, at each of DIFFERENCES.spacings."""
     places = np.multiply.outer(
         [1.0, -1.0], np.multiply.outer(DIFFERENCES.spacings, np.arange(1, DIFFERENCES.values + 1))
     )
@@ -143,20 +143,20 @@ def _along(n: int) -> Array:
 
 
 def _scattered(changes: Array, size: Array) -> tuple[Array, Array, Array]:
-    """The `changes` along a line (2, spacings, values, m), their rounding and their scatter (2, spacings, m)."""
+    """Return the `changes` along a line (2, spacings, values, m), their rounding and scatter (2, spacings, m)."""
     along = changes.reshape(2, len(DIFFERENCES.spacings), DIFFERENCES.values, -1)
     rounding = DIFFERENCES.last_place * (size + np.abs(along).max(axis=2))
     return along, rounding, np.maximum(_scatter(along), rounding)
 
 
 def line(shape: int | tuple[int, ...], seed: int = 1) -> Array:
-    """A direction with no small entry."""
+    """Return a random direction without small entries."""
     random = np.random.default_rng(seed)
     return np.asarray(random.uniform(0.5, 1.0, shape) * random.choice([-1.0, 1.0], shape))
 
 
 def _scatter(values: Array) -> Array:
-    """(..., m) the standard deviation of equally spaced `values` (..., k, m) around a smooth curve."""
+    """Return the standard deviation (..., m) of equally spaced `values` (..., k, m) around a smooth curve."""
     deviations = []
     for order in DIFFERENCES.orders:
         differences = np.diff(values, order, axis=-2)
@@ -167,9 +167,9 @@ def _scatter(values: Array) -> Array:
 def _stairs(
     along_line: Callable[[Array], Array], along: Array, scatter: Array, rounding: Array, unsolved: Array
 ) -> dict[int, str]:
-    """Rows of `along` (2, spacings, values, m) that jump in at least three intervals to each side of the point.
+    """Describe the rows of `along` (2, spacings, values, m) that jump in at least three intervals on each side.
 
-    `along_line` gives the changes (k, m) at k places of the line, `scatter` is (2, spacings, m).
+    `along_line` returns the changes (k, m) at k places of the line. `scatter` has the shape (2, spacings, m).
     """
     slope = (along[0, 0, -1] - along[1, 0, -1]) / (2 * DIFFERENCES.values * DIFFERENCES.spacings[0])
     reasons: dict[int, str] = {}
@@ -180,7 +180,7 @@ def _stairs(
             np.maximum(np.maximum(DIFFERENCES.significant * finest, unsolved), DIFFERENCES.visible * values),
             scatter[:, k].min(axis=0),
         )
-        # Where contact's onsets are as close, only what is flat between its jumps is stairs.
+        # At spacings at which several contacts may start, only a function that is flat between jumps is a staircase.
         if DIFFERENCES.spacings[k] > DIFFERENCES.fine:
             risen = np.abs(along[:, k]).max(axis=(0, 1))
             both = np.where(
@@ -205,7 +205,7 @@ def _stairs(
 def _jumps(
     along_line: Callable[[Array], Array], row: int, sign: int, k: int, values: Array, slope: float, least: float
 ) -> list[tuple[float, float]]:
-    """Up to three jumps of a row and where, each found by halving one of the intervals between `values` (k,)."""
+    """Return up to three jumps of a row and their places, each found by bisection between two of `values` (k,)."""
     places, heights = (
         sign * DIFFERENCES.spacings[k] * np.arange(DIFFERENCES.values + 1),
         np.concatenate([[0.0], values]),

@@ -1,15 +1,15 @@
-"""The Jacobian (m, n) of a step along a few random directions: whether all of its entries stand, or must be looked at.
+"""Check the Jacobian (m, n) of a step along a few random directions, to decide whether every entry must be compared.
 
-A wrong entry is seen along a random direction with probability one; how well depends on its size beside all others.
-Each column is moved by a weight w times a normal number z, so that the entry that matters least is as well seen as it
-can be. Along a direction the gap of row i is sum_j e_j z_j, where e_j = w_j times the error of entry (i, j). Over K
-directions the sum of its squares is below q |e|^2 with probability `miss` at most, whatever the differences themselves
-leave: they only make the gaps larger. So an error that would matter is missed with a probability below `miss`, and one
-in a single entry never, as no column of z is small.
+A wrong entry changes the slope along a random direction with probability one, in proportion to its size. Each column is
+moved by a weight w times a normal number z. The weights make the entry that matters least as visible as possible. Along
+a direction, the gap of row i is sum_j e_j z_j, where e_j = w_j times the error of entry (i, j). Over K directions, the
+sum of the squared gaps is below q |e|^2 with probability `miss` at most. This holds regardless of the error of the
+differences, which only makes the gaps larger. So a significant error is missed with a probability below `miss`, and an
+error in a single entry is never missed, as no column of z is small.
 
-What is smooth at the point is seen by the same differences: a corner stays in the gap between slopes ahead and behind,
-a jump makes that gap grow, stairs make slopes differ between widths. Whatever is in doubt is no verdict: it is a reason
-to look at every entry (see `differences`).
+The same differences show whether the function is smooth at the point. At a corner, the gap between forward and backward
+slopes is constant. At a jump, it grows. On a staircase, slopes differ between widths. A doubt is not a verdict, but a
+reason to compare every entry (see `differences`).
 """
 
 from dataclasses import dataclass
@@ -25,46 +25,46 @@ from drake_diff.certificates.certificate import AGREE, LIMITS, Certificate, Flag
 
 @dataclass(frozen=True)
 class ScreenOptions:
-    """How a derivative (m, n) is screened along a few random directions."""
+    """Options of the check of a derivative (m, n) along a few random directions."""
 
     directions: int = 6
     miss: float = 1e-4
-    quantile: float = 0.17209  # where the distribution of chi^2 with 6 degrees of freedom is `miss`
-    least: float = 1.5  # the sum of squares of a column of z: six normal numbers have 6
-    widths: tuple[float, ...] = tuple(10.0 ** (-k / 2) for k in (9, 10, 11, 12))  # friction turns within 1e-4 m/s
-    nearer: float = 0.1  # of these: where what is there leaves a doubt, and what is at the point may leave none
-    wide: tuple[float, float] = (8e-3, 4e-3)  # of all columns: what is flat there, but for jumps, is stairs
-    flat: float = 1e-2  # of the change over `wide`, likewise `alike`
+    quantile: float = 0.17209  # `miss`-quantile of the chi^2 distribution with 6 degrees of freedom
+    least: float = 1.5  # lower bound of the sum of squares of a column of z, whose expected value is 6
+    widths: tuple[float, ...] = tuple(10.0 ** (-k / 2) for k in (9, 10, 11, 12))  # friction reverses within 1e-4 m/s
+    nearer: float = 0.1  # factor on `widths` for the second look, which is nearer to the point
+    wide: tuple[float, float] = (8e-3, 4e-3)  # of all columns together, to find a staircase, flat except for jumps
+    flat: float = 1e-2  # relative to the change over `wide`, as is `alike`
     alike: float = 0.2
     seeded: int = 11
-    largest: float = 3.0  # of the normal numbers
-    widest: float = 1e2  # a weight over the middle one: no column is moved by more than 1e-2
-    rounds: int = 20  # of balancing weights, at most
-    balanced: float = 1e-2  # by what part of them the last round may change one
-    rounding: float = 3e-15  # of the sums in a value: 30 of its scatter
+    largest: float = 3.0  # bound of the normal numbers
+    widest: float = 1e2  # bound of a weight relative to the median: no column is moved by more than 1e-2
+    rounds: int = 20  # maximum number of iterations that balance the weights
+    balanced: float = 1e-2  # relative change of the weights at which these iterations stop
+    rounding: float = 3e-15  # relative rounding of the sums in a value, 30 times its scatter
 
 
 SCREEN = ScreenOptions()
 
 
 class LookAt:
-    """Where a function R^n -> R^m is to be taken to look at its derivative (m, n), by the scaled displacements."""
+    """The scaled displacements at which a function R^n -> R^m is evaluated to check its derivative (m, n)."""
 
     def __init__(self, derivative: Array, second: Scales | None = None, *, nearer: bool = False):
         self.derivative, self.second, self.nearer = derivative, second, nearer
         self.widths = SCREEN.nearer * np.array(SCREEN.widths) if nearer else np.array(SCREEN.widths)
         self.weights = _weights(derivative, weigh(derivative, derivative, second)[0])
         n, z = len(self.weights), _normals(len(self.weights))
-        self.directions = z * self.weights  # (K, n) zero where the derivative is zero in all rows
+        self.directions = z * self.weights  # (K, n), zero in columns in which the derivative is zero
         both, signs = np.array([1.0, -1.0]), np.where(z[0] > 0, 1.0, -1.0)
         small = np.multiply.outer(both, np.multiply.outer(self.widths, self.directions)).reshape(-1, n)
         line = np.multiply.outer(both, signs * np.minimum(self.weights, 1.0))
         wide = np.multiply.outer(SCREEN.wide, line).reshape(-1, n)
         unmoved = np.multiply.outer([self.widths[0], -SCREEN.wide[0]], signs * (self.weights == 0))
-        self.displacements = np.vstack([np.zeros((1, n)), small, wide, unmoved])  # by at most 1e-2
+        self.displacements = np.vstack([np.zeros((1, n)), small, wide, unmoved])  # at most 1e-2
 
     def taken(self, values: Array, minus: Difference = np.subtract) -> "FirstLook":
-        """What the values (p, m) at the `displacements` (p, n) say; `minus` subtracts two of them."""
+        """Evaluate the values (p, m) at the `displacements` (p, n). `minus` subtracts two values."""
         centre = values[0]
         changes = values[1:] - centre if minus is np.subtract else np.array([minus(v, centre) for v in values[1:]])
         small, wide, unmoved = np.split(changes, [2 * len(self.widths) * SCREEN.directions, -2])
@@ -76,29 +76,29 @@ class LookAt:
 
 @dataclass(frozen=True, eq=False)
 class FirstLook:
-    """What a function R^n -> R^m does along a few directions from a point; `derivative` (m, n) is that in question."""
+    """The differences of a function R^n -> R^m along a few directions from a point, to check `derivative` (m, n)."""
 
     derivative: Array
     plan: LookAt
     ahead: Array  # (s, K, m) one-sided quotients
     behind: Array
     wide: Array  # (2, 2, m) changes over SCREEN.wide, to both sides
-    left_out: Array  # (2, m) changes by the columns that are zero
-    rounding: Array  # (m,) of a value
+    left_out: Array  # (2, m) changes along the columns in which the derivative is zero
+    rounding: Array  # (m,) rounding of a value
 
     @property
     def size(self) -> Array:
-        """(m, n) what an error of each entry is measured by."""
+        """The magnitude (m, n) to which the error of each entry is relative."""
         return weigh(self.derivative, self.derivative, self.plan.second)[0]
 
     @property
     def noticeable(self) -> Array:
-        """(m, n) the error of each entry that would have been noticed, but for a probability of SCREEN.miss."""
+        """The error (m, n) of each entry that would have been noticed with a probability of 1 - SCREEN.miss."""
         return np.asarray(_bound(self._gaps()).min(axis=0)[:, None] * self._per_weight)
 
     @property
     def difference(self) -> Array:
-        """(m, n) the matrix nearest to the derivative, by weights, that has the slopes along the directions."""
+        """The matrix (m, n) that has the measured slopes along the directions and is nearest to the derivative."""
         gaps = self._gaps()
         best = np.argmin(_bound(gaps), axis=0)
         gap = np.take_along_axis(gaps, best[None, None], axis=0)[0]  # (K, m)
@@ -106,7 +106,7 @@ class FirstLook:
         return np.asarray(self.derivative - error * self._per_weight)
 
     def certificate(self, scale: Array, *, told: str = "", **named: Any) -> Certificate:
-        """That the derivative is the function's, in which this look leaves no doubt."""
+        """Return the certificate that all entries agree, for a check that leaves no doubt."""
         plan, noticeable = self.plan, self.noticeable
         near = f"within {plan.widths[0]:.1g} of the scales, beyond which something changes, " if plan.nearer else ""
         statement = (
@@ -119,7 +119,7 @@ class FirstLook:
         return Certificate(**numbers, codes=codes, scale=scale, second=plan.second, told=text, **named)
 
     def doubt(self) -> str:
-        """Why every entry has to be looked at; empty where the derivative is that of the function."""
+        """Return the reason to compare every entry, or "" if the derivative is correct."""
         if np.any(self.left_out != 0):
             return "a column that is 0 in the derivative has an effect"
         gaps, moved = self._gaps(), self.plan.weights > 0
@@ -129,7 +129,7 @@ class FirstLook:
         hidden = _bound(np.broadcast_to(self.rounding / self.plan.widths[-1], gaps[0].shape))
         if not np.all(significant.any(axis=0)):
             return f"row {int(np.argmin(significant.any(axis=0)))} disagrees with the slopes along random directions"
-        # The smallest steps decide: where they say something else it is rounding, or there is something at the point.
+        # The smallest steps decide: a gap there that exceeds rounding shows a discontinuity near the point.
         if not np.all(significant[-1] | (bounds[-1] <= hidden)):
             return "the slopes along random directions change with smaller steps"
         corners = self._corners()
@@ -139,7 +139,7 @@ class FirstLook:
         return "a row is constant near the point and changes farther away" if np.any(self._stairs()) else ""
 
     def _stairs(self) -> Flags:
-        """(m,) rows that are flat here and change to both sides farther away, not as smooth curves do, h^2 and h^3."""
+        """Find rows (m,) that are flat at the point and change farther away, but not as h^2 and h^3 (a staircase)."""
         risen = np.abs(self.wide).max(axis=0).min(axis=0)
         weights = np.minimum(self.plan.weights, 1.0)
         predicted = np.linalg.norm(self.derivative * weights, axis=1) * SCREEN.wide[0]
@@ -153,18 +153,18 @@ class FirstLook:
 
     @property
     def _per_weight(self) -> Array:
-        """(n,) zero where the weight is."""
+        """The reciprocal weights (n,), zero where the weight is zero."""
         weights = self.plan.weights
         return np.divide(1.0, weights, out=np.zeros_like(weights), where=weights > 0)
 
     def _gaps(self) -> Array:
-        """(s - 1, K, m) of slopes with an error of order h^4, from wide steps to small."""
+        """Return the gaps (s - 1, K, m) to slopes with an error of order h^4, from wide to small steps."""
         return np.asarray(self.plan.directions @ self.derivative.T - richardson((self.ahead + self.behind) / 2))
 
     def _corners(self) -> Array:
-        """(s - 2, m) what is left of the gap between both sides at no width, where it shrinks as h + h^3.
+        """Return (s - 2, m) the gap between forward and backward slopes, extrapolated to h = 0.
 
-        Of three neighbouring widths each.
+        Each value is the constant term of a fit with h and h^3 to three neighbouring widths.
         """
         bend, corners = (self.ahead - self.behind) / 2, []
         for first in range(len(self.plan.widths) - 2):
@@ -175,13 +175,13 @@ class FirstLook:
 
 
 def _bound(gaps: Array) -> Array:
-    """(..., m) of gaps (..., K, m): the error of a row is smaller but for a probability of SCREEN.miss."""
+    """Return, from gaps (..., K, m), bounds (..., m) that errors of rows exceed with probability SCREEN.miss."""
     return np.asarray(np.sqrt((gaps**2).sum(axis=-2) / SCREEN.quantile))
 
 
 @cache
 def _normals(n: int) -> Array:
-    """(K, n) always the same ones, no column of which is small."""
+    """Return fixed normal numbers (K, n), of which no column is small."""
     random = np.random.default_rng(SCREEN.seeded)
     z = random.standard_normal((SCREEN.directions, n))
     while np.any(small := (z**2).sum(axis=0) < SCREEN.least):
@@ -190,7 +190,7 @@ def _normals(n: int) -> Array:
 
 
 def _weights(a: Array, size: Array) -> Array:
-    """(n,) such that the least entry that matters in a column is as large a part of its row as in any other column."""
+    """Return weights (n,) for which the smallest entry that matters is the same part of its row in each column."""
     moved = np.any(a != 0, axis=0)
     w = np.where(moved, 1.0, 0.0)
     if not moved.any():
@@ -207,6 +207,6 @@ def _weights(a: Array, size: Array) -> Array:
 
 
 def _middle(values: Array) -> float:
-    """The median of `values` (n,), without what makes NumPy's own twenty times as slow."""
+    """Return the median of `values` (n,), twenty times as fast as `np.median`."""
     values, half = np.sort(values), len(values) // 2
     return float(values[half] if len(values) % 2 else (values[half - 1] + values[half]) / 2)

@@ -1,13 +1,13 @@
-"""The rollouts that a certificate takes, and what it asks of the loss and the policy alone.
+"""Evaluate displaced rollouts for a certificate, and check the loss and the policy separately.
 
-A rollout's gradient goes through u = policy(x, t). It is wrong where the policy remembers what it was asked before,
-as the derivative by what is remembered is nowhere, and where its derivative is not its own. Both are told here by
-asking the policy alone; what they do to the gradient, rollouts tell.
+A rollout's gradient includes the derivative of u = policy(x, t). It is wrong if the policy depends on earlier calls,
+because the derivative with respect to the policy's memory is missing, and if the policy's own derivative is wrong.
+Calls of the policy alone show both faults. Rollouts show their effect on the gradient.
 
-A loss or a policy may be a staircase: rounding, a table or a whole number make a function that is flat, or nearly so,
-between jumps. Its derivative is true and worthless, and where the steps are wide no difference of a rollout meets one.
-The function alone can be asked far from the motion at next to no cost, over lengths from 1e-4 to 10 times the scale:
-along one line, and a policy along each state. One jump of a policy alone, a switch, matters where the motion passes it.
+A loss or a policy may be a staircase: rounding, a table or an integer make it flat, or nearly flat, between jumps. Its
+derivative is correct but useless, and differences of rollouts miss the jumps of wide stairs. The function alone can be
+evaluated far from the trajectory at little cost, over lengths from 1e-4 to 10 times the scale, along one line and, for
+a policy, along each state. A single jump of a policy (a switch) matters only if the trajectory passes it.
 """
 
 import pickle
@@ -40,25 +40,25 @@ from drake_diff.motion.gradient import RolloutGradient, differentiate_rollout
 from drake_diff.motion.loss import Loss, evaluate_loss
 from drake_diff.motion.policy import ParametricPolicy, active_parameters, differentiate_policy, policy_parameters
 
-WIDEST = 0.25  # of the scale of a state or a parameter: how far differences may move it
-MANY = 256  # rollouts whose steps are solved at once
+WIDEST = 0.25  # relative to the scale of a state or a parameter: largest displacement in differences
+MANY = 256  # number of rollouts whose steps are solved in one call
 Point = tuple[Array, Array, Array, ParameterVector]  # x0 (nx,), us (N, nu), the policy's parameters, the model's
 
 
 @dataclass(frozen=True, eq=False)
 class DisplacedDirection:
-    """One direction in which a rollout is moved: one column of its gradient, or one input by as much at all times."""
+    """A direction in which a rollout is displaced: a column of its gradient, or an input equally at all times."""
 
     name: str
-    columns: Indices  # of the gradient, which add up to it
+    columns: Indices  # of the gradient, whose sum is the slope along the direction
     scale: float
-    vector: Array  # (n,) the displacement by a unit of it
-    room: float  # how far differences may move it, in its unit
+    vector: Array  # (n,) displacement per unit of the direction
+    room: float  # largest displacement in differences, in the unit of the direction
 
 
 @dataclass(frozen=True, eq=False)
 class Displaced:
-    """A rollout of N steps under `us` (N, nu), or under `policy`, and all that its gradient is by.
+    """A rollout of N steps under `us` (N, nu), or under `policy`, and all variables of its gradient.
 
     A displacement (n,) is [x0 on the tangent space; the inputs step by step, or the policy's parameters; the model's
     parameters], each relative to `scale` (n,).
@@ -66,7 +66,7 @@ class Displaced:
 
     model: Model
     x0: Array
-    us: Array  # (N, nu); under a policy (N, 0), as no input is given
+    us: Array  # (N, nu), or (N, 0) with a policy
     loss: Loss
     policy: Any
     vector: ParameterVector
@@ -82,24 +82,24 @@ class Displaced:
 
     @property
     def time_step(self) -> float:
-        """[s] as the parameters say."""
+        """The time step [s] that the parameters specify."""
         return self.vector.time_step(self.vector.values)
 
     @cached_property
     def _values(self) -> Array:
-        """(n - size,) all but the state."""
+        """The displaced values (n - size,) except the state."""
         return np.concatenate([self.us.ravel(), policy_parameters(self.policy), self.vector.values])
 
     @cached_property
     def scale(self) -> Array:
-        """(n,) what one unit of a displacement is: the magnitude of what it moves, at least 1."""
+        """The scale (n,) of a displacement: the magnitude of the displaced values, at least 1."""
         given = self._values[: len(self._values) - len(self.vector.values)]
         steps = np.maximum(1.0, np.abs(given))
         return np.concatenate([state_scale(self.space, self.x0), steps, self.vector.difference_scale()])
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """(n,) names."""
+        """The names (n,) of the columns."""
         inputs = tuple(f"{name}[{k}]" for k in range(len(self.us)) for name in self.model.input_names)
         if self.policy is not None:
             inputs = tuple(f"policy[{i}]" for i in range(len(policy_parameters(self.policy))))
@@ -107,7 +107,7 @@ class Displaced:
 
     @property
     def kinds(self) -> Indices:
-        """(n,) which columns are of a kind: positions, velocities, one input, the policy's or one model parameter."""
+        """The kind (n,) of each column: positions, velocities, each input, the policy's, each model parameter."""
         of_x0 = [0] * self.model.nv + [1] * self.model.nv
         given = [2 + i for _ in self.us for i in range(self.us.shape[1])] + [2] * len(policy_parameters(self.policy))
         first = 2 + max(1, self.us.shape[1])
@@ -116,7 +116,7 @@ class Displaced:
 
     @property
     def units(self) -> list[str]:
-        """(n,) the unit of each column of a gradient by given inputs; what is of one kind has one."""
+        """The unit (n,) of each column for given inputs, which is the same for columns of the same kind."""
         contract = self.model.contract
         units = [f"position [{term.unit}]" for term in contract.positions]
         units += [f"velocity [{term.unit}]" for term in contract.velocities]
@@ -125,7 +125,7 @@ class Displaced:
 
     @cached_property
     def lines(self) -> tuple[DisplacedDirection, ...]:
-        """Each state, each input by as much at all times or each parameter of the policy, and each of the model."""
+        """The directions of each state, each input at all times or each policy parameter, and each model parameter."""
         (count, nu), size, n = self.us.shape, self.space.size, len(self.scale)
         units, names, scales = np.eye(n) / self.scale, self.columns, self.scale.tolist()
         single = [
@@ -145,14 +145,14 @@ class Displaced:
         return (*single[:size], *inputs, *single[size + count * nu :])
 
     def point(self, displacement: Array) -> Point:
-        """What is rolled out at a displacement (n,)."""
+        """Return the initial state, the inputs and the parameters at a displacement (n,)."""
         point = move(self.space, self.model.nx, np.concatenate([self.x0, self._values]), self.scale * displacement)
         sizes = self.model.nx, self.us.size, len(policy_parameters(self.policy))
         x0, us, parameters, values = np.split(point, np.cumsum(sizes))
         return x0, us.reshape(self.us.shape), parameters, self.vector.at(values)
 
     def gradient(self, displacement: Array) -> RolloutGradient:
-        """The gradient at a displacement (n,)."""
+        """Compute the gradient at a displacement (n,)."""
         x0, us, parameters, values = self.point(displacement)
         options: dict[str, Any] = {"parameters": values, "method": self.method}
         if self.policy is None:
@@ -161,12 +161,12 @@ class Displaced:
         return differentiate_rollout(self.model, x0, None, self.loss, policy=policy, num_steps=len(self.us), **options)
 
     def flat(self, g: RolloutGradient) -> Array:
-        """(n,) the gradient by what a displacement moves, `scale` left out."""
+        """Return the gradient (n,) with respect to the displaced variables, without `scale`."""
         by_x0 = g.by_x0 @ self.space.derivative_of_plus(g.xs[0])
         return np.concatenate([by_x0, g.by_us.ravel() if self.policy is None else g.by_policy, g.by_parameters])
 
     def losses(self, displacements: Array, policy: Any = None) -> Array:
-        """(K, 1) of the double plant's rollouts at displacements (K, n); `policy` is one that may keep its memory."""
+        """Return losses (K, 1) of the double plant's rollouts at displacements (K, n). `policy` keeps its memory."""
         return np.array([[self._roll(d, policy)] for d in displacements])
 
     def _roll(self, displacement: Array, policy: Any) -> float:
@@ -181,9 +181,9 @@ class Displaced:
         return evaluate_loss(self.loss, xs, inputs)
 
     def left_by_drake(self, g: RolloutGradient) -> tuple[Array, float]:
-        """(N, size) what Drake's own steps along the motion of `g` leave unsolved, and the worst, of the momentum.
+        """Return the errors (N, size) of Drake's own steps along `g`, and their largest residual.
 
-        Raises UnsolvedError where a step is not known to rounding.
+        The residual is relative to the momentum. Raises UnsolvedError if a step cannot be solved to rounding.
         """
         with applied(self.vector) as model:
             refined = solved(refine_steps(model, self.vector, g.xs[:-1], g.us))
@@ -191,10 +191,10 @@ class Displaced:
         return np.array(left), float(np.max(refined.left))
 
     def solved_losses(self, left: Array, displacements: Array) -> Array:
-        """(K, 1) as `losses`, of rollouts whose every step is solved to rounding and then moved by `left` (N, size).
+        """Return losses (K, 1) as `losses`, with every step solved to rounding and then displaced by `left` (N, size).
 
-        That is what Drake's own steps leave unsolved along the motion, so that this is where the rollouts start from,
-        and differences are of the steps' equation there. Raises UnsolvedError as `left_by_drake`.
+        `left` are the errors of Drake's own steps, so that the undisplaced rollout is Drake's own, and differences are
+        those of the equation of the steps along it. Raises UnsolvedError as `left_by_drake`.
         """
         parts = np.array_split(displacements, -(-len(displacements) // MANY))
         return np.vstack([self._solved(left, chunk) for chunk in parts])
@@ -215,54 +215,54 @@ class Displaced:
         return np.array([[evaluate_loss(self.loss, *motion)] for motion in zip(xs, inputs, strict=True)])
 
     def solver_tolerance(self, g: RolloutGradient) -> float:
-        """How accurately the steps along the motion of `g` are solved by Drake; 0 where they are known to rounding."""
+        """Return the relative tolerance of Drake's steps along `g`, 0 if they are accurate to rounding."""
         with applied(self.vector) as model:
             return max(solver_tolerance(model, x, u) for x, u in zip(g.xs[:-1], g.us, strict=True))
 
     def inputs(self, us: Array, parameters: Array, policy: Any) -> Callable[[Array, int, float], Array]:
-        """The input (nu,) at a state, a step and a time step [s]."""
+        """Return the function of a state, a step index and a time step [s] that computes the input (nu,)."""
         if self.policy is None:
             return lambda x, k, h: us[k]
         asked, nu = with_parameters(fresh(self.policy) if policy is None else policy, parameters), self.model.nu
         return lambda x, k, h: finite_array("policy(x, t)", asked(x.copy(), k * h), (nu,))
 
 
-SHARED = ("pydrake.", "drake_diff.model.")  # packages whose objects a copy shares with the original: models and plants
+SHARED = ("pydrake.", "drake_diff.model.")  # packages whose objects, such as models and plants, a copy shares
 REMEMBERING = (FunctionType, MethodType, CellType, partial, dict, list, tuple, set, deque, np.ndarray)
 
 
 @dataclass(frozen=True)
 class ProbeOptions:
-    """How a loss and a policy are asked alone."""
+    """Options for separate checks of a loss and a policy."""
 
-    steps: tuple[float, ...] = (1e-4, 1e-6)  # of the differences of a policy; a derivative must miss both
-    missed: float = 1e-3  # of the row's largest entry
-    least: float = 1e-6  # of the input: a smaller derivative is not told from rounding
-    asked: int = 5  # times along the motion at which the derivative is compared
-    cells: int = 16  # both sides together
-    stairs: int = 3  # jumps in as many cells: fewer are a switch, which the motion may never meet
+    steps: tuple[float, ...] = (1e-4, 1e-6)  # of a policy's differences; a wrong derivative differs from both
+    missed: float = 1e-3  # relative to the row's largest entry: error above which a derivative is wrong
+    least: float = 1e-6  # relative to the input: a smaller derivative may be rounding
+    asked: int = 5  # number of times along the trajectory at which the derivative is compared
+    cells: int = 16  # number of intervals, both sides together
+    stairs: int = 3  # least number of cells with a jump; fewer are a switch, which the trajectory may never reach
     quarterings: int = 10
-    settled: int = 2  # after so many a smooth function's cells differ by 1/256, those of a corner by 1/16
-    remains: float = 0.125  # and those of a jump by as much as before
-    rounded: float = 1e-12  # of the largest value: a smaller jump is its rounding
-    spread: float = 1e-6  # of what values differ by: the same
-    moves: float = 1e-9  # of the largest state: a smaller step is rounding
-    single_parameters: int = 8  # of the policy that are asked alone
-    wide: int = 2  # lengths that are left out there, as the line through all has met steps so small
-    single: float = 5e-7  # of an input: single precision is no staircase
+    settled: int = 2  # quarterings that reduce the deviation of a smooth function to 1/256, of a corner to 1/16
+    remains: float = 0.125  # part of the deviation that is left then at a jump, which keeps its size
+    rounded: float = 1e-12  # relative to the largest value: a smaller jump is rounding
+    spread: float = 1e-6  # relative to the range of the values: a smaller jump is ignored
+    moves: float = 1e-9  # relative to the largest state: a smaller step is rounding
+    single_parameters: int = 8  # number of policy parameters that are checked individually
+    wide: int = 2  # number of short lengths left out for single variables, as the common line covers them
+    single: float = 5e-7  # relative to an input: the resolution of single precision is no staircase
 
 
 ASK = ProbeOptions()
 
 
 class _Copier(cloudpickle.Pickler):  # type: ignore[misc]  # cloudpickle has no types
-    """Pickles what can remember: containers, arrays, closures and objects of classes written in Python.
+    """A pickler of objects that can have state: containers, arrays, closures and objects of Python classes.
 
-    All else is shared: `shared` has it by the number that stands for it.
+    All other objects are shared with the original. `shared` contains them at the index that replaces them.
     """
 
     def __init__(self, file: BytesIO):
-        super().__init__(file, protocol=4)  # a later one would share the buffers of arrays
+        super().__init__(file, protocol=4)  # later protocols share the buffers of arrays
         self.shared: list[Any] = []
 
     def persistent_id(self, thing: Any) -> int | None:
@@ -284,9 +284,9 @@ class _Restorer(pickle.Unpickler):
 
 
 def fresh(policy: Any) -> Any:
-    """A copy of `policy` with a memory of its own: containers, arrays and closures are copied, however deep they stand.
+    """Copy `policy` with its memory: containers, arrays and closures are copied at any depth.
 
-    Models are shared, as are objects that are not made in Python, and the globals of a module that can be imported.
+    Models are shared, as are objects that are not of Python classes, and the globals of an importable module.
     """
     file = BytesIO()
     copier = _Copier(file)
@@ -296,14 +296,14 @@ def fresh(policy: Any) -> Any:
 
 
 def with_parameters(policy: Any, parameters: Array) -> Any:
-    """`policy` with other `parameters` (n,); itself where it has none."""
+    """Return `policy` with other `parameters` (n,), or the policy itself if it has no parameters."""
     return ParametricPolicy(policy, parameters) if len(policy_parameters(policy)) else policy
 
 
 def check_memory(policy: Any, g: RolloutGradient, time_step: float) -> None:
-    """Refuse a policy that says another u at a state and a time of the motion of `g` after it was asked elsewhere.
+    """Raise GradientError if a policy returns another u at a state and time of `g` after other calls.
 
-    `policy` has led another motion before; it is asked from the end to the start.
+    `policy` has been called along another trajectory before. It is called from the last step to the first.
     """
     for k in reversed(range(len(g.us))):
         u, again = g.us[k], finite_array("policy(x, t)", policy(g.xs[k].copy(), k * time_step), (g.us.shape[1],))
@@ -316,7 +316,7 @@ def check_memory(policy: Any, g: RolloutGradient, time_step: float) -> None:
 
 
 def wrong_derivative(policy: Any, space: TangentSpace, g: RolloutGradient, time_step: float) -> str:
-    """What the policy's own derivative misses at five times along the motion; empty where it is right there."""
+    """Describe an error of the policy's own derivative at five times along `g`, or return "" if it is correct."""
     parameters, nu = policy_parameters(policy), g.us.shape[1]
     for k in np.unique(np.linspace(0, len(g.us) - 1, ASK.asked).astype(int)):
         x, t = g.xs[k], float(k * time_step)
@@ -347,15 +347,15 @@ def wrong_derivative(policy: Any, space: TangentSpace, g: RolloutGradient, time_
     return ""
 
 
-LINE = 2  # the seed of lines along which a loss or a policy is asked
+LINE = 2  # seed of the lines along which a loss or a policy is evaluated
 LENGTHS = tuple(10.0**k for k in range(-4, 2))  # of the line, to each side
-OUTSIDE = (ValueError, ArithmeticError, LookupError)  # what a function may raise where it is not defined
+OUTSIDE = (ValueError, ArithmeticError, LookupError)  # errors of a function outside its domain
 
-Jump = tuple[float, float]  # from where to where
+Jump = tuple[float, float]  # places before and after the jump
 
 
 def stairs_of_loss(loss: Loss, g: RolloutGradient, space: TangentSpace) -> str:
-    """How the loss alone jumps around the motion of `g`; empty where it is no staircase."""
+    """Describe the jumps of the loss near the trajectory of `g`, or return "" if the loss is not a staircase."""
     by_x = line((len(g.xs), space.size), LINE)
     states = np.array([space.derivative_of_plus(x) @ d for x, d in zip(g.xs, by_x, strict=True)])
     inputs = line(g.us.shape, LINE)
@@ -373,11 +373,11 @@ def stairs_of_loss(loss: Loss, g: RolloutGradient, space: TangentSpace) -> str:
 
 
 def stairs_of_policy(policy: Callable[..., Array], g: RolloutGradient, space: TangentSpace, time_step: float) -> str:
-    """How the policy alone jumps around the motion of `g`; empty where it does not.
+    """Describe the jumps of the policy near the trajectory of `g`, or return "" if it does not jump.
 
-    It jumps where it is a staircase at three states of the motion, along a line and each state and parameter alone; and
-    where it is switched by the motion: on the way from a state to the next, or beyond the farthest of each state by as
-    much as the motion moves it in a step. A switch farther away does no harm.
+    A staircase is searched at three states of the trajectory, along a line and along each state and parameter. A switch
+    is searched between consecutive states, and beyond the extremes of each state over its largest change in one step.
+    A switch farther away has no effect.
     """
     probe = _PolicyProbe(fresh(policy), g, space, time_step)
     return next((text for text in (*probe.staircases(), *probe.switches()) if text), "")
@@ -385,7 +385,7 @@ def stairs_of_policy(policy: Callable[..., Array], g: RolloutGradient, space: Ta
 
 @dataclass(frozen=True)
 class _PolicyProbe:
-    """Asks a policy along lines through the states of the motion of `g`."""
+    """Evaluations of a policy along lines through the states of `g`."""
 
     policy: Any
     g: RolloutGradient
@@ -393,7 +393,7 @@ class _PolicyProbe:
     time_step: float
 
     def staircases(self) -> Iterator[str]:
-        """At the first state, the middle one and the last along one line; at the middle one along each variable."""
+        """Search staircases along a line at the first, middle and last state, and along each variable at the middle."""
         size, parameters, middle = self.space.size, policy_parameters(self.policy), len(self.g.us) // 2
         scale = np.concatenate([np.ones(size), np.maximum(1.0, np.abs(parameters))])
         through, all_parameters = np.append(line(size, LINE), 0 * parameters), np.append(np.zeros(size), 0 * parameters)
@@ -406,7 +406,7 @@ class _PolicyProbe:
             yield self._staircase(middle, way * scale, name, LENGTHS[ASK.wide :])
 
     def switches(self) -> Iterator[str]:
-        """On the way from state to state, and beyond the extremes of each."""
+        """Search switches between consecutive states, and beyond the extremes of each state."""
         xs, none = self.g.xs, np.zeros(len(policy_parameters(self.policy)))
         steps = np.array([self.space.minus(after, x) for x, after in pairwise(xs)])
         moves = np.max(np.abs(steps), axis=1) > ASK.moves * np.max(np.abs(xs))
@@ -449,7 +449,7 @@ class _PolicyProbe:
         return lambda s: float(weight @ self._u(k, way, s))
 
     def _u(self, k: int, way: Array, s: float) -> Array:
-        """(nu,) at a displacement `s` times `way` (size + parameters,) from the state at step k."""
+        """Return u (nu,) at the displacement `s` times `way` (size + parameters,) from the state at step k."""
         by_state, by_parameters = np.split(s * way, [self.space.size])
         asked = self.policy
         if np.any(by_parameters):
@@ -460,7 +460,7 @@ class _PolicyProbe:
 def _stairs(
     f: Callable[[float], float], least: float, lengths: Sequence[float] = LENGTHS
 ) -> tuple[float, float, int] | None:
-    """Where a function of one number jumps first, from and to, and in how many cells; None where it is no staircase."""
+    """Return the first jump of a function of one number and its number of cells with jumps, None if no staircase."""
     with np.errstate(all="ignore"):
         for length in lengths:
             try:
@@ -473,17 +473,17 @@ def _stairs(
 
 
 def _jumps(f: Callable[[float], float], ends: Array, least: float) -> list[Jump]:
-    """Where a function of one number jumps, of each cell between `ends` (c + 1,) the largest jump."""
+    """Return the largest jump of a function of one number in each cell between `ends` (c + 1,) that has a jump."""
     values = np.array([f(float(s)) for s in ends])
     threshold = max(least, ASK.rounded * float(np.max(np.abs(values))), ASK.spread * float(np.ptp(values)))
-    if not np.max(np.abs(np.diff(values, 3))) > threshold:  # which is nothing where a function is smooth
+    if not np.max(np.abs(np.diff(values, 3))) > threshold:  # third differences are small for a smooth f
         return []
     cells = (_jump(f, ends[i : i + 2], values[i : i + 2], threshold) for i in range(len(ends) - 1))
     return [jump for jump in cells if jump]
 
 
 def _jump(f: Callable[[float], float], ends: Array, values: Array, least: float) -> Jump | None:
-    """Where `f` jumps between two places (2,): the quarter that changes unlike the others is divided again."""
+    """Return the jump of `f` between two places (2,), or None. The quarter that deviates most is divided again."""
     sizes: list[float] = []
     for k in range(ASK.quarterings):
         places = np.linspace(float(ends[0]), float(ends[1]), 5)

@@ -1,4 +1,4 @@
-"""A finding of an audit, and what its checks read of a model at a point."""
+"""The findings of an audit, and the properties of a model at a point that its checks read."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,18 +21,18 @@ from drake_diff.model.step import advance, set_state
 
 Severity = Literal["error", "warning", "info"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "info")
-LONGEST_LIST = 8  # names; of more the others are counted
+LONGEST_LIST = 8  # number of names in a message; further names are only counted
 PARALLEL = 1e-6  # [rad] between face normals
 
 
 @dataclass(frozen=True, repr=False)
 class Finding(ShowsItsRepr):
-    """Something to know before a model is differentiated.
+    """A property of a model that affects its derivatives.
 
-    `severity` is "error" if Drake throws here or the derivative is wrong, "warning" if it may be or a number was not
-    chosen, and "info" if it is taken care of or a limit to know. `code` is a stable name of the kind of finding,
-    `subject` the part of the model, `message` says what is found and `remedy` what to change. `arguments` are those of
-    `load_model` with which the same file has no such finding; empty where the file, x or u has to change.
+    `severity` is "error" if Drake raises an error or the derivative is wrong, "warning" if the derivative may be wrong
+    or a default value applies, and "info" for a limitation or a problem that the package handles. `code` is a stable
+    name of the kind of finding, `subject` is the part of the model, `message` describes the finding, and `remedy` the
+    proposed change. `arguments` of `load_model` avoid the finding; they are empty if the file, x or u has to change.
 
     Example:
         >>> from drake_diff.certificates import Finding
@@ -55,7 +55,7 @@ class Finding(ShowsItsRepr):
 
 
 class Findings(list[Finding], ShowsItsRepr):
-    """What an audit found, the worst first: a list that prints one finding below the other."""
+    """The findings of an audit, the most severe first: a list that prints one finding below the other."""
 
     def __str__(self) -> str:
         return "\n".join(map(str, self)) or "nothing found"
@@ -64,7 +64,7 @@ class Findings(list[Finding], ShowsItsRepr):
 
 
 def listed(names: Any) -> str:
-    """The first of some names, and how many more there are."""
+    """Return the first names, and the number of further names."""
     unique = list(dict.fromkeys(names))
     more = f" and {len(unique) - LONGEST_LIST} more" if len(unique) > LONGEST_LIST else ""
     return ", ".join(unique[:LONGEST_LIST]) + more
@@ -72,14 +72,14 @@ def listed(names: Any) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Collider:
-    """A collision geometry at x. `given` is what the file or the user gave it, `used` what Drake uses."""
+    """A collision geometry at x, with the properties `given` by the file or the user and those `used` by Drake."""
 
     id: Any
     label: str
     body: str
     shape: Any
     pose: Any  # X_WG
-    box: Any  # its oriented box in its own frame; None for a half space
+    box: Any  # oriented bounding box in the geometry's frame; None for a half space
     compliance: Literal["none", "rigid", "compliant"]
     given: Any  # ProximityProperties
     used: Any
@@ -89,15 +89,15 @@ class Collider:
         return type(self.shape).__name__
 
     def has(self, quantity: str) -> bool:
-        """Whether a quantity of PROXIMITY is given."""
+        """Return whether a quantity of PROXIMITY is given."""
         return bool(self.given.HasProperty(*PROXIMITY[quantity]))
 
     def axis(self, i: int) -> Array:
-        """(3,) the unit vector of its frame in the world."""
+        """Return the unit vector (3,) of axis i of the geometry's frame, in the world frame."""
         return np.asarray(self.pose.rotation().matrix())[:, i]
 
     def extent(self, direction: Array) -> tuple[float, float]:
-        """Where its box begins and ends [m] along a direction in the world."""
+        """Return the interval [m] that the bounding box covers along a direction in the world frame."""
         if self.box is None:
             middle, along = float(direction @ self.pose.translation()), float(direction @ self.axis(2))
             infinite = abs(along) < 1 - PARALLEL
@@ -130,7 +130,7 @@ class ColliderPair:
 
     @property
     def contact(self) -> Literal["point", "hydroelastic", "none"]:
-        """What Drake computes between them; "none" is what it throws at."""
+        """The kind of contact that Drake computes for the pair, or "none" if Drake raises an error."""
         both = {self.a.compliance, self.b.compliance}
         soft_half_space = both == {"compliant"} and "HalfSpace" in self.kinds
         if self.model == ContactModel.kPoint:
@@ -144,7 +144,7 @@ class ColliderPair:
         return self.contact == "none" or not autodiff_supports(self.a.shape, self.b.shape, self.contact)
 
     def in_order(self, first: str, other: str) -> tuple[Collider, Collider] | None:
-        """The two in the order of the kinds that are asked for."""
+        """Return the two colliders in the order of the given kinds, or None if the kinds differ."""
         for a, b in ((self.a, self.b), (self.b, self.a)):
             if a.kind == first and b.kind == other:
                 return a, b
@@ -153,19 +153,19 @@ class ColliderPair:
 
 @dataclass(frozen=True, eq=False)
 class JointFacts:
-    """A joint that can be driven, and what the file says of it."""
+    """A joint that can have an actuator, and the file's information about it."""
 
     name: str
     joint: Any
     driven: bool
     follows: bool
-    left_out: bool  # its actuator
+    left_out: bool  # whether an actuator of the joint was left out
     says: Any  # JointSays or None
 
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A model at x, u: what several checks ask for, computed once."""
+    """A model at x, u, with properties that several checks need, each computed once."""
 
     model: Model
     x: Array
@@ -173,7 +173,7 @@ class Point:
 
     @cached_property
     def has_poses(self) -> bool:
-        """Whether Drake can place the bodies: not with a quaternion of zeros."""
+        """Whether Drake can compute body poses, which fails for a quaternion of zeros."""
         plant = self.model.plant
         set_state(self.model.double, self.x)
         try:
@@ -184,7 +184,7 @@ class Point:
 
     @cached_property
     def step_error(self) -> SimulationError | None:
-        """Why the double step fails here."""
+        """The error of the double step at x and u, None if it succeeds."""
         try:
             advance(self.model.double, self.x, self.u)
         except SimulationError as error:
@@ -192,7 +192,7 @@ class Point:
         return None
 
     def differentiate(self, method: str) -> StepDerivatives | DrakeDiffError:
-        """The Jacobians through the whole step, or why there are none."""
+        """Return the Jacobians of the step, or the error that prevents them."""
         try:
             return differentiate_step(self.model, self.x, self.u, method=method)
         except (GradientError, ModelError, SimulationError) as error:
@@ -208,7 +208,7 @@ class Point:
 
     @cached_property
     def joints(self) -> list[JointFacts]:
-        """Those that can be driven."""
+        """The joints that can have an actuator."""
         plant, facts = self.model.plant, self.model.file_facts
         driven = {actuator.joint().index() for actuator in actuators(plant)}
         rows = []
@@ -220,13 +220,13 @@ class Point:
         return rows
 
     def link_says(self, body: Any) -> Any:
-        """What the file says of a body, None where it says nothing."""
+        """Return the file's information about a body, or None if there is none."""
         key = self.model.plant.GetModelInstanceName(body.model_instance()), body.name()
         return self.model.file_facts.links.get(key)
 
     @cached_property
     def query(self) -> Any:
-        """Drake's QueryObject; it sees the state that the double context has when it is asked."""
+        """Drake's QueryObject, which evaluates the state that the double context has at the time of a query."""
         return self.model.plant.get_geometry_query_input_port().Eval(self.model.double.context)
 
     @cached_property
@@ -241,7 +241,7 @@ class Point:
 
     @cached_property
     def colliders(self) -> list[Collider]:
-        """Those that can collide."""
+        """The collision geometries that can collide."""
         return sorted({c for pair in self.pairs for c in (pair.a, pair.b)}, key=lambda c: c.id.get_value())
 
     def _collider(self, geometry: Any) -> Collider:
@@ -261,7 +261,7 @@ class Point:
         )
 
     def _compliance(self, geometry: Any, shape: Any) -> Literal["none", "rigid", "compliant"]:
-        """How hydroelastic contact sees a geometry. Python cannot read Drake's compliance_type, so by its mesh."""
+        """Return the hydroelastic type of a geometry, from its mesh, as Python cannot read Drake's compliance_type."""
         scene_graph = self.model.double.scene_graph
         if not isinstance(shape, HalfSpace):
             mesh = self.query.inspector().maybe_get_hydroelastic_mesh(geometry)

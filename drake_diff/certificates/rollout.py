@@ -1,4 +1,4 @@
-"""Certify the gradient of a whole rollout before it is used: entry by entry, or by at most 20 rollouts."""
+"""Certify the gradient of a whole rollout: entry by entry, or with at most 20 rollouts."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from drake_diff.motion.rollout import Policy, check_inputs
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RolloutCertificate(Certificate):
-    """The certificate of a rollout's gradient, with that gradient and its refinements.
+    """The certificate of a rollout's gradient, with the gradient and its refinements.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -54,9 +54,9 @@ class RolloutCertificate(Certificate):
 
     gradient: RolloutGradient = field(kw_only=True)
     refinements: tuple[Refinement, ...] = ()
-    cause: str = ""  # why entries disagree, where that is known
-    truth: Truth | None = None  # the motion in continuous time, where it was asked for and there is one
-    no_truth: str = ""  # why there is none
+    cause: str = ""  # reason for entries that disagree, if it is known
+    truth: Truth | None = None  # the loss and its slopes in continuous time, if requested and available
+    no_truth: str = ""  # reason why `truth` is not available
 
     def _lines(self) -> list[str]:
         truth = [repr(self.truth)] if self.truth else [f"no truth: {self.no_truth}"] if self.no_truth else []
@@ -81,41 +81,41 @@ def certify_rollout(
 ) -> RolloutCertificate | SampledCertificate:
     """Compare the gradient of a rollout's loss with differences of whole rollouts, 26 for each column.
 
-    Under a policy the rollouts are of the closed loop: it is asked with plain numbers, and each rollout has a copy of
-    it with a memory of its own.
+    With a policy, the rollouts are those of the closed loop. The policy is called with plain numbers, and each rollout
+    uses its own copy of the policy and of the policy's memory.
 
     Args:
-        model: the model that is rolled out.
-        x0: (nx,) the first state.
-        us: (N, nu) [N or N m] the inputs; None where the model has none, and under a policy.
-        loss: a function of (xs, us) or of the last state, written so that AutoDiffXd flows through it.
+        model: The model.
+        x0: (nx,) The initial state.
+        us: (N, nu) [N or N m] The inputs, or None for a policy or a model without inputs.
+        loss: A function of (xs, us) or of the last state that supports AutoDiffXd.
         policy: u = policy(x, t) in place of `us`, as in `differentiate_rollout`.
-        parameters: names, or values by name, of the parameters to differentiate by too.
-        num_steps: N, where `us` is None.
-        refine: take the gradient again at h/2 and h/4, under the same inputs, and compare it with the slopes of the
-            motion in continuous time, along each state, each input by as much at all times, and each parameter: the
-            certificate's `truth`. Where something touches and they are not known, nothing converges.
-        seconds: of this thread's work at most for the motion in continuous time [s]; columns that are not measured by
-            then say so.
-        method: as in `differentiate_step`; or "continuous": the gradient of the motion in continuous time, beside the
-            slopes of another integration of it. A column has no slope where those do not settle, which is
-            "discontinuous", and is "undecided" where they were not measured in time.
-        gradient: what to certify, instead of what `differentiate_rollout` gives; one by "continuous" is judged so.
-        sampled: take at most 20 rollouts, along random directions, whatever the number of columns.
-        seed: of these directions.
+        parameters: Names, or values by name, of the parameters that the loss is also differentiated with respect to.
+        num_steps: N, if `us` is None.
+        refine: Compute the gradient again at h/2 and h/4, under the same inputs, and compare it with the slopes of the
+            motion in continuous time along each state, each input equally at all times, and each parameter (`truth` of
+            the certificate). If geometries touch and these slopes are not known, no entry converges.
+        seconds: [s] Maximum thread time for the continuous motion. Columns not measured in this time are marked.
+        method: As in `differentiate_step`, or "continuous" for the gradient of the motion in continuous time, compared
+            with the slopes of another integration. A column is "discontinuous" if these slopes do not converge, and
+            "undecided" if they were not measured in time.
+        gradient: The gradient to certify, by default the result of `differentiate_rollout`. The comparison for a
+            gradient by "continuous" is the one of this method.
+        sampled: Take at most 20 rollouts, along random directions, for any number of columns.
+        seed: Seed of these directions.
 
     Returns:
-        The certificate of one row, the loss; its columns are x0 (on the tangent space), u[k] step by step or the
-        policy's parameters, and the model's; in continuous time each input is one column, by as much at all times.
-        Entries that agree and do not converge are "not_converged". Where
-        `sampled`, a certificate of all columns together, which says how small an error it would have noticed.
+        The certificate with one row, the loss. Its columns are x0 (on the tangent space), u[k] step by step or the
+        policy's parameters, and the model's parameters. In continuous time, each input is one column for all times.
+        Entries that agree but do not converge are "not_converged". With `sampled`, the certificate has one verdict for
+        all columns, and states the smallest error that it would have noticed.
 
     Raises:
-        InputError: both `us` and `policy` are given; what is sampled, or under a policy, is to be refined; the time
-            step is refined and a parameter at once.
-        ModelError: the motion in continuous time is asked for and there is none; `refine` of a model from a diagram,
-            which has but one time step, where that is so.
-        GradientError: the rollout has no gradient, or the policy remembers what it was asked before.
+        InputError: Both `us` and `policy` are given. Or `refine` is combined with `sampled`, with a policy, or with the
+            time step as a parameter.
+        ModelError: The motion in continuous time is requested but not available, also by `refine` for a model from a
+            diagram, whose time step cannot change.
+        GradientError: The rollout has no gradient, or the policy depends on earlier calls.
         SimulationError: Drake cannot take a step.
 
     Source:
@@ -158,7 +158,7 @@ def certify_rollout(
 def _entries(
     moved: Displaced, gradient: RolloutGradient, beside: Array | None, seconds: float | None
 ) -> RolloutCertificate:
-    """The certificate by differences of whole rollouts, with refinement where `seconds` are given for it."""
+    """Certify by differences of whole rollouts, with a refinement if `seconds` is given."""
     stairs, truth, no_truth = _staircase(moved, gradient), None, ""
     refinements: tuple[Refinement, ...] = ()
     if seconds is not None:
@@ -175,27 +175,27 @@ def _entries(
 
 
 def _sampled(moved: Displaced, gradient: RolloutGradient, seed: int) -> SampledCertificate:
-    """The certificate by few rollouts along random directions."""
+    """Certify by a few rollouts along random directions."""
     sample, stairs = certify_sampled(moved, gradient, seed), _staircase(moved, gradient)
     if stairs:
         return replace(sample, codes=np.full(sample.codes.shape, DISCONTINUOUS), why=stairs)
-    cause = _cause(moved, gradient, "")  # which few rollouts may not tell: it is asked for whatever they say
+    cause = _cause(moved, gradient, "")  # for every verdict, as few rollouts may miss a wrong policy derivative
     codes = np.full(sample.codes.shape, DISAGREE) if cause and sample.verdict == "agree" else sample.codes
     return replace(sample, cause=cause, codes=codes)
 
 
 def _certify_continuous(moved: Displaced, gradient: RolloutGradient | None, seconds: float) -> RolloutCertificate:
-    """The certificate of a gradient in continuous time: one column for each slope that is measured."""
+    """Certify a gradient in continuous time, with one column for each measured slope."""
     if gradient is None:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", GradientWarning)  # the certificate says it, and more
+            warnings.simplefilter("ignore", GradientWarning)  # the certificate contains this information
             gradient = moved.gradient(np.zeros(len(moved.scale)))
     stairs, truth = _staircase(moved, gradient), truth_of(moved, gradient, seconds)
     return _of_rollout(by_truth(truth, moved.subject), stairs, gradient=gradient, truth=truth)
 
 
 def _staircase(moved: Displaced, gradient: RolloutGradient) -> str:
-    """How the loss or the policy is a staircase, empty where they are none."""
+    """Describe the staircase of the loss or the policy, or return "" if there is none."""
     stairs = stairs_of_loss(moved.loss, gradient, moved.space)
     if stairs or moved.policy is None:
         return stairs
@@ -203,7 +203,7 @@ def _staircase(moved: Displaced, gradient: RolloutGradient) -> str:
 
 
 def _certified(moved: Displaced, gradient: RolloutGradient, beside: Array | None) -> Certificate:
-    """The certificate by rollouts whose steps are solved to rounding, else by Drake's own."""
+    """Certify by rollouts whose steps are solved to rounding if possible, else by Drake's own steps."""
     derivative, tolerance = moved.flat(gradient)[None] * moved.scale, moved.solver_tolerance(gradient)
     method = " + ".join(dict.fromkeys((*gradient.methods, *gradient.parameter_sources)))
 
@@ -229,7 +229,7 @@ def _of_rollout(
     refinements: tuple[Refinement, ...] = (),
     **more: Any,
 ) -> RolloutCertificate:
-    """With what a rollout's certificate has; entries that do not converge, are not the truth, or on stairs, fail."""
+    """Extend a certificate to a rollout's; entries that do not converge, differ from `truth`, or have stairs fail."""
     codes, reasons = np.array(certificate.codes), certificate.reasons
     wrong = np.zeros(codes.shape[1], dtype=bool)
     for refinement in refinements:
@@ -247,7 +247,7 @@ def _of_rollout(
 
 
 def _cause(moved: Displaced, gradient: RolloutGradient, verdict: str) -> str:
-    """What is wrong with the policy's own derivative, where a gradient does not agree."""
+    """Describe the error of the policy's own derivative, if the gradient does not agree."""
     if moved.policy is None or verdict == "agree":
         return ""
     return wrong_derivative(moved.policy, moved.space, gradient, moved.time_step)

@@ -1,10 +1,10 @@
-"""The gradient (n,) of a rollout along a few random directions, each difference of which takes two rollouts.
+"""Check the gradient (n,) of a rollout along a few random directions, with two rollouts for each difference.
 
-Those along a direction v tell the gap (g - g*)' v between the gradient g that is stated and the true one. Let e be the
-error in units in which each entry that matters weighs the same, and z = v in these units a vector of independent normal
-numbers. Then each gap is e' z plus what the differences themselves leave, and whatever that is, m gaps are in sum of
-squares below q |e|^2 with probability at most P(chi^2_m <= q). So |e| <= U = sqrt(sum gap^2 / q) but for that
-probability: no model of the noise is needed, a noisy difference merely makes U large.
+The difference along a direction v yields the gap (g - g*)' v between the gradient g in question and the true gradient
+g*. Let e be the error in units in which all significant entries have the same weight, and let z = v in these units be a
+vector of independent normal numbers. Then each gap is e' z plus the error of the difference. For any such error, the
+sum of m squared gaps is below q |e|^2 with probability P(chi^2_m <= q) at most. So |e| <= U = sqrt(sum gap^2 / q) holds
+except with that probability. No model of the noise is needed, as noise only makes U larger.
 """
 
 from __future__ import annotations
@@ -23,31 +23,31 @@ from drake_diff.motion.gradient import RolloutGradient
 
 @dataclass(frozen=True)
 class SampleOptions:
-    """How a rollout's gradient is checked along a few random directions."""
+    """Options of the check of a rollout's gradient along a few random directions."""
 
     miss: float = 1e-3  # the probability that an error is missed
-    # Where the distribution of chi^2 with `second` and with `first` degrees of freedom is `miss` / 2, as each of two
-    # step sizes may agree.
+    # The (`miss` / 2)-quantiles of the chi^2 distribution with `second` and `first` degrees of freedom. The probability
+    # is halved because each of two step sizes may agree.
     quantiles: tuple[float, float] = (0.06392, 0.15810)
-    limit: float = 1e-2  # the error of an entry that must be noticed
-    # An entry matters that is at least `least` of the largest of its kind. A kind matters whose largest is at least
-    # `floor` of the largest of all, each entry times the scale of its column.
+    limit: float = 1e-2  # relative error of an entry that must be noticed
+    # An entry is significant if it is at least `least` times the largest of its kind. A kind is significant if its
+    # largest entry is at least `floor` times the largest of all. Entries are multiplied by the scale of their column.
     least: float = 1e-2
     floor: float = 1e-6
     first: int = 5
-    second: int = 4  # directions at the first step size, and at the second
+    second: int = 4  # number of directions at the first and at the second step size
     step: float = 1e-6
-    # The second step size over the first: finer where the loss bends by more than `bent` of its slope, else coarser.
+    # Ratio of the second step size to the first: `finer` if the loss bends by more than `bent` of its slope.
     finer: float = 1e-1
     coarser: float = 10.0
     bent: float = 1e-2
-    rounding: float = 1e-14  # of a loss along a rollout
+    rounding: float = 1e-14  # relative rounding of a loss along a rollout
     widest: float = 1e-2
-    steady: float = 0.25  # numbers at two step sizes that differ by this part, or less, are not the differences' own
-    alone: float = 1e-3  # of the squared gaps may be left by the one entry that explains them
-    rollouts: int = 20  # at most
-    doubt: float = 0.05  # of the derivative along a direction: what Drake's solver, stopping early, changed it by
-    elsewhere: float = 1e-3  # of the scale: how far from the motion a policy is led before it is asked again
+    steady: float = 0.25  # largest relative change between two step sizes of a gap not due to the differences
+    alone: float = 1e-3  # part of the squared gaps that a single entry that explains them may leave
+    rollouts: int = 20  # maximum number
+    doubt: float = 0.05  # relative change of a directional derivative due to the early stop of Drake's solver
+    elsewhere: float = 1e-3  # relative to the scale: displacement of the rollout that precedes the check of the memory
 
 
 SAMPLE = SampleOptions()
@@ -56,18 +56,18 @@ TINY = 1e-100
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SampledCertificate(Certificate):
-    """A rollout's gradient (1, n), compared with differences along random directions; all entries have one verdict.
+    """A rollout's gradient (1, n), compared with differences along random directions. All entries have one verdict.
 
-    An entry matters that is at least 1 % of the largest of its kind: positions, velocities, each input, the policy's
-    parameters, each parameter of the model; where all of a kind are below 1e-6 of the largest entry, at least that.
-    Entries are compared after each is multiplied by the scale of its column: 1 in SI units, or the magnitude of what
-    is moved where that is more. `size` is the entry, or what would matter. The verdict is
+    An entry is significant if it is at least 1 % of the largest of its kind, and at least 1e-6 of the largest entry of
+    all. The kinds are positions, velocities, each input, the policy's parameters, and each parameter of the model.
+    Entries are multiplied by the scale of their column, which is 1 in SI units, or the magnitude of the variable if
+    that is larger. `size` is the entry or the smallest significant value. The verdict is
 
-    - "agree": errors of 1 % in any entry that matters, or in several together, would have been missed with a
-      probability below 1e-3, over the seeds of the directions. `noticeable` says it for every entry;
+    - "agree": errors of 1 % in any significant entry, or in several together, would have been missed with a
+      probability below 1e-3 over the seeds of the directions. `noticeable` is the noticeable error of every entry;
     - "disagree": the gaps are the same at two step sizes;
-    - "discontinuous": the loss has a corner or jumps at the point;
-    - "undecided": what the differences leave is more than 1 % of an entry.
+    - "discontinuous": the loss has a corner or a jump at the point;
+    - "undecided": the differences do not resolve 1 % of an entry.
 
     Example:
         >>> model = dd.load_model("models/cart_pole.urdf", time_step=0.01)
@@ -79,8 +79,8 @@ class SampledCertificate(Certificate):
     gradient: RolloutGradient = field(kw_only=True)
     rollouts: int = 0
     seed: int = 0
-    why: str = ""  # of every verdict but "agree"
-    cause: str = ""  # what is wrong with the policy's own derivative, where that is known
+    why: str = ""  # reason for every verdict except "agree"
+    cause: str = ""  # error of the policy's own derivative, if it is known
 
     def _lines(self) -> list[str]:
         count = int((self.noticeable <= SAMPLE.limit * np.abs(self.derivative)).sum())
@@ -95,13 +95,13 @@ class SampledCertificate(Certificate):
 
 @dataclass(frozen=True, eq=False)
 class Gaps:
-    """At one step size, of m directions, in the unit in which an entry that matters is 1."""
+    """The gaps along m directions at one step size, in units in which significant entries are 1."""
 
     step: float
-    stated: Array  # (m,) the slope along each direction
-    gap: Array  # (m,) that less the differences'
-    bend: Array  # (m,) half of what the quotients of both sides differ by
-    rounding: float  # what the loss's rounding makes of a gap
+    stated: Array  # (m,) slope of the gradient in question along each direction
+    gap: Array  # (m,) this slope minus the slope from differences
+    bend: Array  # (m,) half of the difference between forward and backward quotients
+    rounding: float  # effect of the loss's rounding on a gap
 
     def __str__(self) -> str:
         worst = int(np.argmax(np.abs(self.gap)))
@@ -113,12 +113,12 @@ class Gaps:
 
     @property
     def bound(self) -> float:
-        """U: the error is smaller, but for a probability of `SAMPLE.miss` / 2, as two step sizes are tried."""
+        """The bound U, which the error exceeds with a probability of at most `SAMPLE.miss` / 2."""
         return _bound(self.gap)
 
 
 def weights(contribution: Array, kinds: Indices) -> Array:
-    """(n,) what makes an entry that matters 1; `contribution` (n,) are the entries' sizes, `kinds` (n,) their kinds."""
+    """Return weights (n,) that scale significant entries to 1, from the sizes `contribution` (n,) and `kinds` (n,)."""
     of_kind = np.zeros(int(np.max(kinds)) + 1)
     np.maximum.at(of_kind, kinds, contribution)
     floor = max(SAMPLE.floor * float(np.max(contribution)), TINY)
@@ -127,7 +127,7 @@ def weights(contribution: Array, kinds: Indices) -> Array:
 
 @dataclass(eq=False)
 class Probe:
-    """Rollouts along random directions around one point; `f` takes displacements (K, n) and gives losses (K,)."""
+    """Rollouts along random directions around one point. `f` takes displacements (K, n) and returns losses (K,)."""
 
     f: Callable[[Array], Array]
     derivative: Array  # (n,)
@@ -137,17 +137,17 @@ class Probe:
 
     @property
     def left(self) -> int:
-        """How many more rollouts may be taken."""
+        """The number of remaining rollouts."""
         return SAMPLE.rollouts - self.spent
 
     def normals(self, count: int) -> Array:
-        """(count, n) the same ones first."""
+        """Return the first `count` rows (count, n) of a fixed set of normal numbers."""
         return np.random.default_rng(self.seed).standard_normal((SAMPLE.first, len(self.weight)))[:count]
 
     def gaps(self, loss: float, step: float, count: int) -> Gaps:
-        """Of the first `count` directions, `loss` being the one at the point.
+        """Compute the gaps along the first `count` directions, with the `loss` at the point.
 
-        No entry is moved by more than its scale times a normal number.
+        No entry is displaced by more than `step` times its scale times a normal number.
         """
         reach = 1 / float(np.max(self.weight))
         v = reach * self.weight * self.normals(count)
@@ -159,9 +159,9 @@ class Probe:
         return Gaps(step, stated, stated - (ahead - behind) / (2 * unit), bend, SAMPLE.rounding * abs(loss) / unit)
 
     def two(self, loss: float) -> tuple[Gaps, Gaps | None]:
-        """The gaps at the usual step size and, where these do not agree and there is something left, at another.
+        """Compute the gaps at the default step size, and at a second one if these do not agree and rollouts are left.
 
-        No step is so small that the rounding of the loss is more than a tenth of what is allowed.
+        The steps are large enough that the rounding of the loss is at most a tenth of the allowed error.
         """
         least = 10 * SAMPLE.rounding * abs(loss) / SAMPLE.limit * float(np.max(self.weight))
         count = SAMPLE.first if self.left >= 2 * (SAMPLE.first + SAMPLE.second) else SAMPLE.second
@@ -173,7 +173,7 @@ class Probe:
         return first, self.gaps(loss, step, SAMPLE.second) if step <= SAMPLE.widest else None
 
     def alone(self, gaps: Gaps) -> tuple[int, float] | None:
-        """The entry whose error alone explains the gaps, and that error; None where no single one does."""
+        """Return the entry whose error alone explains the gaps, and this error, or None if there is no such entry."""
         z = self.normals(len(gaps.gap))
         size = (z**2).sum(axis=0)
         error = (gaps.gap @ z) / size
@@ -183,7 +183,7 @@ class Probe:
 
 
 def judge(first: Gaps, second: Gaps | None, doubt: float) -> tuple[str, str]:
-    """The verdict and its reason; `doubt` is the root mean square of gaps that a solver's early stop may leave."""
+    """Return the verdict and its reason. `doubt` is the root mean square of gaps due to a solver's early stop."""
     if second is None:
         agrees = max(first.bound, _bound(first.bend)) <= SAMPLE.limit
         return ("agree", "") if agrees else ("undecided", "no second step size is possible")
@@ -208,7 +208,7 @@ def _bound(values: Array) -> float:
 
 
 def _steady(near: Array, far: Array) -> bool:
-    """Whether two step sizes tell the same of the directions that they share."""
+    """Return whether the values at two step sizes agree along their common directions."""
     both = min(len(near), len(far))
     near, far = near[:both], far[:both]
     return _size(near - far) <= SAMPLE.steady * min(_size(near), _size(far))
@@ -219,7 +219,7 @@ def _size(values: Array) -> float:
 
 
 def certify_sampled(moved: Displaced, g: RolloutGradient, seed: int) -> SampledCertificate:
-    """Certify `g` by at most 20 rollouts, of solved steps if possible; one has led a policy elsewhere before."""
+    """Certify `g` by at most 20 rollouts, of solved steps if possible. One of them checks a policy's memory."""
     derivative = moved.flat(g) * moved.scale
     weight = weights(np.abs(derivative), moved.kinds)
     probe = Probe(lambda d: moved.losses(d)[:, 0], derivative, weight, seed, 0 if moved.policy is None else 1)

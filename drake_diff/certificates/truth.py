@@ -1,16 +1,16 @@
-"""What a rollout's gradient is beside the truth: the motion in continuous time that the discrete steps stand for.
+"""Compare a rollout's gradient with the truth: the slopes of the motion in continuous time that the steps discretize.
 
-Both AutoDiffXd and difference quotients can be wrong about the physics: through a compliant bounce the gradient of the
-discrete motion can be 10 to 400 times that of the motion it stands for. So a rollout's gradient may also be taken at h,
-h/2 and h/4. That it converges does not make it right (see `beside_truth`): it is compared with slopes of the motion.
+Both AutoDiffXd and difference quotients can be wrong about the physics. Through a compliant bounce, the gradient of the
+discrete motion can be 10 to 400 times that of the continuous motion. A rollout's gradient can therefore be computed at
+h, h/2 and h/4. A limit of these gradients may still be wrong (see `beside_truth`), so that it is compared with slopes
+of the continuous motion.
 
-The motion is integrated with error control from the contact law itself (`motion.continuous`), which shares nothing with
-the steps nor with `differentiate_rollout(method="continuous")`. A slope is measured by central differences over three
-widths, 1e-2, 1e-3 and 1e-4 of a column's scale (a tenth of that where nothing touches), each with an integration as
-much more accurate as it is narrower. It exists where the two narrow ones agree to 0.1 %, and the wide one agrees as
-well or differs from them as a smooth curve does: by the square of the width, which half the wide one shows; and where
-it is the same ahead as behind. It is unknown, and nothing else, where the time is up first or the integration's own
-error hides it.
+The continuous motion is integrated with error control from the contact law (`motion.continuous`), independently of the
+steps and of `differentiate_rollout(method="continuous")`. A slope is measured by central differences over three widths,
+1e-2, 1e-3 and 1e-4 of a column's scale (a tenth of that without contact), with integration tolerances proportional to
+the width. It exists if the two narrow slopes agree to 0.1 %, if the wide one agrees or differs by the square of the
+width as for a smooth curve (checked at half the width), and if the forward and backward slopes agree. It is unknown if
+the time limit is reached or the error of the integration hides it.
 """
 
 import time
@@ -39,67 +39,67 @@ from drake_diff.motion.loss import evaluate_loss, takes_one_argument
 
 @dataclass(frozen=True)
 class TruthOptions:
-    """How slopes of the motion in continuous time are measured and judged."""
+    """Options for the slopes of the motion in continuous time, and thresholds to judge them."""
 
-    widths: tuple[float, ...] = (1e-2, 1e-3, 1e-4)  # of a column's scale, to both sides
-    between: float = 5e-3  # a fourth, where the first is another slope than the rest
-    curve: float = (1e-2**2 - 1e-3**2) / (5e-3**2 - 1e-3**2)  # how the slopes of a smooth curve differ over these
-    bent: float = 0.1  # of that: what its next derivative may add
-    shrinks: float = 0.3  # of a smooth curve's corner a tenth is left over a tenth of the width, of a real one all
-    smooth: float = 0.1  # part of the widths where nothing touches
-    tolerance: float = 1e-5  # of an integration's step, as a part of the width
-    settled: float = 1e-3  # how far apart slopes may be, of their size
-    right: float = 1e-2  # how far from the truth a gradient may be, of its size
-    negligible: float = 1e-3  # of the largest column, each moved by its scale: a smaller one is judged as that large
-    close: float = 3e-3  # the same, for a yes
-    nothing: float = 1e-7  # of the loss: a change by a whole scale that is none
-    known: float = 1e-2  # of a slope: the integration's own error at most
-    sure: float = 3.0  # times what the integration's error is found to be
-    rounded: float = 1e-15  # of a loss: its rounding
-    unknown: float = 1e6  # of its size: what would have been noticed where nothing is measured
-    contraction: float = 0.75  # halfway between 1/2, which first order promises, and 1, no convergence
-    trusted: float = 0.1  # how far from its limit a gradient at finer steps may be, relative to it
-    still: float = 1e-2  # changes below this part tell no rate
-    spread: float = 0.05  # how uncertain a slope may be that a gradient is compared with, relative to its size
+    widths: tuple[float, ...] = (1e-2, 1e-3, 1e-4)  # relative to a column's scale, to both sides
+    between: float = 5e-3  # a fourth width, used if the slope over the first differs from the others
+    curve: float = (1e-2**2 - 1e-3**2) / (5e-3**2 - 1e-3**2)  # ratio of slope differences on a smooth curve
+    bent: float = 0.1  # relative deviation from this ratio that the next derivative may cause
+    shrinks: float = 0.3  # over a tenth of the width, the gap of a smooth curve shrinks to 0.1, of a corner not at all
+    smooth: float = 0.1  # factor on the widths without contact
+    tolerance: float = 1e-5  # of an integration step, relative to the width
+    settled: float = 1e-3  # largest difference between equal slopes, relative to their size
+    right: float = 1e-2  # largest error of a gradient, relative to its size
+    negligible: float = 1e-3  # least size relative to the largest column, each times its scale
+    close: float = 3e-3  # the same as `right`, for the verdict "agree"
+    nothing: float = 1e-7  # relative to the loss: effect of a displacement by a whole scale that is ignored
+    known: float = 1e-2  # largest error of the integration, relative to a slope
+    sure: float = 3.0  # safety factor on the estimated error of the integration
+    rounded: float = 1e-15  # relative rounding of a loss
+    unknown: float = 1e6  # relative to the size: noticeable error of a slope that is not measured
+    contraction: float = 0.75  # halfway between 1/2 (first-order convergence) and 1 (no convergence)
+    trusted: float = 0.1  # largest relative distance of a gradient from its limit at finer steps
+    still: float = 1e-2  # relative changes below this value show no rate
+    spread: float = 0.05  # largest uncertainty, relative to its size, of a slope used for comparison
 
 
 TRUTH = TruthOptions()
 
-SECONDS = 10.0  # of this thread's work
+SECONDS = 10.0  # [s] thread time
 FORMULAS = {KELVIN_VOIGT: "k (x + tau x')+", HUNT_CROSSLEY: "k x (1 + d x')+"}
 
 
 @dataclass(frozen=True, eq=False)
 class TrueSlope(ShowsItsRepr):
-    """One column of a gradient, or an input's at all times together, beside the slope of the motion in continuous time.
+    """A column of a gradient, or the sum of an input's columns, and the slope of the motion in continuous time.
 
-    `exists` is None where it is not known whether there is one; `reason` then says why, and where there is none. Value
-    and error are NaN unless it exists.
+    `exists` is None if it is unknown whether the slope exists. `reason` explains an unknown or nonexistent slope.
+    `value` and `error` are NaN unless the slope exists.
     """
 
     column: str
-    columns: tuple[int, ...]  # of the gradient, which add up to it
+    columns: tuple[int, ...]  # of the gradient, whose sum is `ours`
     ours: float
     widths: tuple[float, ...] = ()  # to both sides, in the column's unit
-    slopes: tuple[float, ...] = ()  # over them
-    corners: tuple[float, ...] = ()  # the slope ahead less the slope behind, over them
+    slopes: tuple[float, ...] = ()  # over the widths
+    corners: tuple[float, ...] = ()  # forward slope minus backward slope, over the widths
     value: float = float("nan")
     error: float = float("nan")
     exists: bool | None = None
     reason: str = ""
-    size: float = float("nan")  # what an error of it is measured by
-    by_other_law: float = float("nan")  # the slope under `Truth.other_law`, less this one
+    size: float = float("nan")  # magnitude to which errors are relative
+    by_other_law: float = float("nan")  # the slope under `Truth.other_law` minus this slope
 
     @property
     def sign_agrees(self) -> bool | None:
-        """Whether ours has the sign of the truth; None where that has none that is known."""
+        """Whether `ours` has the sign of the true slope, or None if this sign is unknown."""
         if not self.exists or not abs(self.value) > self.error:
             return None
         return bool(np.sign(self.ours) == np.sign(self.value))
 
     @property
     def agrees(self) -> bool | None:
-        """Whether ours is the truth, to 1 % and its error; None where the truth is not known, or there is none."""
+        """Whether `ours` equals the true slope up to 1 % and its error, or None without a known true slope."""
         return bool(abs(self.ours - self.value) <= TRUTH.right * self.size + self.error) if self.exists else None
 
     def __repr__(self) -> str:
@@ -113,7 +113,7 @@ class TrueSlope(ShowsItsRepr):
 
 @dataclass(frozen=True, eq=False)
 class Truth(ShowsItsRepr):
-    """A rollout's loss and the slopes of it in continuous time, beside what the rollout and its gradient say.
+    """A rollout's loss and its slopes in continuous time, together with the loss and gradient of the rollout.
 
     Example:
         >>> model = dd.load_model("models/sphere_on_ground.sdf", time_step=0.01)
@@ -125,23 +125,23 @@ class Truth(ShowsItsRepr):
 
     law: str
     loss: float
-    error: float  # of the loss, by the integration
-    ours: float  # the rollout's
+    error: float  # of the loss, due to the integration
+    ours: float  # loss of the rollout
     slopes: tuple[TrueSlope, ...]
-    seconds: float  # that it was given
-    touches: bool  # whether anything touches on the way
-    other_law: str = ""  # that of Drake's own continuous plant, where it is another one
-    by_other_law: float = float("nan")  # the loss under it, less this one
-    other_reason: str = ""  # why that is not known
-    notes: tuple[str, ...] = ()  # what else the steps have that is not the law
+    seconds: float  # [s] time limit
+    touches: bool  # whether any contact occurs
+    other_law: str = ""  # contact law of Drake's own continuous plant, if it differs
+    by_other_law: float = float("nan")  # the loss under that law minus this loss
+    other_reason: str = ""  # why that difference is unknown
+    notes: tuple[str, ...] = ()  # other differences between the steps and the law
 
     def slope(self, column: str) -> TrueSlope:
-        """That of a column; KeyError where there is none of that name."""
+        """Return the slope of a column. Raises KeyError if there is no such column."""
         return {slope.column: slope for slope in self.slopes}[column]
 
     @property
     def wrong(self) -> tuple[TrueSlope, ...]:
-        """Those that ours is not."""
+        """The slopes from which the gradient differs."""
         return tuple(slope for slope in self.slopes if slope.agrees is False)
 
     def __repr__(self) -> str:
@@ -166,9 +166,9 @@ class Truth(ShowsItsRepr):
 def truth_of(
     moved: Displaced, gradient: RolloutGradient, seconds: float = SECONDS, columns: Sequence[str] | None = None
 ) -> Truth:
-    """The truth beside a gradient by all that `moved` moves, or some `columns`, and the rollout's loss.
+    """Measure the true loss and its slopes along all directions of `moved`, or along some `columns`.
 
-    Raises ModelError or SimulationError, which say why, where the motion has no continuous form.
+    Raises ModelError or SimulationError with the reason if the motion has no continuous form.
     """
     lines = [line for line in moved.lines if columns is None or line.name in columns]
     truth = _Measurement(moved, moved.flat(gradient), seconds).truth(gradient.loss, lines)
@@ -180,7 +180,7 @@ def truth_of(
 
 
 def softest_contact(model: Model, xs: Array) -> str | None:
-    """Which contact of `sap` the steps make softer than it is stated, and by how much; None where they do not.
+    """Describe the contact that the steps of `sap` soften most relative to its stiffness, or return None.
 
     An impulse of the step is g = (x + ...) / (R (h + tau)), R = max(beta^2 w / (4 pi^2), 1 / (h (h + tau) k)), where
     beta is Drake's near-rigid threshold and w a third of the norm of the inverse of the mass at the contact (Castro,
@@ -199,24 +199,24 @@ def softest_contact(model: Model, xs: Array) -> str | None:
 
 
 class _Measurement:
-    """Losses of the motion in continuous time, by a deadline."""
+    """Losses of the motion in continuous time, measured within a time limit."""
 
     def __init__(self, moved: Displaced, gradient: Array, seconds: float):
         self.moved, self.gradient, self.seconds = moved, gradient, seconds
         self.deadline = time.thread_time() + seconds
         self.touches = False
-        self.losses: list[float] = []  # here: one for each of the widths, and one that is better
+        self.losses: list[float] = []  # at the point: one per width, and a more accurate one
 
     def truth(self, ours: float, lines: Sequence[DisplacedDirection]) -> Truth:
         with applied(self.moved.vector) as model:
             law = ContinuousMotion(model).law
-        with suppress(TimeoutError):  # every slope says so below
+        with suppress(TimeoutError):  # every slope below then has this reason
             self._measure_losses()
         order = sorted(lines, key=lambda line: -abs(self._ours(line)) * line.scale)
         measured = {line.name: self._measured(line) for line in order}
         sizes = [abs(s) * line.scale for line in order for s in (*measured[line.name].slopes[-1:], self._ours(line))]
         losses, largest = np.array(self.losses), max(map(abs, self.losses), default=0.0)
-        # and what changes the loss by no part of it that matters, moved by a whole scale
+        # Slopes are also negligible if a displacement by a whole scale does not change the loss significantly.
         least = max(TRUTH.negligible * max(sizes, default=0.0), TRUTH.nothing * largest)
         noise = np.abs(losses[:3] - losses[-1]) + TRUTH.rounded * largest if self.losses else np.zeros(3)
         slopes = tuple(judged(measured[line.name], noise, least / line.scale) for line in lines)
@@ -245,22 +245,22 @@ class _Measurement:
         return [w if self.touches else TRUTH.smooth * w for w in TRUTH.widths]
 
     def _measure_losses(self) -> None:
-        """The loss by an integration for each width, and by one that is better than the last."""
+        """Compute the loss with the tolerance of each width, and with a tenth of the last tolerance."""
         still = np.zeros(len(self.moved.scale))
-        first = self._loss(still, TRUTH.tolerance * TRUTH.widths[0])  # and what touches
+        first = self._loss(still, TRUTH.tolerance * TRUTH.widths[0])  # also sets `touches`
         self.losses.append(first if self.touches else self._loss(still, TRUTH.tolerance * self._widths()[0]))
         for width in (*self._widths()[1:], self._widths()[-1] / 10):
             self.losses.append(self._loss(still, TRUTH.tolerance * width))
 
     def _slope(self, line: DisplacedDirection, width: float, law: str | None = None) -> tuple[float, float]:
-        """Over `width` times the scale to both sides; and by how much it is another one ahead than behind."""
+        """Return the slope over `width` times the scale to both sides, and the forward minus the backward slope."""
         w = width * line.scale
         ahead, behind = (self._loss(s * w * line.vector, TRUTH.tolerance * width, law) for s in (1, -1))
         nearest = int(np.argmin(np.abs(np.log(np.array(self._widths()) / width))))
         return (ahead - behind) / (2 * w), (ahead - 2 * self.losses[nearest] + behind) / w
 
     def _measured(self, line: DisplacedDirection) -> TrueSlope:
-        """The slopes along a line, from wide to narrow; not judged."""
+        """Measure the slopes along a line, from wide to narrow, without a judgement."""
         widths = self._widths()
         measured = TrueSlope(line.name, tuple(line.columns.tolist()), self._ours(line))
         if widths[0] * line.scale > line.room:
@@ -278,7 +278,7 @@ class _Measurement:
         return replace(measured, widths=tuple(w * line.scale for w in widths), slopes=slopes, corners=corners)
 
     def _beside_other_law(self, truth: Truth, lines: Sequence[DisplacedDirection]) -> Truth:
-        """With what Drake's continuous plant would do, which has Hunt and Crossley's law whatever the steps have."""
+        """Add the results of Drake's continuous plant, which uses Hunt and Crossley's law for any law of the steps."""
         still, width, slopes = np.zeros(len(self.moved.scale)), TRUTH.widths[1], list(truth.slopes)
         truth = replace(truth, other_law=HUNT_CROSSLEY)
         try:
@@ -287,7 +287,7 @@ class _Measurement:
             return replace(truth, other_reason=self._beyond())
         except DrakeDiffError as error:
             return replace(truth, other_reason=f"not measured: {error}")
-        with suppress(TimeoutError, DrakeDiffError):  # the slopes that are left are NaN: not measured
+        with suppress(TimeoutError, DrakeDiffError):  # the remaining slopes stay NaN
             for i, (slope, line) in enumerate(zip(slopes, lines, strict=True)):
                 if slope.exists:
                     other, _ = self._slope(line, width, HUNT_CROSSLEY)
@@ -296,7 +296,7 @@ class _Measurement:
 
 
 def judged(slope: TrueSlope, noise: Array, least: float) -> TrueSlope:
-    """Whether the slope exists, and its value; `noise` (3,) is how wrong a loss is at each of three widths."""
+    """Decide whether the slope exists, and set its value. `noise` (3,) is the error of the loss at three widths."""
     if not slope.slopes:
         return replace(slope, size=max(abs(slope.ours), least))
     (wide, *between, middle, narrow), w = slope.slopes, np.array([*slope.widths[:1], *slope.widths[-2:]])
@@ -322,7 +322,7 @@ def judged(slope: TrueSlope, noise: Array, least: float) -> TrueSlope:
 
 
 def by_truth(truth: Truth, subject: str) -> Certificate:
-    """The certificate of one row, the loss, and a column for each of the slopes."""
+    """Return the certificate with one row, the loss, and a column for each slope."""
     slopes = truth.slopes
     ours, value, error, size = (
         np.array([[getattr(slope, name) for slope in slopes]], dtype=float)
@@ -350,21 +350,21 @@ def by_truth(truth: Truth, subject: str) -> Certificate:
     )
 
 
-REFINEMENTS = (1, 2, 4)  # parts of a time step
+REFINEMENTS = (1, 2, 4)  # divisors of the time step
 
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
     """A gradient (n,) at three time steps [s], and its limit.
 
-    `apart` names the directions in which the gradient is not the slope of the motion in continuous time.
+    `apart` lists the directions along which the gradient is not known to be the slope of the continuous motion.
     """
 
     levels: tuple[float, ...]
     columns: tuple[str, ...]
     values: Array  # (3, n)
     limit: Array  # (n,)
-    scale: Array  # (n,) what the errors of each entry are parts of
+    scale: Array  # (n,) magnitude to which errors of each entry are relative
     converged: NDArray[np.bool_]  # (n,)
     apart: tuple[str, ...] = ()
 
@@ -384,7 +384,7 @@ class Refinement:
 
 
 def _at_finer_steps(moved: Displaced) -> Iterator[Array]:
-    """The gradient at h/2 and h/4 under the same inputs, the loss seeing the states at the same times."""
+    """Compute the gradient at h/2 and h/4 under the same inputs, for the loss of the states at the same times."""
     if TIME_STEP in {p.name for p in moved.vector.parameters}:
         raise InputError(
             "parameters", got=TIME_STEP, expected="parameters other than the time step, which refine=True changes"
@@ -399,11 +399,11 @@ def _at_finer_steps(moved: Displaced) -> Iterator[Array]:
 
 
 def judge_levels(levels: tuple[float, ...], columns: Sequence[str], values: Array, kinds: Sequence[str]) -> Refinement:
-    """Which columns of `values` (3, n) converge.
+    """Decide which columns of `values` (3, n) converge.
 
-    An error of first order makes the changes d1 and d2 halve, and the limit is g3 + d2. An entry has converged if
-    |d2| <= 0.75 |d1| and its first value is within 10 % of the limit, or if both changes are below 1 %: of the largest
-    of its own values, or of the root mean square of all entries of its kind, as the others matter more than it then.
+    With a first-order error, d2 is half of d1 for the changes d1 and d2, and the limit is g3 + d2. An entry has
+    converged if |d2| <= 0.75 |d1| and its first value is within 10 % of the limit, or if both changes are below 1 % of
+    its largest value or of the root mean square of the entries of its kind, which matter more if they are larger.
     """
     d1, d2 = np.diff(values, axis=0)
     limit = values[2] + d2
@@ -420,7 +420,7 @@ def judge_levels(levels: tuple[float, ...], columns: Sequence[str], values: Arra
 
 
 def refine_by_time_step(moved: Displaced, gradient: RolloutGradient, truth: Truth | None) -> Refinement:
-    """The `gradient` at h, at h/2 and h/4, beside the slopes of the motion in continuous time."""
+    """Compare the `gradient` at h with those at h/2 and h/4, and with the slopes of the motion in continuous time."""
     values = np.array([moved.flat(gradient), *_at_finer_steps(moved)])
     levels = tuple(moved.model.time_step / m for m in REFINEMENTS)
     refinement = judge_levels(levels, moved.columns, values, moved.units)
@@ -428,7 +428,7 @@ def refine_by_time_step(moved: Displaced, gradient: RolloutGradient, truth: Trut
 
 
 def _overlaps(model: Model, xs: Array) -> bool:
-    """Whether geometries that may collide overlap in one of the states `xs` (N + 1, nx)."""
+    """Return whether geometries that may collide overlap in one of the states `xs` (N + 1, nx)."""
     return bool(model.contract.contact.collision_pairs) and any(_overlap(model, x) for x in xs)
 
 
@@ -440,12 +440,12 @@ def _overlap(model: Model, x: Array) -> bool:
 def beside_truth(
     refinement: Refinement, lines: Sequence[DisplacedDirection], truth: Truth | None, *, touches: bool
 ) -> Refinement:
-    """`refinement`, in which only what is the slope of the motion in continuous time, to 10 %, converges.
+    """Restrict convergence in `refinement` to entries that equal the slope of the continuous motion up to 10 %.
 
-    Contact begins at the first step that overlaps, with a force that is not small (k tau v in `sap`): what is lost of
-    it grows along a step and starts again at the next, and the loss is a sawtooth of the start, whose teeth shrink with
-    h and keep their slope. So a gradient that `touches` something and cannot be compared does not converge either. Of
-    inputs at all times the size of a slope is the sum of their sizes.
+    Discrete contact begins at the first step with an overlap, with a force that is not small (k tau v in `sap`). The
+    impulse lost before that step is a sawtooth function of the initial state, and so is the loss. Its teeth shrink with
+    h but keep their slope. So a gradient that cannot be compared does not converge if a contact `touches`. The size of
+    a slope along an input at all times is the sum of the sizes of its columns.
     """
     converged, apart = refinement.converged.copy(), []
     for line in lines:

@@ -1,4 +1,4 @@
-"""The same model in other simulators: one file for each, one protocol for all."""
+"""The same model in other simulators: one module per simulator, one protocol for all."""
 
 from drake_diff._base import attach_stub as _attach_stub
 

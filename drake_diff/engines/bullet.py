@@ -1,7 +1,7 @@
 """Bullet by pybullet, in double precision, on multibodies built link by link from Drake's plant.
 
-It has no armature; springs are Drake's forces, given with those of the actuators. Friction and stiffness are those of
-links, and make those of pairs: mu = mu_a mu_b and 1/k = 1/k_a + 1/k_b. The contract tells how its step is not Drake's.
+Bullet has no armature. The engine applies spring forces together with actuator forces. Friction and stiffness are set
+per link and combined per pair: mu = mu_a mu_b and 1/k = 1/k_a + 1/k_b. The contract lists the differences to Drake.
 """
 
 from functools import partial
@@ -39,18 +39,18 @@ except ImportError as error:
         "this engine needs pybullet, which has wheels up to Python 3.11: pip install 'drake-diff[forward]'"
     ) from error
 
-Owner = tuple[int, int]  # Bullet's body and link, -1 for its base
+Owner = tuple[int, int]  # numbers of Bullet's body and link, where link -1 is the base
 KINDS = {p.JOINT_REVOLUTE: "revolute", p.JOINT_PRISMATIC: "prismatic"}
-SMALLEST = 1e-30  # for 0, whose logarithm and whose inverse are needed
+SMALLEST = 1e-30  # replaces 0, as logarithm and inverse are needed
 EVERY_TIME_STEP = {"reportSolverAnalytics": 1, "warmStartingFactor": 0.0, "contactSlop": 0.0}
-# Bullet drags all bodies, clamps joints at 100 rad/s or m/s, and adds a margin to cylinders.
+# By default, Bullet damps all bodies, limits joint speeds to 100 rad/s or m/s, and adds a margin to cylinders.
 INERT = {"linearDamping": 0.0, "angularDamping": 0.0, "maxJointVelocity": 1e10, "collisionMargin": 0.0}
 NO_OTHER_FRICTION = {"rollingFriction": 0.0, "spinningFriction": 0.0, "restitution": 0.0}
 NO_BIAS = "pybullet's inverse dynamics of a free body is not that of Bullet's own step"
 
 
 class Client:
-    """pybullet's functions on a server of its own, which ends with it."""
+    """pybullet's functions on a separate server, which is disconnected when the object is deleted."""
 
     def __init__(self) -> None:
         self.number = p.connect(p.DIRECT)
@@ -61,7 +61,7 @@ class Client:
 
 
 class PybulletEngine(RigidEngine):
-    """Trees of hinges, slides and free bodies; contacts of spheres, boxes, cylinders, capsules and half spaces."""
+    """An engine for hinges, slides and free bodies, with spheres, boxes, cylinders, capsules and half spaces."""
 
     name, version = "pybullet", version("pybullet")
 
@@ -72,8 +72,8 @@ class PybulletEngine(RigidEngine):
         self.bullet.setTimeStep(model.time_step)
         self.bullet.setGravity(*(float(g) for g in self.description.gravity))
         self.bullet.setPhysicsEngineParameter(**EVERY_TIME_STEP)
-        self.places: dict[int, Owner] = {}  # of each rigid link
-        self.owners: dict[str, Owner] = {}  # of each geometry
+        self.places: dict[int, Owner] = {}  # by rigid link
+        self.owners: dict[str, Owner] = {}  # by geometry
         for tree in self.tree.trees:
             self._build(tree)
         for geometry in (g for number, g in self.tree.geometries if number < 0):
@@ -86,7 +86,7 @@ class PybulletEngine(RigidEngine):
         self.centers = Centers(self.coordinates, tuple(np.array(info[3]) for info in moving_dofs))
         axes = [rotation(np.array(info[4])[[3, 0, 1, 2]]) for info in moving_dofs]
         bases = [bodies[v][0] for _, v in self.coordinates.free]
-        # Of each free body its places in q and v, and what Bullet has: its base, centre of mass and principal axes.
+        # For each free body, its indices in q and v, and its base, centre of mass and principal axes in Bullet.
         self.free = tuple(zip(self.coordinates.free, bases, self.centers.centers, axes, strict=True))
         self.joints = [(self.places[i], link) for i, link in enumerate(self.tree.links) if not link.free]
         self.untouched = self.bullet.saveState()
@@ -107,7 +107,7 @@ class PybulletEngine(RigidEngine):
             position, turn = self.bullet.getBasePositionAndOrientation(base)
             R = rotation(np.array(turn)[[3, 0, 1, 2]]) @ turned.T
             q[i : i + 4] = RotationMatrix(R).ToQuaternion().wxyz()
-            q[i : i + 4] *= np.sign(q[i : i + 4] @ x[i : i + 4])  # of the two, that which x goes on to
+            q[i : i + 4] *= np.sign(q[i : i + 4] @ x[i : i + 4])  # the sign for which q is continuous
             q[i + 4 : i + 7] = np.array(position) - R @ center
             v[j + 3 : j + 6], v[j : j + 3] = self.bullet.getBaseVelocity(base)
         x_next = self._drake_state("Bullet", q, v, x, u)
@@ -135,14 +135,14 @@ class PybulletEngine(RigidEngine):
         M, T = np.zeros((self.nv, self.nv)), self.centers.turn(q)
         for tree in self.tree.trees:
             owner, body, joints = self._dofs(tree), self.places[tree.start][0], self._joint_positions(tree, q)
-            M[np.ix_(owner, owner)] = self.bullet.calculateMassMatrix(body, joints or [0.0])  # it takes no empty list
+            M[np.ix_(owner, owner)] = self.bullet.calculateMassMatrix(body, joints or [0.0])  # not an empty list
         for (i, j), _, _, turned in self.free:
             into = np.kron(np.eye(2), (rotation(q[i : i + 4]) @ turned).T)
             T[j : j + 6] = into @ T[j : j + 6]
         return np.asarray(T.T @ M @ T)
 
     def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
-        """NotOfferedError for free bodies."""
+        """Raise NotOfferedError for models with free bodies."""
         q, v = self._motion(q, v)
         if self.coordinates.free:
             raise NotOfferedError(NO_BIAS)
@@ -204,7 +204,7 @@ class PybulletEngine(RigidEngine):
         self.owners |= {g.name: self.places[i] for i, g in self.tree.geometries if i in members}
 
     def _set_contacts(self) -> None:
-        """Where pairs disagree, friction and stiffness of links are by least squares; the contract shows them."""
+        """Set friction and stiffness of links, by least squares if pairs disagree; the contract reports the result."""
         for owner in set(self.owners.values()):
             self.bullet.setCollisionFilterGroupMask(*owner, 0, 0)
         pairs = [(self._owners_of(pair), pair) for pair in self.tree.pairs]
@@ -221,12 +221,12 @@ class PybulletEngine(RigidEngine):
             self.bullet.changeDynamics(*owner, **values)
 
     def _owners_of(self, pair: PairContract) -> tuple[Owner, Owner]:
-        """The two links of a pair of geometries, the smaller first."""
+        """Return the two links of a pair of geometries, the smaller first."""
         a, b = sorted(self.owners[name] for name in pair.names)
         return a, b
 
     def _read_pairs(self) -> tuple[PairContract, ...]:
-        """Every pair of geometries whose links touch each other in Bullet: Drake's, then what comes with them."""
+        """Return all pairs of geometries whose links can collide in Bullet: Drake's pairs first, then others."""
         owners, links = self.owners, {self._owners_of(pair) for pair in self.tree.pairs}
         pairs = [pair.names for pair in self.tree.pairs]
         for a in owners:
@@ -243,7 +243,7 @@ class PybulletEngine(RigidEngine):
         return tuple(contracts)
 
     def _dofs(self, members: range) -> list[int]:
-        """Drake's places in v of a tree's velocities in Bullet's order."""
+        """Return the indices in Drake's v of a tree's velocities in Bullet's order."""
         dofs: list[int] = []
         for i in sorted(members, key=lambda i: self.places[i][1]):
             start = self.tree.links[i].joint.v_start
@@ -267,7 +267,7 @@ class PybulletEngine(RigidEngine):
 
 
 def _read_part(bullet: Any, owner: Owner) -> tuple[float, Array, Array, Array]:
-    """Mass, centre of mass (3,), inertia (3, 3) about it and principal axes (3, 3) of a link, in world."""
+    """Return mass, centre of mass (3,), inertia (3, 3) about it and principal axes (3, 3) of a link, in world."""
     info = bullet.getDynamicsInfo(*owner)
     state = bullet.getBasePositionAndOrientation(owner[0]) if owner[1] < 0 else bullet.getLinkState(*owner, 0, 1)
     R = rotation(np.array(state[1])[[3, 0, 1, 2]])
@@ -275,7 +275,7 @@ def _read_part(bullet: Any, owner: Owner) -> tuple[float, Array, Array, Array]:
 
 
 def _read_joint(bullet: Any, owner: Owner, link: RigidLink) -> JointContract:
-    """Where Bullet is at Drake's q = 0; springs are those of the engine."""
+    """Read a joint from Bullet at Drake's q = 0. The springs are those of the engine."""
     mass, center, inertia, R = _read_part(bullet, owner)
     name, carried = link.joint.joint, [(mass, center, inertia)]
     if owner[1] < 0:
@@ -291,7 +291,7 @@ def _read_joint(bullet: Any, owner: Owner, link: RigidLink) -> JointContract:
 
 
 def _shape(geometry: Geometry) -> dict[str, Any]:
-    """Bullet's keywords."""
+    """Return the keyword arguments of Bullet's collision shape."""
     kind, sizes = shape_of(geometry)
     if kind == "HalfSpace":
         return {"shapeType": p.GEOM_PLANE, "planeNormal": [0, 0, 1]}
@@ -304,5 +304,5 @@ def _shape(geometry: Geometry) -> dict[str, Any]:
 
 
 def _turn(R: Array) -> Array:
-    """The quaternion x y z w."""
+    """Return the quaternion (x, y, z, w)."""
     return np.asarray(RotationMatrix(R).ToQuaternion().wxyz()[[1, 2, 3, 0]])

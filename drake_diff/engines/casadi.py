@@ -1,7 +1,7 @@
-"""CasADi expressions that adam-robotics builds from URDF, in Drake's semi-implicit Euler step; CasADi's Jacobians.
+"""CasADi expressions that adam-robotics builds from URDF, in Drake's semi-implicit Euler step, with CasADi's Jacobians.
 
-adam has one tree on one floating base: a plant is handed to it as one tree for each free body, that being the base, and
-one for what stands on the world. Gravity is given to it (its own is 9.80665 m/s^2).
+adam supports one tree on one floating base. The plant is therefore split into one tree per free body, with this body as
+the base, and one tree on the world. Gravity is set explicitly (adam's default is 9.80665 m/s^2).
 """
 
 from importlib.metadata import version
@@ -32,12 +32,12 @@ NO_CONTACT = "adam's dynamics have no contact here"
 
 
 class CasadiEngine(PlantEngine, EulerEngine):
-    """Trees of hinges, slides and free bodies; no contact and no joint limits."""
+    """An engine for trees of hinges, slides and free bodies, without contact and joint limits."""
 
     name, version, method = "casadi", version("adam-robotics"), "casadi"
 
     def __init__(self, model: Model):
-        """The functions of q, v and a: M and bias; the potential energy; d (M a + bias) / dq and / dv."""
+        """Build the functions of q, v and a: M and bias, the potential energy, d(M a + bias) / dq and / dv."""
         super().__init__(model)
         self.gravity = self.description.gravity
         bases: list[Link | None] = [x for x in self.description.moving if x.kind == "quaternion_floating"]
@@ -97,7 +97,7 @@ class CasadiEngine(PlantEngine, EulerEngine):
 
 
 class _Tree:
-    """What one base carries, the world where `base` is None, in adam; `dofs` are its places in Drake's v."""
+    """The tree on one base, or on the world if `base` is None, in adam. `dofs` are its indices in Drake's v."""
 
     def __init__(self, description: Description, base: Link | None):
         if base and base.parent != "world":
@@ -115,16 +115,16 @@ class _Tree:
         self.links = {x.joint: x for x in self.moving}
 
     def dynamics(self, q: Any, v: Any, gravity: Array) -> tuple[Any, Any]:
-        """M (n, n) and bias (n,) by `dofs`."""
+        """Return M (n, n) and bias (n,) in the order of `dofs`."""
         n, world, base_v = len(self.moving), ca.SX.eye(6), ca.SX.zeros(6)
-        algorithms = RBDAlgorithms(self.model, self.math)  # of the "mixed" representation
+        algorithms = RBDAlgorithms(self.model, self.math)  # in the "mixed" representation
         own_q, own_v = q[self.positions], v[self.dofs[len(self.dofs) - n :]]
         if self.base:
             i, W = self.base.v_start, _turn(self.base)
             world = ca.blockcat([[ca.SX(3, 3), W], [W, ca.SX(3, 3)]])  # from Drake's (w, v_o) to adam's (v, w)
             base_v = ca.mtimes(world, v[i : i + 6])
         H = self._base_pose(q)
-        M, _ = algorithms.crba(H, own_q if n else ca.SX.zeros(1))  # adam reads one position though there be none
+        M, _ = algorithms.crba(H, own_q if n else ca.SX.zeros(1))  # adam needs at least one position
         bias = algorithms.rnea(H, own_q, base_v, own_v, np.append(gravity, np.zeros(3)))
         into = ca.diagcat(world, ca.SX.eye(n))
         start = 0 if self.base else 6
@@ -132,7 +132,7 @@ class _Tree:
         return M, ca.mtimes(into.T, bias.array)[start:]
 
     def potential(self, q: Any, gravity: Array) -> Any:
-        """[J] 0 at height 0."""
+        """Return the potential energy [J], 0 at height 0."""
         total = ca.SX(0)
         for name, H in self._poses(q).items():
             link = self.model.links[name]
@@ -141,7 +141,7 @@ class _Tree:
         return total
 
     def _base_pose(self, q: Any) -> Any:
-        """(4, 4) of the root, which stands as the world does where q = 0."""
+        """Return the pose (4, 4) of the root, whose axes are parallel to the world's at q = 0."""
         if self.base is None:
             return ca.SX.eye(4)
         i, X = self.base.q_start, self.base.on_parent
@@ -150,7 +150,7 @@ class _Tree:
         return ca.blockcat([[R, p], [ca.SX(1, 3), ca.SX(1)]])
 
     def _poses(self, q: Any) -> dict[str, Any]:
-        """(4, 4) of each link."""
+        """Return the pose (4, 4) of each link."""
         poses = {self.root: self._base_pose(q)}
         for node in list(self.model.tree)[1:]:
             joint = node.parent_arc
@@ -159,7 +159,7 @@ class _Tree:
         return poses
 
     def joints(self) -> tuple[JointContract, ...]:
-        """As adam has them."""
+        """Read the joints from adam."""
         carrier = {self.root: self.base.joint if self.base else None}
         carried: dict[str | None, list[tuple[float, Array, Array]]] = {}
         zero = ca.SX.zeros(1 + max([*self.positions, self.base.q_start + 6 if self.base else 0]))
@@ -191,7 +191,7 @@ class _Tree:
 
 
 class _Joint(StdJoint):  # type: ignore[misc]  # adam has no types
-    """In adam 0.5.0 a slide moves along its parent's axes, which `urdf` keeps, and its motion has 12 entries for 6."""
+    """A joint for adam 0.5.0, whose slides use the parent's axes, parallel in `urdf`, and 12 motion entries for 6."""
 
     def motion_subspace(self) -> Any:
         if self.type != "prismatic":
@@ -205,12 +205,12 @@ class _Factory(URDFModelFactory):  # type: ignore[misc]
 
 
 def rotation(quaternion: Any) -> Any:
-    """(3, 3) of a quaternion (w, x, y, z) of any norm, as an expression."""
+    """Return the rotation matrix (3, 3) of a quaternion (w, x, y, z) of any norm, as an expression."""
     s, v = quaternion[0], quaternion[1:4]
     product = s**2 * ca.SX.eye(3) + 2 * s * ca.skew(v) + ca.mtimes(v, v.T) + ca.mtimes(ca.skew(v), ca.skew(v))
     return product / ca.sumsqr(quaternion)
 
 
 def _turn(base: Link) -> Any:
-    """(3, 3) the frame that a free body's coordinates are in."""
+    """Return the rotation matrix (3, 3) of the frame in which a free body's coordinates are given."""
     return ca.SX(ca.DM(base.on_parent.rotation().matrix()))

@@ -1,6 +1,6 @@
-"""Models by hand, each readable beside its file in models/, and an engine of them with nothing but NumPy.
+"""Equations of motion derived by hand for some of the files in models/, and an engine for them that needs only NumPy.
 
-Their derivatives are complex steps of M(q) a + bias(q, v) at fixed a, which have no truncation error.
+Their derivatives are complex-step derivatives of M(q) a + bias(q, v) at fixed a, which have no truncation error.
 """
 
 from abc import ABC, abstractmethod
@@ -20,12 +20,12 @@ from drake_diff.model.model import Model
 
 (X, Y, Z), ORIGIN, NO_INERTIA = np.eye(3), np.zeros(3), np.zeros((3, 3))
 Limits = tuple[float, float]
-TINY = 1e-30  # of a complex step
+TINY = 1e-30  # size of a complex step
 
 
 @dataclass(frozen=True)
 class HandForm(ABC):
-    """Joints of one degree of freedom, unless said otherwise; q (nv,), v (nv,), u (nu,)."""
+    """Equations of motion for joints of one degree of freedom by default, with q (nv,), v (nv,) and u (nu,)."""
 
     gravity: float = 9.81  # [m/s^2], downwards
     joint_names: tuple[str, ...] = ()
@@ -40,37 +40,37 @@ class HandForm(ABC):
 
     @property
     def gravity_vector(self) -> Array:
-        """(3,) [m/s^2]."""
+        """The gravity vector (3,) [m/s^2]."""
         return -self.gravity * Z
 
     @property
     def actuation(self) -> Array:
-        """B (nv, nu): input i drives joint i."""
+        """B (nv, nu), with which input i drives joint i."""
         return np.eye(self.coordinates.nv, len(self.input_names))
 
     @property
     def damping(self) -> Array:
-        """(nv,), implicit in the step."""
+        """The joint damping (nv,), which is implicit in the step."""
         return np.array(self.joint_damping) if self.joint_damping else np.zeros(self.coordinates.nv)
 
     @abstractmethod
     def mass_matrix(self, q: Array) -> Array:
-        """M (nv, nv)."""
+        """Return M (nv, nv)."""
 
     @abstractmethod
     def bias(self, q: Array, v: Array) -> Array:
-        """(nv,)."""
+        """Return the bias forces (nv,)."""
 
     @abstractmethod
     def potential_energy(self, q: Array) -> float:
-        """[J]."""
+        """Return the potential energy [J]."""
 
     @abstractmethod
     def joints(self) -> tuple[JointContract, ...]:
-        """What the contract says of the joints."""
+        """Return the joints for the contract."""
 
     def needed_derivative(self, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
-        """(nv, nv) each, of M a + bias by small motion and by v."""
+        """Return the derivatives (nv, nv) of M a + bias with respect to small motion and to v."""
         by_q = _complex_steps(lambda z: self.mass_matrix(z) @ a + self.bias(z, v), q)
         return by_q @ self.coordinates.rate(q), _complex_steps(lambda z: self.bias(q, z), v)
 
@@ -87,14 +87,14 @@ class HandForm(ABC):
 
 
 def _complex_steps(function: Callable[[Array], Array], z: Array) -> Array:
-    """(m, n) the derivative of an analytic function of z (n,)."""
+    """Return the derivative (m, n) of an analytic function of z (n,)."""
     columns = [np.imag(function(z + 1j * TINY * e)) / TINY for e in np.eye(len(z))]
     return np.array(columns).T.astype(float)
 
 
 @dataclass(frozen=True)
 class Projectile(HandForm):
-    """A free ball: q = (quaternion, position), v = (angular, linear velocity)."""
+    """A free ball with q = (quaternion, position) and v = (angular velocity, linear velocity)."""
 
     joint_names: tuple[str, ...] = ("ball",)
     mass: float = 1.0
@@ -171,7 +171,7 @@ class Pendulum(HandForm):
 
 @dataclass(frozen=True)
 class DoublePendulum(HandForm):
-    """Two uniform thin rods below hinges about +y; the second angle is relative to the first."""
+    """Two uniform thin rods below hinges about +y. The second angle is relative to the first."""
 
     joint_names: tuple[str, ...] = ("shoulder", "elbow")
     input_names: tuple[str, ...] = ("shoulder_motor", "elbow_motor")
@@ -214,7 +214,7 @@ class DoublePendulum(HandForm):
 
 @dataclass(frozen=True)
 class CartPole(HandForm):
-    """Kelly's: a cart on a rail along x, a point bob on a massless pole from a hinge about -y; the cart is pushed."""
+    """Kelly's cart-pole: a driven cart on a rail along x, and a point mass on a massless pole at a hinge about -y."""
 
     joint_names: tuple[str, ...] = ("slide", "hinge")
     input_names: tuple[str, ...] = ("force",)
@@ -241,7 +241,7 @@ class CartPole(HandForm):
         )
 
 
-# The hand calculation of the file of that name in models/.
+# The equations for the file of the same name in models/.
 BY_MODEL: dict[str, HandForm] = {
     "projectile": Projectile(), "mass_spring_damper": MassSpringDamper(), "pendulum": Pendulum(),
     "double_pendulum": DoublePendulum(), "cart_pole": CartPole(),
@@ -249,7 +249,7 @@ BY_MODEL: dict[str, HandForm] = {
 
 
 class NumpyEngine(EulerEngine):
-    """A closed form, or the one for the model's name (`match_contracts` tells whether it is the same model)."""
+    """An engine for a closed form, or for the one with the model's name (check it with `match_contracts`)."""
 
     name, version, status, method = "numpy", np.__version__, "ok", "by hand"
 

@@ -1,4 +1,4 @@
-"""Whether two engines simulate the same model, line by line, before either takes a step: bodies, forces, contact."""
+"""Compare the models of two engines line by line, before any simulation: bodies, forces, contact."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -13,33 +13,33 @@ from drake_diff.exceptions import NotOfferedError
 from drake_diff.mechanics.description import GeometryContract, JointContract, PairContract
 
 Verdict = Literal["equal", "mapped", "different"]
-# Two libraries' sums over a tree differ by rounding, magnified by cancellation; a wrong number differs by far more.
+# Sums over a tree by two libraries differ by rounding, magnified by cancellation. A wrong number differs by far more.
 SAME_NUMBER: dict[Precision, float] = {"float64": 1e-9, "float32": 1e-5}
-# Below any inertia that matters: what MuJoCo gives a point mass, 2e-15 kg m^2, and rounding of zeros.
+# Below any significant inertia, above MuJoCo's inertia of a point mass (2e-15 kg m^2) and the rounding of zeros.
 NOTHING: dict[Precision, float] = {"float64": 1e-12, "float32": 1e-6}
 
-# What an engine must have of contact: where it lacks them and they are at work, it simulates another model.
+# Quantities without which an engine simulates another model if contact acts.
 MUST_HAVE = ("shapes", "poses", "contact pairs")
-# What is the engine's own whatever the model: the form of its laws.
+# Quantities that depend on the engine and not on the model.
 LAWS = (
     "integrator", "scalar type", "derivative convention", "limit law", "contact law", "solver tolerance", "reset",
 )  # fmt: skip
 
 
-# Of a quantity that is different because nobody says what it is, which neither breaks nor explains anything.
+# Reasons for "different" if a value is unknown. Such a line neither shows another model nor explains a difference.
 NOT_TOLD, FUNCTION_DOES_NOT_SAY = "the recording does not say", "a user's function does not say"
 UNKNOWN = (NOT_TOLD, FUNCTION_DOES_NOT_SAY)
 
 
 @dataclass(frozen=True, repr=False)
 class ContractLine:
-    """One thing that two engines must share, and whether they do.
+    """The comparison of one quantity of two engines.
 
     Attributes:
-        quantity: what is compared, such as "mass" or "contact law".
-        verdict: "equal", "mapped" (the same in other coordinates; `detail` says how) or "different".
-        detail: the common value, or both values, their place, and the reason where there is one.
-        reason: why an engine cannot have what the other has; empty where the model itself differs.
+        quantity: The compared quantity, such as "mass" or "contact law".
+        verdict: "equal", "mapped" (equal in other coordinates, see `detail`) or "different".
+        detail: The common value, or both values with their place and the reason, if there is one.
+        reason: Why an engine does not support the other's value, empty if the models differ.
 
     Example:
         >>> print(dd.engines.ContractLine("time step", "equal", "0.01 [s]"))
@@ -56,12 +56,12 @@ class ContractLine:
 
 
 def is_another_model(line: ContractLine, touched: bool) -> bool:
-    """Whether a line that is different makes another model, where contact is at work (`touched`) or not."""
+    """Return whether a "different" line means another model, depending on whether contact acts (`touched`)."""
     return (touched and line.quantity in MUST_HAVE) or (not line.reason and line.quantity not in LAWS)
 
 
 class Match:
-    """Lines of two engines' contracts, `one` and `two`, compared in the coarser arithmetic of both."""
+    """The comparison of two engines' contracts, `one` and `two`, with the lower of their two precisions."""
 
     def __init__(self, a: Engine, b: Engine):
         self.engines = a, b
@@ -83,11 +83,11 @@ class Match:
         return f"{self.one.engine}: {a}; {self.two.engine}: {b}"
 
     def reason(self, quantity: str) -> str:
-        """Why one of the two engines cannot have what the other has."""
+        """Return why one of the engines does not support the other's value, or ""."""
         return self.one.reasons.get(quantity) or self.two.reasons.get(quantity) or ""
 
     def different(self, quantity: str, what: str) -> ContractLine:
-        """With the reason of the engine that has one."""
+        """Return a "different" line, with the reason of the engine that has one."""
         reason = self.reason(quantity)
         detail = reason if reason in UNKNOWN else "; ".join(text for text in (what, reason) if text)
         return ContractLine(quantity, "different", detail, reason)
@@ -101,7 +101,7 @@ class Match:
         return self.numbers(quantity, (read(self.one),), (read(self.two),))
 
     def mapped(self, quantity: str, read: Callable[[EngineContract], str]) -> ContractLine:
-        """Of what each engine may have in its own way."""
+        """Compare a quantity for which each engine may use its own convention."""
         a, b = map(read, self.contracts)
         return ContractLine(quantity, "equal", a) if a == b else ContractLine(quantity, "mapped", self.both(a, b))
 
@@ -115,7 +115,7 @@ class Match:
         return ContractLine(quantity, "mapped", f"by name, from {self.both(*inside)}")
 
     def joints(self, quantity: str, read: Callable[[JointContract], tuple[Any, ...]]) -> ContractLine:
-        """By name, so that another order is reported once and not in every line."""
+        """Compare joints by name, so that a different order is reported once and not in every line."""
         others = {j.name: j for j in self.two.joints}
         lines = {
             j.name: self.numbers(quantity, read(j), read(others[j.name])) for j in self.one.joints if j.name in others
@@ -145,7 +145,7 @@ class Match:
         return ContractLine(quantity, "equal", "; ".join(f"{name} drives {a[name]}" for name in inputs))
 
     def dynamics(self) -> tuple[ContractLine, ...]:
-        """M and bias at random states in Drake's coordinates; of a closed form the parts of its forces."""
+        """Compare M and bias at random states in Drake's coordinates, or the force parts of a user's closed form."""
         kinds = [j.kind for j in self.one.joints]
         if kinds != [j.kind for j in self.two.joints]:
             why = "not comparable: the joint types differ"
@@ -229,17 +229,17 @@ JOINT_NUMBERS: dict[str, Callable[[JointContract], tuple[Any, ...]]] = {
 
 
 def match_contracts(a: Engine, b: Engine) -> tuple[ContractLine, ...]:
-    """Compare what two engines simulate, quantity by quantity, before either takes a step.
+    """Compare the models of two engines, quantity by quantity, before any simulation.
 
-    M(q) and the bias forces are compared at random states, everything else as the engines report it.
+    M(q) and the bias forces are compared at random states, all other quantities as the engines report them.
 
     Args:
-        a: one engine, from `load_engine`; its values come first in the details.
-        b: another engine on the same model.
+        a: One engine, from `load_engine`. Its values come first in the details.
+        b: Another engine on the same model.
 
     Returns:
-        A line per quantity. A line that is "different" has no reason where the model differs (another mass), and the
-        reason where the engine cannot have what the other has (another contact law).
+        A line per quantity. A "different" line has no reason if the models differ (for example in a mass). It has a
+        reason if an engine does not support the other's value (for example its contact law).
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -271,14 +271,14 @@ def match_contracts(a: Engine, b: Engine) -> tuple[ContractLine, ...]:
 
 
 def _forces_by_joint(contract: EngineContract) -> dict[str, dict[str, float]]:
-    """Of each input, the generalized force per unit by joint."""
+    """Return the generalized force per unit of each input, by joint."""
     owners = [name for j in contract.joints for name in [j.name] * (6 if j.kind == "quaternion_floating" else 1)]
     rows = list(zip(owners, contract.actuation, strict=True))
     return {name: {joint: row[i] for joint, row in rows if row[i]} for i, name in enumerate(contract.inputs)}
 
 
 def _random_state(kinds: list[str], random: np.random.Generator) -> tuple[Array, Array]:
-    """q and v of joints of these kinds, in Drake's coordinates, quaternions of norm 1."""
+    """Return random q and v for joints of these kinds, in Drake's coordinates, with quaternions of norm 1."""
     free = [kind == "quaternion_floating" for kind in kinds]
     parts = [random.standard_normal(7 if floats else 1) for floats in free]
     for coordinates in (coordinates for coordinates, floats in zip(parts, free, strict=True) if floats):
@@ -286,14 +286,14 @@ def _random_state(kinds: list[str], random: np.random.Generator) -> tuple[Array,
     return np.concatenate(parts), random.standard_normal(len(kinds) + 5 * sum(free))
 
 
-NAMED = 4  # pairs or geometries that a line names
+NAMED = 4  # maximum number of pairs or geometries that a line names
 Shared = Sequence[tuple[PairContract, PairContract]]
 
 
 def contact_lines(match: Match) -> tuple[ContractLine, ...]:
-    """Shapes, poses, pairs, friction, stiffness, dissipation, margin, and what Drake's contact does not have.
+    """Compare shapes, poses, pairs, friction, stiffness, dissipation, margin, and terms that Drake does not have.
 
-    A number that differs has no reason: it is another model. What an engine has no number for has its reason.
+    A different number has no reason, as the models differ. A number that an engine lacks has the engine's reason.
     """
     same = same_geometries(match)
     a = {frozenset(same.get(name, name) for name in pair.names): pair for pair in match.one.contacts}
@@ -311,9 +311,9 @@ def contact_lines(match: Match) -> tuple[ContractLine, ...]:
 
 
 def same_geometries(match: Match) -> dict[str, str]:
-    """The name in the second engine of each geometry of the first that is there: by name, else by place, else nearest.
+    """Map the geometries of the first engine to those of the second: by name, else by pose, else the nearest.
 
-    A name is taken without what Drake puts around it: model::name#number.
+    Drake's additions to a name (model::name#number) are ignored if the full names differ.
     """
     a, b = (list(c.geometries) for c in match.contracts)
     same: dict[str, str] = {}
@@ -346,7 +346,7 @@ def _same_pose(match: Match, x: GeometryContract, y: GeometryContract) -> bool:
 
 
 def _geometries(match: Match, same: Mapping[str, str]) -> tuple[ContractLine, ContractLine]:
-    """Of those that are in both, and may touch something in one."""
+    """Compare shapes and poses of the geometries that are in both engines and may collide in at least one."""
     a, b = ({g.name: g for g in c.geometries} for c in match.contracts)
     touching = [{name for pair in c.contacts for name in pair.names} for c in match.contracts]
     both = [(a[x], b[y]) for x, y in same.items() if x in touching[0] or y in touching[1]]
@@ -366,7 +366,7 @@ def _pose(g: GeometryContract) -> str:
 
 
 def _line(match: Match, quantity: str, wrong: list[str], detail: str) -> ContractLine:
-    """What is wrong without a reason to excuse it; the engine's own word on it is told all the same."""
+    """Return a line without `reason` for different values. The engine's remark is included in the detail."""
     if not wrong:
         return ContractLine(quantity, "equal", detail)
     remark = match.reason(quantity)
@@ -392,7 +392,7 @@ def _pairs(
 def _numbers(
     match: Match, quantity: str, shared: Shared, read: Callable[[PairContract], float | None], unit: str
 ) -> ContractLine:
-    """A value that neither gives is the same default only where the contact law is the same."""
+    """Compare a value of the pairs. A value missing in both engines is equal only if the contact laws are equal."""
     wrong, absent = [], []
     for x, y in shared:
         p, q = read(x), read(y)
@@ -408,7 +408,7 @@ def _numbers(
 
 
 def _dissipation(match: Match, shared: Shared) -> ContractLine:
-    """Hunt and Crossley's where both have it, and the relaxation time, or the critical one of an engine's own law."""
+    """Compare Hunt-Crossley dissipation if both have it, and relaxation times, or an engine's critical one."""
     quantity = "dissipation"
     details: dict[str, list[str]] = {"wrong": [], "absent": [], "mapped": []}
     for x, y in shared:

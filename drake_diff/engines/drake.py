@@ -1,4 +1,4 @@
-"""Drake itself as an engine: contact approximation and source of the derivatives chosen once."""
+"""Drake itself as an engine, with a fixed contact approximation and a fixed source of the derivatives."""
 
 from functools import cached_property
 from importlib.metadata import version
@@ -18,7 +18,7 @@ from drake_diff.model.step import set_state, step
 
 
 class DrakeEngine:
-    """`contact` is sap, similar or lagged (None: the model's own), `method` one of `differentiate_step`'s."""
+    """An engine that uses Drake, with `contact` sap, similar or lagged (default: the model's) and a step `method`."""
 
     version, status = version("drake"), "ok"
 
@@ -31,7 +31,7 @@ class DrakeEngine:
 
     @cached_property
     def description(self) -> Description:
-        """What the contract is read from, with all joints; ModelError where the plant has what no engine is given."""
+        """The description for the contract, with all joints. Raises ModelError for unsupported plant elements."""
         return describe(self.model.whole)
 
     def step(self, x: ArrayLike, u: ArrayLike) -> Array:

@@ -1,4 +1,4 @@
-"""A user's own equations of motion as an engine, and each part of their forces beside that of another engine."""
+"""A user's equations of motion as an engine, and the comparison of each part of their forces with another engine."""
 
 from __future__ import annotations
 
@@ -25,29 +25,29 @@ from drake_diff.model.tangent import sample_states
 
 EXPLICIT, RK4 = "semi-implicit Euler, joint damping explicit, q' = q + h N(q) v'", "Runge-Kutta of order 4"
 INTEGRATORS: Mapping[str, str] = {"drake": DRAKES_STEP, "semi-implicit Euler": EXPLICIT, "RK4": RK4}
-# What a function of accelerations says nothing of, by quantity of the match: its forces are compared in place of them.
+# Quantities of the match that a function of accelerations does not define. Its forces are compared instead.
 NOT_SAID = (
     "frames", "mass", "center of mass", "inertia", "damping", "armature", "springs", "position limits", "gravity",
     "actuator mapping",
 )  # fmt: skip
 UNSAID = float("nan")
 PARTS = ("forces at rest", "velocity products", "damping forces", "forces of the inputs")
-ALONE = 1e-6  # of a part: what a factor must leave of it to be the whole difference
-# What rounding in M(q) a makes of a force, by the condition number of M.
+ALONE = 1e-6  # relative remainder of a part below which a factor explains the whole difference
+# Relative rounding of a force M(q) a, times the condition number of M.
 ROUNDING = 1e-14
 
 
 @dataclass(frozen=True)
 class UserFunction:
-    """What a record can hold of a function: its name, the hash of its source, and the parameters it was given."""
+    """The recorded description of a function: its name, the hash of its source, and its parameters."""
 
     name: str
-    sha256: str | None  # of the source, None where Python cannot show it
+    sha256: str | None  # of the source, None if the source is not available
     parameters: Mapping[str, float]
 
 
 class Parts(NamedTuple):
-    """Generalized forces (nv,) of one engine at one state: those named in PARTS."""
+    """The generalized forces (nv,) of one engine at one state, as listed in PARTS."""
 
     rest: Array
     products: Array
@@ -56,31 +56,31 @@ class Parts(NamedTuple):
 
 
 class ClosedForm(Arguments):
-    """Your own equations of motion in NumPy as an engine: they stand beside Drake in `dd.compare`.
+    """A user's equations of motion in NumPy as an engine, for a comparison with Drake by `dd.compare`.
 
-    The function gives accelerations. `compare` takes it apart at random states into forces at rest (gravity, springs),
-    velocity products, damping and forces of the inputs, and compares each with Drake's by joint, taking Drake's M(q):
-    a wrong inertia therefore shows in every part. A part that differs makes it another model, and the detail names
-    the joint and, where there is one, the factor. Contact and joint limits are no parts of it.
+    The function returns accelerations. At random states, `compare` separates them into forces at rest (gravity,
+    springs), velocity products, damping and forces of the inputs, and compares each part with Drake's by joint. The
+    forces are computed with Drake's M(q), so that a wrong inertia shows in every part. If a part differs, the models
+    differ, and the detail names the joint and, if there is one, the factor. Contact and joint limits are not compared.
 
-    The inputs are cut at the model's effort limits before the function sees them. In a record the function is known
-    by its name and the hash of its source alone; what it uses from outside is not in that hash.
+    The inputs are clipped at the model's effort limits before the call. A record identifies the function only by its
+    name and the hash of its source, which does not cover objects outside the function.
 
     Args:
-        model: the model whose coordinates and time step it has.
+        model: The model that defines the coordinates and the time step.
         acceleration: (q (nq,), v (nv,), u (nu,)) -> dv/dt (nv,), or with `parameters` (q, v, u, parameters). SI units.
             A free body has Drake's coordinates: quaternion w x y z and position; angular and linear velocity in world.
-        name: what it is called in results.
-        parameters: numbers by name that the function takes, for the record.
-        integrator: "drake" (semi-implicit Euler, with what is linear and odd in v taken at the next velocity, as Drake
-            takes joint damping), "semi-implicit Euler" (v' = v + h a) or "RK4".
-        contact: where the function has contact of its own, its law in words. A step of it in contact is then
-            the same as Drake's, or unexplained: nothing is known of its friction and stiffness.
+        name: The name in results.
+        parameters: Named numbers that are passed to the function and recorded.
+        integrator: "drake" (semi-implicit Euler, in which forces that are linear and odd in v use the next velocity, as
+            Drake's joint damping does), "semi-implicit Euler" (v' = v + h a) or "RK4".
+        contact: A description of the contact law, if the function includes contact. A step in contact is then either
+            the same as Drake's or unexplained, as friction and stiffness are unknown.
 
     Raises:
-        UnknownNameError: there is no such integrator.
-        InputError: a function that fails, or that does not give the same twice.
-        ShapeError, NonFiniteError: the function gives another shape, or NaN or infinity, at a state of the model.
+        UnknownNameError: There is no such integrator.
+        InputError: The function fails, or returns different values for the same arguments.
+        ShapeError, NonFiniteError: The function returns another shape, NaN or infinity at a state of the model.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -123,7 +123,7 @@ class ClosedForm(Arguments):
         self._try(model)
 
     def _try(self, model: Model) -> None:
-        """The function at a state, twice: what is wrong with it is said before anything runs."""
+        """Call the function twice at a state, to report errors early."""
         sample = sample_states(model, 1)[0]
         expected = "a function of q, v and u alone"
         try:
@@ -134,19 +134,19 @@ class ClosedForm(Arguments):
             raise InputError("acceleration", got=f"{first} and then {second} for the same arguments", expected=expected)
 
     def acceleration(self, q: ArrayLike, v: ArrayLike, u: ArrayLike) -> Array:
-        """(nv,) dv/dt in Drake's order.
+        """Compute dv/dt (nv,) in Drake's order.
 
         Args:
-            q: (nq,) positions.
-            v: (nv,) velocities.
-            u: (nu,) inputs, which are cut at their limits.
+            q: (nq,) Positions.
+            v: (nv,) Velocities.
+            u: (nu,) Inputs, which are clipped at their limits.
 
         Returns:
-            (nv,) the accelerations.
+            (nv,) The accelerations.
 
         Raises:
-            ShapeError, NonFiniteError: an argument, or what the function gives, has another shape or is not finite.
-            SimulationError: the function fails there.
+            ShapeError, NonFiniteError: An argument or the function's result has another shape or is not finite.
+            SimulationError: The function fails.
         """
         q, v = self._motion(q, v)
         u = np.clip(finite_array("u", u, (self.nu,)), -self._limits, self._limits)
@@ -157,7 +157,7 @@ class ClosedForm(Arguments):
         return finite_array(f"{self.name}: acceleration at q = {q}, v = {v}", given, (self.nv,))
 
     def step(self, x: ArrayLike, u: ArrayLike) -> Array:
-        """The state (nx,) one time step after `x` (nx,) under `u` (nu,)."""
+        """Compute the state (nx,) one time step after `x` (nx,) under `u` (nu,)."""
         x, u = self._point(x, u)
         q, v, h = x[: self.nq], x[self.nq :], self.time_step
         try:
@@ -187,27 +187,27 @@ class ClosedForm(Arguments):
         return np.asarray(x + h / 6 * (a + 2 * b + 2 * c + rate(x + h * c)))
 
     def _damping_by_velocity(self, q: Array) -> Array:
-        """(nv, nv): the odd part of the acceleration at unit velocities, in which velocity products, even, are not."""
+        """Return the odd part (nv, nv) of the acceleration at unit velocities. Velocity products are even."""
         u = np.zeros(self.nu)
         columns = [(self.acceleration(q, e, u) - self.acceleration(q, -e, u)) / 2 for e in np.eye(self.nv)]
         return np.array(columns).reshape(self.nv, self.nv).T
 
     def parts(self, M: Array, q: Array, v: Array, u: Array) -> Parts:
-        """The forces that `M` (nv, nv) makes of the accelerations."""
+        """Compute the parts of the forces from the accelerations and `M` (nv, nv)."""
         still, no_u = np.zeros(self.nv), np.zeros(self.nu)
         rest, ahead, back = (self.acceleration(q, w, no_u) for w in (still, v, -v))
         accelerations = (rest, (ahead + back) / 2 - rest, (ahead - back) / 2, self.acceleration(q, v, u) - ahead)
         return Parts(*(M @ a for a in accelerations))
 
     def terms(self, M: Array, x: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Bias, B u and joint damping, (nv,) each, that make these accelerations of `M` (nv, nv)."""
+        """Return bias, B u and joint damping, (nv,) each, that yield these accelerations with `M` (nv, nv)."""
         q, v = x[: self.nq], x[self.nq :]
         damping = -np.diag(M @ self._damping_by_velocity(q))
         inputs = self.parts(M, q, v, u).inputs
         return inputs - damping * v - M @ self.acceleration(q, v, u), inputs, damping
 
     def part_lines(self, match: Match, states: Sequence[tuple[Array, Array]]) -> tuple[ContractLine, ...]:
-        """A line per part of the forces, at `states` (q, v); of two closed forms, and of one without M(q), none."""
+        """Compare each part of the forces at `states` (q, v). This requires that the other engine offers M(q)."""
         theirs = next(engine for engine in match.engines if engine is not self)
         random, contract = np.random.default_rng(1), theirs.contract
         limit = np.minimum(np.array(contract.effort_limits), 1.0)
@@ -235,23 +235,23 @@ class ClosedForm(Arguments):
         return tuple(lines)
 
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
-        """NotOfferedError: differences of its steps are taken where a Jacobian is compared."""
+        """Raise NotOfferedError. Comparisons of Jacobians use differences of the steps."""
         raise self._not_offered("derivatives")
 
     def energy(self, x: ArrayLike) -> float:
-        """NotOfferedError."""
+        """Raise NotOfferedError."""
         raise self._not_offered("energy")
 
     def contact_depth(self, x: ArrayLike) -> float:
-        """NotOfferedError."""
+        """Raise NotOfferedError."""
         raise self._not_offered("overlap")
 
     def mass_matrix(self, q: ArrayLike) -> Array:
-        """NotOfferedError."""
+        """Raise NotOfferedError."""
         raise self._not_offered("M(q) alone")
 
     def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
-        """NotOfferedError."""
+        """Raise NotOfferedError."""
         raise self._not_offered("forces alone")
 
     def _not_offered(self, what: str) -> NotOfferedError:
@@ -259,7 +259,7 @@ class ClosedForm(Arguments):
 
     @property
     def contract(self) -> EngineContract:
-        """The model's coordinates, limits of inputs and time step; of the rest a function says nothing."""
+        """The model's coordinates, effort limits and time step. A function does not define the other quantities."""
         unsaid: dict[str, Any] = {
             "axis": (UNSAID,) * 3, "anchor": (UNSAID,) * 3, "center_of_mass": (UNSAID,) * 3, "inertia": (UNSAID,) * 6,
             **dict.fromkeys(("mass", "damping", "armature", "stiffness", "rest"), UNSAID),
@@ -284,7 +284,7 @@ class ClosedForm(Arguments):
 
 
 def _parts_of(engine: Engine, q: Array, v: Array, u: Array) -> Parts:
-    """Of an engine with terms of its own; NotOfferedError for one without."""
+    """Compute the parts of the forces from an engine's terms. Raises NotOfferedError if it has none."""
     contract = engine.contract
     rest, limit = -engine.bias(q, np.zeros(len(v))), np.array(contract.effort_limits)
     damping = [[0.0] * 6 if j.kind == "quaternion_floating" else [j.damping] for j in contract.joints]
@@ -294,7 +294,7 @@ def _parts_of(engine: Engine, q: Array, v: Array, u: Array) -> Parts:
 
 
 def _how_different(wanted: Array, given: Array) -> str:
-    """How one joint's force over the states differs from what it is to be."""
+    """Describe how one joint's force over the states differs from the expected force."""
     size, gap = float(wanted @ wanted), float(np.abs(given - wanted).max())
     at_most = f"off by up to {gap:.4g} of {np.abs(wanted).max():.4g}"
     if not size:
@@ -310,9 +310,9 @@ def _name_of(function: Any) -> str:
 
 
 def _source_hash(function: Any) -> str | None:
-    """Of the function's source; of an object that is called, of its class."""
+    """Return the hash of the source of a function, or of the class of a callable object."""
     shown = function if inspect.isroutine(function) else type(function)
     try:
         return sha256(inspect.getsource(shown).encode()).hexdigest()
-    except (OSError, TypeError, SyntaxError, TokenError):  # the file is not there, or holds other text
+    except (OSError, TypeError, SyntaxError, TokenError):  # the file is missing or has changed
         return None

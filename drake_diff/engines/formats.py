@@ -1,10 +1,10 @@
-"""Drake's plant as URDF, MJCF and SDF: the same bodies, joints, motors and shapes, numbers to the last digit.
+"""Write Drake's plant as URDF, MJCF and SDF: the same bodies, joints, motors and shapes, with all digits.
 
-In URDF and SDF each link's frame stands at its joint and parallel to the world where q = 0: no joint is turned against
-its parent, so nothing goes through roll, pitch and yaw but geometry. URDF has no springs; friction and softness of
-contact are written in the elements that Drake reads. SDF drives joints, and has no names of actuators: the input of a
-joint has the joint's name, and an effort of 0 means that nothing drives it. Bullet gets each link in the frame of its
-joint, with its inertia by the principal axes.
+In URDF and SDF, each link's frame is at its joint and parallel to the world at q = 0. No joint is rotated relative to
+its parent, so that only geometry uses roll, pitch and yaw. URDF has no springs. Friction and compliance of contact are
+written in the elements that Drake reads. SDF drives joints and has no actuator names. The input of a joint has the
+joint's name, and an effort of 0 means that the joint has no actuator. For Bullet, each link is written in the frame of
+its joint, with principal moments of inertia.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,19 +19,19 @@ from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.coordinates import rotation
 from drake_diff.mechanics.description import Description, Geometry, Link, RigidLink
 
-# Drake's own elements, in URDF and SDF, of what a side of a contact is made.
+# Drake's elements, in URDF and SDF, for the contact properties of a geometry.
 PROXIMITY = {
     "friction": ("mu_dynamic", "mu_static"), "stiffness": ("point_contact_stiffness",),
     "dissipation": ("hunt_crossley_dissipation",), "relaxation_time": ("relaxation_time",),
 }  # fmt: skip
 KINDS = {"weld": "fixed", "prismatic": "prismatic", "quaternion_floating": "floating"}
-SHAPES = ("Sphere", "Box", "Cylinder")  # URDF's own; Bullet has capsules too
+SHAPES = ("Sphere", "Box", "Cylinder")  # shapes of URDF; Bullet also reads capsules
 
 
 def urdf(description: Description) -> str:
-    """The URDF text, with a link "world" that free bodies float on.
+    """Return the URDF text, with a link "world" as the parent of free bodies.
 
-    A motor's torque limit is its joint's effort; geometries that are no sphere, box or cylinder are left out.
+    A motor's torque limit is its joint's effort. Geometries other than spheres, boxes and cylinders are left out.
     """
     root, elements = _tree(description, "world", description.links)
     zero = AtZero(description)
@@ -48,22 +48,22 @@ def urdf(description: Description) -> str:
         driven = SubElement(transmission, "joint", name=joint)
         SubElement(driven, "hardwareInterface").text = "EffortJointInterface"
         motor = SubElement(transmission, "actuator", name=name)
-        # The first motor of a joint has its whole armature.
+        # The first motor of a joint gets the joint's whole armature.
         SubElement(motor, "drake:rotor_inertia", value=row(armature.pop(joint, 0.0)))
         SubElement(motor, "drake:gear_ratio", value="1.0")
     return xml_text(root)
 
 
 def inertial_urdf(description: Description, base: str) -> str:
-    """The URDF text, without geometry and motors, of the tree on the link `base`, a free body or "world"."""
+    """Return the URDF text, without geometry and motors, of the tree on the link `base`, a free body or "world"."""
     return xml_text(_tree(description, base, carried_by(description, base))[0])
 
 
 def bullet_urdf(links: Sequence[tuple[int, RigidLink]], geometries: Sequence[tuple[int, Geometry]]) -> str:
-    """One tree for Bullet: links, each with its place (by which geometries and children name it).
+    """Return the URDF text of one tree for Bullet. Each link has an index, to which geometries and children refer.
 
-    The first link may be a free body; a tree that hangs on the world gets a massless base "world". Raises ModelError
-    for a half space on a link, which Bullet has on the world alone.
+    The first link may be a free body. A tree on the world gets a massless base "world". Raises ModelError for a half
+    space on a link, which Bullet supports only on the world.
     """
     root = Element("robot", name="tree")
     if not links[0][1].free:
@@ -87,7 +87,7 @@ def bullet_urdf(links: Sequence[tuple[int, RigidLink]], geometries: Sequence[tup
 
 
 def carried_by(description: Description, base: str) -> tuple[Link, ...]:
-    """The links that stand on `base`, a free body or "world", free bodies not among them."""
+    """Return the links whose tree has the root `base`, a free body or "world", without free bodies."""
     bodies, links = {base}, []
     for link in description.links:
         if link.parent in bodies and link.kind != "quaternion_floating":
@@ -97,7 +97,7 @@ def carried_by(description: Description, base: str) -> tuple[Link, ...]:
 
 
 class AtZero:
-    """Where `bodies` and the `frames` of links are in the world where q = 0: frames at the joints, parallel to it."""
+    """Poses of `bodies` and of the `frames` of links in the world at q = 0. The frames are parallel to the world."""
 
     def __init__(self, description: Description):
         self.bodies, self.frames = {"world": RigidTransform()}, {"world": RigidTransform()}
@@ -107,27 +107,27 @@ class AtZero:
             self.frames[link.body] = RigidTransform(pose.translation())
 
     def in_frame(self, body: str) -> RigidTransform:
-        """The pose of a body in its link's frame."""
+        """Return the pose of a body in its link's frame."""
         return self.frames[body].inverse() @ self.bodies[body]
 
     def in_parent(self, link: Link) -> RigidTransform:
-        """The pose of a link's frame in that of its parent."""
+        """Return the pose of a link's frame in its parent's frame."""
         return self.frames[link.parent].inverse() @ self.frames[link.body]
 
     def inertia(self, link: Link) -> tuple[Array, Array]:
-        """Centre of mass (3,) and inertia (3, 3) about it, in the link's frame."""
+        """Return the centre of mass (3,) and the inertia (3, 3) about it, in the link's frame."""
         X = self.in_frame(link.body)
         R = X.rotation().matrix()
         return np.asarray(X @ link.center_of_mass), R @ link.inertia @ R.T
 
     def axis(self, link: Link) -> Array:
-        """(3,) of its joint, of norm 1."""
+        """Return the axis (3,) of the link's joint, with norm 1."""
         turn = (self.bodies[link.parent] @ link.on_parent).rotation().matrix()
         return np.asarray(turn @ link.axis / np.linalg.norm(link.axis))
 
 
 def _tree(description: Description, base: str, links: tuple[Link, ...]) -> tuple[Element, dict[str, Element]]:
-    """The document of `links` on the link `base`, and its links."""
+    """Return the document of `links` on the link `base`, and the elements of its links."""
     root = Element("robot", {"name": "from_drake", "xmlns:drake": "http://drake.mit.edu"})
     elements = {name: SubElement(root, "link", name=name) for name in (base, *(x.body for x in links))}
     zero = AtZero(description)
@@ -170,7 +170,7 @@ def _add_freedom(joint: Element, axis: Array, damping: float, effort: float, sid
 
 
 def _add_inertial(body: Element, mass: float, center: RigidTransform, inertia: Array) -> None:
-    """`inertia` (3, 3) is about `center` and in its axes."""
+    """Add mass, centre of mass and `inertia` (3, 3), about and in the axes of `center`."""
     inertial = SubElement(body, "inertial")
     _add_origin(inertial, center)
     SubElement(inertial, "mass", value=row(mass))
@@ -193,23 +193,23 @@ def _add_origin(element: Element, X: RigidTransform) -> None:
     SubElement(element, "origin", xyz=row(X.translation()), rpy=row(rpy))
 
 
-# MuJoCo refuses a mass [kg] or moment of inertia [kg m^2] of at most 1e-15: massless links and point masses get this.
+# Mass [kg] and moment of inertia [kg m^2] of massless links and point masses: MuJoCo does not accept 1e-15 or less.
 SMALLEST = 2e-15
-# Constant impedance of contacts: near enough to rigid for friction to hold, far enough for a spring to be one.
+# Constant impedance of contacts: rigid enough for friction to hold, soft enough for a spring-like force.
 IMPEDANCE = 0.9
-FRICTION_IMPEDANCE_RATIO = 100.0  # so that what sticks creeps little
-STIFFEST = 0.9999  # MuJoCo's largest impedance: joints that follow others give way by a ten-thousandth
+FRICTION_IMPEDANCE_RATIO = 100.0  # reduces creep of sticking contacts
+STIFFEST = 0.9999  # MuJoCo's largest impedance, with which joints that follow others yield by 1e-4
 
 
 def mjcf(description: Description, time_step: float, inverse_masses: Mapping[str, float] | None = None) -> str:
-    """The MJCF text, whose contacts have Drake's stiffness where they rest (see `contacts`) and are damped critically.
+    """Return the MJCF text. Its contacts have Drake's stiffness at rest (see `mujoco_contract`) and critical damping.
 
-    `inverse_masses` are what MuJoCo takes for 1 / mass of each body, which only it knows; `generated` asks it. Without
-    them contacts have MuJoCo's own stiffness, which is another model's. Geometries that are no sphere, box, cylinder,
-    capsule, ellipsoid or half space are left out, with their pairs.
+    `inverse_masses` are MuJoCo's values of 1 / mass for each body, which `generated` reads from a compiled model.
+    Without them, contacts have MuJoCo's default stiffness and the models differ. Geometries other than spheres, boxes,
+    cylinders, capsules, ellipsoids and half spaces are left out, with their pairs.
 
     Raises:
-        ModelError: a free body whose joint's frames are not its own and the world's.
+        ModelError: The frames of a free body's joint are not those of the body and the world.
     """
     root = Element("mujoco", model="from_drake")
     smallest = row(SMALLEST)
@@ -296,17 +296,17 @@ def _add_mjcf_geometry(body: Element, geometry: Geometry) -> bool:
 
 
 SDF_KINDS = {"weld": "fixed", "prismatic": "prismatic", "revolute": "revolute"}
-GROUND = "fixed_to_the_world"  # the model of the world's own geometry
+GROUND = "fixed_to_the_world"  # name of the model with the world's geometries
 
 
 def sdf(description: Description, time_step: float) -> str:
-    """The SDF text. Geometries that are no sphere, box, cylinder, capsule, ellipsoid or half space are left out.
+    """Return the SDF text, without geometries other than spheres, boxes, cylinders, capsules, ellipsoids, half spaces.
 
-    Friction and softness of contact are written for each geometry as Drake reads them, and friction as others do
-    where all pairs have the same: these combine that of two geometries otherwise. Joints that follow others are written
-    as Drake reads them, and as SDF has them.
+    Friction and compliance of contact are written for each geometry in Drake's elements. If all pairs have the same
+    friction, it is also written in SDF's elements, as other simulators combine the friction of two geometries
+    differently. Mimic joints are written in Drake's elements and in SDF's.
     """
-    version = "1.11" if description.followers else "1.9"  # the first that has <mimic>
+    version = "1.11" if description.followers else "1.9"  # 1.11 is the first version with <mimic>
     root = Element("sdf", {"version": version, "xmlns:drake": "http://drake.mit.edu"})
     world = SubElement(root, "world", name="from_drake")
     SubElement(SubElement(world, "physics", name="step", type="ode"), "max_step_size").text = row(time_step)
@@ -329,7 +329,7 @@ def sdf(description: Description, time_step: float) -> str:
 
 
 def collision_name(geometry: str) -> str:
-    """SDF keeps :: for itself."""
+    """Replace "::", which is reserved in SDF."""
     return geometry.replace("::", "/")
 
 

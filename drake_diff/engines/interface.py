@@ -1,4 +1,4 @@
-"""What every engine offers, and what the engines here have in common: arguments, Euler's step, the plant's numbers."""
+"""The protocol of engines, and base classes for the engines of this package: arguments, Euler step, plant data."""
 
 import os
 import sys
@@ -38,17 +38,17 @@ Precision = Literal["float64", "float32"]
 DRAKES_STEP = "semi-implicit Euler, joint damping implicit, q' = q + h N(q) v'"
 DRAKES_STATE = "quaternion w x y z; velocity of a free body angular then linear, both in world"
 EACH_CALL = "each step starts from x and u alone"
-UNLIMITED = 1e10  # written for "no limit": readers take a missing limit for 0, and not all can read inf
+UNLIMITED = 1e10  # written for "no limit", as readers take a missing limit for 0, and some cannot read inf
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class EngineContract:
-    """What an engine uses, read out of the engine itself; SI units, in the order of the x and u that it takes."""
+    """The properties that an engine uses, read from the engine itself, in SI units and in the order of x and u."""
 
     engine: str
     joints: tuple[JointContract, ...]
-    native_order: tuple[str, ...]  # of the joints inside the engine
-    state: str = DRAKES_STATE  # how a free body's state is held inside the engine
+    native_order: tuple[str, ...]  # order of the joints inside the engine
+    state: str = DRAKES_STATE  # state of a free body inside the engine
     inputs: tuple[str, ...]
     actuation: tuple[tuple[float, ...], ...]  # (nv, nu): generalized force per unit of input, gears included
     effort_limits: tuple[float, ...]  # (nu,)
@@ -57,13 +57,13 @@ class EngineContract:
     gravity: tuple[float, ...]
     contact_law: str = "none"
     geometries: tuple[GeometryContract, ...] = ()
-    contacts: tuple[PairContract, ...] = ()  # the names are those of `geometries`
-    solver_tolerance: float | None = None  # relative; None where nothing is solved iteratively
+    contacts: tuple[PairContract, ...] = ()  # by names of `geometries`
+    solver_tolerance: float | None = None  # relative; None without an iterative solver
     limit_law: str = "none"
     reset: str = EACH_CALL
     precision: Precision = "float64"  # of the engine's arithmetic
-    derivatives: str = "none"  # by what they are taken in the engine, before they are mapped to Drake's x and u
-    # By quantity of the match: why this engine cannot have what Drake has.
+    derivatives: str = "none"  # variables of the derivatives in the engine, before the map to Drake's x and u
+    # By quantity of the match: the reason why this engine differs from Drake.
     reasons: Mapping[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -75,7 +75,7 @@ class EngineContract:
 
 
 class StepJacobian(NamedTuple):
-    """A (nx, nx) and B (nx, nu) of one step in Drake's coordinates, and where they come from."""
+    """A (nx, nx) and B (nx, nu) of one step in Drake's coordinates, and the method that computed them."""
 
     A: Array
     B: Array
@@ -86,16 +86,16 @@ class StepJacobian(NamedTuple):
 
 
 class Engine(Protocol):
-    """One model in one simulator, in Drake's coordinates: what `load_engine` returns and `dd.compare` takes.
+    """A model in a simulator, in Drake's coordinates, as returned by `load_engine` and accepted by `dd.compare`.
 
     `x = [q; v]` and `u` have Drake's order, quaternions are (w, x, y, z), and velocities of free bodies are (angular,
-    linear) in the world frame. Every result depends on the arguments alone, not on earlier calls. An engine of your
-    own needs no base class: an object with these names will do.
+    linear) in the world frame. Every result depends on the arguments alone, not on earlier calls. A custom engine needs
+    no base class. It only needs these attributes and methods.
 
     Raises:
-        ShapeError, NonFiniteError: an argument has the wrong shape or is not finite.
-        NotOfferedError: the engine does not compute this; the message says why.
-        SimulationError: the engine cannot take the step.
+        ShapeError, NonFiniteError: An argument has the wrong shape or is not finite.
+        NotOfferedError: The engine does not compute this value. The message gives the reason.
+        SimulationError: The engine cannot take the step.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -106,7 +106,7 @@ class Engine(Protocol):
 
     @property
     def name(self) -> str:
-        """The engine's name, with the options that were chosen."""
+        """The engine's name, with the chosen options."""
 
     @property
     def version(self) -> str:
@@ -114,55 +114,55 @@ class Engine(Protocol):
 
     @property
     def contract(self) -> EngineContract:
-        """What the engine uses, read back from it."""
+        """The properties that the engine uses, read from the engine."""
 
     @property
     def status(self) -> str:
-        """How the last step went: "ok", or what the engine's solver said."""
+        """The status of the last step: "ok", or the message of the engine's solver."""
 
     def step(self, x: ArrayLike, u: ArrayLike) -> Array:
-        """The state (nx,) one time step after `x` (nx,) under `u` (nu,)."""
+        """Compute the state (nx,) one time step after `x` (nx,) under `u` (nu,)."""
 
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
-        """The Jacobians of `step`."""
+        """Compute the Jacobians of `step`."""
 
     def energy(self, x: ArrayLike) -> float:
-        """Kinetic and potential energy [J]; potential energy is 0 with all mass at height 0 and springs at rest."""
+        """Return the total energy [J]. The potential energy is 0 with all mass at height 0 and springs at rest."""
 
     def contact_depth(self, x: ArrayLike) -> float:
-        """The deepest overlap [m], 0 where nothing touches or the engine has no contact."""
+        """Return the largest penetration depth [m], 0 without contact or if the engine does not support contact."""
 
     def mass_matrix(self, q: ArrayLike) -> Array:
-        """(nv, nv), armature included."""
+        """Return the mass matrix (nv, nv), including armature."""
 
     def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
-        """(nv,) in M dv/dt + bias = B u - damping v: velocity products less gravity and springs."""
+        """Return bias (nv,) in M dv/dt + bias = B u - damping v: velocity products minus gravity and springs."""
 
 
 def floats(values: Any) -> tuple[float, ...]:
-    """A vector as a contract holds it."""
+    """Convert a vector to the type that contracts use."""
     return tuple(float(value) for value in np.ravel(values))
 
 
 def float_rows(matrix: Any) -> tuple[tuple[float, ...], ...]:
-    """A matrix as a contract holds it."""
+    """Convert a matrix to the type that contracts use."""
     return tuple(floats(row) for row in matrix)
 
 
 def limit(value: float) -> float:
-    """A limit that was read back, infinite where UNLIMITED was written for it."""
+    """Convert a limit read from an engine, with infinity for values from UNLIMITED on."""
     return float(value) if abs(value) < UNLIMITED else float(np.copysign(np.inf, value))
 
 
 class Arguments:
-    """Checks what an engine is asked about: ShapeError or NonFiniteError."""
+    """Checks of an engine's arguments, which raise ShapeError or NonFiniteError."""
 
     nq: int
     nv: int
     nu: int
 
     def _state(self, x: ArrayLike) -> tuple[Array, Array, Array]:
-        """x (nx,), q (nq,) and v (nv,)."""
+        """Return x (nx,), q (nq,) and v (nv,)."""
         x = finite_array("x", x, (self.nq + self.nv,))
         return x, x[: self.nq], x[self.nq :]
 
@@ -177,16 +177,16 @@ class Arguments:
 
 
 class EulerEngine(Arguments):
-    """An engine whose M and bias are put into Drake's Euler step, without contact unless it says otherwise."""
+    """An engine that computes Drake's Euler step from its own M and bias, by default without contact."""
 
     coordinates: Coordinates
     time_step: float
-    damping: Array  # (nv,) of the joints, implicit
-    method: str  # by which its derivatives are taken
+    damping: Array  # (nv,) joint damping, implicit
+    method: str  # name of the method of its derivatives
 
     def step(self, x: ArrayLike, u: ArrayLike) -> Array:
         x, u = self._point(x, u)
-        with np.errstate(over="ignore", invalid="ignore"):  # what runs away is said below
+        with np.errstate(over="ignore", invalid="ignore"):  # reported as SimulationError below
             x_next = euler_step(self.coordinates, self.time_step, x, self._acceleration(x, u))
         if not np.all(np.isfinite(x_next)):
             raise SimulationError(f"the step leads to {x_next}, which is not finite, from x = {x}, u = {u}")
@@ -204,13 +204,13 @@ class EulerEngine(Arguments):
         return 0.0
 
     def _acceleration(self, x: Array, u: Array) -> Array:
-        """(nv,) (v' - v) / h of the step."""
+        """Return the acceleration (v' - v) / h (nv,) of the step."""
         q, v = x[: self.nq], x[self.nq :]
         force = self._effort(u) - self.bias(q, v)
         return euler_acceleration(self.mass_matrix(q), self.damping, self.time_step, v, force)
 
     def _acceleration_derivative(self, x: Array, u: Array) -> tuple[Array, Array]:
-        """The acceleration, and its derivative (nv, 2 nv + nu) by small motion, by v and by u."""
+        """Return the acceleration and its derivative (nv, 2 nv + nu) with respect to small motion, v and u."""
         q, v, acceleration, D = x[: self.nq], x[self.nq :], self._acceleration(x, u), np.diag(self.damping)
         by_motion, by_v = self._needed_derivative(q, v, acceleration)
         residual = np.hstack([by_motion, by_v + D, -self._effort_by_input(u)])
@@ -218,27 +218,27 @@ class EulerEngine(Arguments):
 
     @abstractmethod
     def mass_matrix(self, q: ArrayLike) -> Array:
-        """(nv, nv)."""
+        """Return the mass matrix (nv, nv)."""
 
     @abstractmethod
     def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
-        """(nv,)."""
+        """Return the bias forces (nv,)."""
 
     @abstractmethod
     def _effort(self, u: Array) -> Array:
-        """(nv,) B u, cut at the effort limits."""
+        """Return B u (nv,), clipped at the effort limits."""
 
     @abstractmethod
     def _effort_by_input(self, u: Array) -> Array:
-        """(nv, nu) the derivative of `_effort`."""
+        """Return the derivative (nv, nu) of `_effort`."""
 
     @abstractmethod
     def _needed_derivative(self, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
-        """(nv, nv) each, of the force M a + bias that `a` (nv,) needs: by small motion and by v."""
+        """Return the derivatives (nv, nv) of the force M a + bias with respect to small motion and to v."""
 
 
 class PlantEngine(Arguments):
-    """An engine built from the description of Drake's plant, whose numbers it holds by Drake's velocities."""
+    """An engine built from the description of Drake's plant, with the joint data in the order of Drake's v."""
 
     def __init__(self, model: Model):
         self.description = describe(model)
@@ -251,31 +251,31 @@ class PlantEngine(Arguments):
         self.actuation, self.limits = self.description.actuation, self.description.effort_limits
 
     def _effort(self, u: Array) -> Array:
-        """(nv,) B u, cut at the effort limits."""
+        """Return B u (nv,), clipped at the effort limits."""
         return np.asarray(self.actuation @ np.clip(u, -self.limits, self.limits))
 
     def _effort_by_input(self, u: Array) -> Array:
-        """(nv, nu) the derivative of `_effort`."""
+        """Return the derivative (nv, nu) of `_effort`."""
         return np.asarray(self.actuation * (np.abs(u) <= self.limits))
 
     def _stretch(self, q: Array) -> Array:
-        """(nv,) of the springs on hinges and slides."""
+        """Return the deflection (nv,) of the springs on hinges and slides."""
         stretch = -self.rest
         for i, j in self.coordinates.single:
             stretch[j] += q[i]
         return stretch
 
     def _spring_energy(self, q: Array) -> float:
-        """[J]."""
+        """Return the energy [J] of the springs."""
         stretch = self._stretch(q)
         return float(stretch @ (self.stiffness * stretch)) / 2
 
     def _zero(self) -> Array:
-        """x (nx,) at which contracts are read: q = 0, free bodies unturned at the origin, nothing moves."""
+        """Return the state (nx,) at which contracts are read: q = 0, v = 0, free bodies unrotated at the origin."""
         return np.concatenate([zero(self.coordinates), np.zeros(self.nv)])
 
     def _plant_fields(self) -> dict[str, Any]:
-        """The fields of the contract that an engine takes over from Drake as they are."""
+        """Return the fields of the contract that an engine copies from Drake."""
         return {
             "inputs": self.description.inputs,
             "actuation": float_rows(self.actuation),
@@ -285,9 +285,9 @@ class PlantEngine(Arguments):
 
 
 class RigidEngine(PlantEngine):
-    """An engine built link by link, whose free bodies move by the velocity of their centres of mass.
+    """An engine built link by link, in which free bodies have the velocity of their centres of mass.
 
-    It has trees of hinges, slides and free bodies, and contacts of spheres, boxes, cylinders, capsules and half spaces.
+    It supports hinges, slides, free bodies, and contact of spheres, boxes, cylinders, capsules and half spaces.
     """
 
     centers: Centers
@@ -297,7 +297,7 @@ class RigidEngine(PlantEngine):
         self.tree = rigid_links(self.description)
 
     def _drake_state(self, who: str, q: Array, v: Array, x: ArrayLike, u: ArrayLike) -> Array:
-        """Drake's state (nx,) of q and the velocities of centres of mass; SimulationError where it is not finite."""
+        """Return Drake's state (nx,) from q and velocities of centres of mass, or raise SimulationError."""
         if not (np.all(np.isfinite(q)) and np.all(np.isfinite(v))):
             raise SimulationError(f"{who} cannot take this step, from x = {np.asarray(x)}, u = {np.asarray(u)}")
         return np.concatenate([q, np.linalg.solve(self.centers.turn(q), v)])
@@ -305,7 +305,7 @@ class RigidEngine(PlantEngine):
 
 @contextmanager
 def silent() -> Iterator[None]:
-    """What libraries print from C on stdout and stderr goes nowhere."""
+    """Discard the C-level output of libraries on stdout and stderr."""
     sys.stdout.flush()
     sys.stderr.flush()
     originals = [(stream, os.dup(stream)) for stream in (1, 2)]
@@ -321,18 +321,18 @@ def silent() -> Iterator[None]:
 
 
 def row(values: object) -> str:
-    """Numbers as text, to the last digit."""
+    """Format numbers with all digits."""
     return " ".join(repr(float(value)) for value in np.ravel(np.asarray(values, dtype=float)))
 
 
 def xml_text(root: ElementTree.Element) -> str:
-    """The document, indented."""
+    """Return the indented text of the document."""
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode")
 
 
 def shape_of(geometry: Any) -> tuple[str, dict[str, list[float]]]:
-    """The kind of Drake's shape, such as "Sphere", and its sizes [m], none of those that no engine is given."""
+    """Return the kind of Drake's shape, such as "Sphere", and its sizes [m], empty for unsupported shapes."""
     shape, kind = geometry.shape, type(geometry.shape).__name__
     if kind == "Sphere":
         return kind, {"radius": [shape.radius()]}
@@ -346,7 +346,7 @@ def shape_of(geometry: Any) -> tuple[str, dict[str, list[float]]]:
 
 
 def geometry_contracts(description: Description) -> tuple[GeometryContract, ...]:
-    """Each geometry of a kind that engines are given, where q = 0."""
+    """Return the geometries of supported kinds, at q = 0."""
     moving, on, _ = without_welds(description.links)
     frames: list[RigidTransform] = []
     for link in moving:
@@ -365,14 +365,14 @@ def geometry_contracts(description: Description) -> tuple[GeometryContract, ...]
 
 
 def without_damping(pair: PairContract) -> PairContract:
-    """Of an engine whose contacts have friction and stiffness of the model, and dampers of their own or none."""
+    """Return the pair for an engine that takes friction and stiffness from the model, but not dissipation."""
     return replace(pair, dissipation=None, relaxation_time=None)
 
 
 def geometry_contract(
     name: str, carrier: str, kind: str, sizes: Sequence[float], position: Array, R: Array
 ) -> GeometryContract:
-    """From the centre (3,) and the axes R (3, 3) in world; what is round or flat is so about its z axis."""
+    """Build a contract from the centre (3,) and the axes R (3, 3) in world. The z axis is the axis of symmetry."""
     directions = np.zeros(0)
     if kind == "HalfSpace":
         directions, position = R[:, 2], R[:, 2] * (R[:, 2] @ position)
@@ -388,9 +388,9 @@ def _upper_half(matrix: Array) -> Array:
 
 
 def principal(inertia: Array) -> tuple[Array, Array]:
-    """Principal moments (3,) of `inertia` (3, 3), and the quaternion (w, x, y, z) of their axes.
+    """Return the principal moments (3,) of `inertia` (3, 3), and the quaternion (w, x, y, z) of their axes.
 
-    MuJoCo checks A + B >= C exactly: what rounding takes from it, at most 1e-14 of the largest, is put back.
+    MuJoCo checks A + B >= C exactly. A violation by rounding, of at most 1e-14 of the largest moment, is corrected.
     """
     moments, axes = np.linalg.eigh(inertia)
     if np.array_equal(inertia, np.diag(np.diag(inertia))):

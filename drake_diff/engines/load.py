@@ -1,4 +1,4 @@
-"""Load engines by name, imported when they are asked for, on the whole plant or on its independent coordinates."""
+"""Load engines by name, for the whole plant or for its independent coordinates. Engines are imported on demand."""
 
 import os
 from collections.abc import Iterator, Mapping
@@ -29,7 +29,7 @@ ENGINES = {
     "pybullet": ("engines.bullet", "PybulletEngine"),
     "sapien": ("engines.physx", "SapienEngine"),
 }
-# Tools that people ask for and that are no engine here, and why.
+# Other tools that are not supported as engines, with the reason.
 ELSEWHERE = {
     "isaaclab": "it needs its own Python environment: run drake-diff export-model, record there, and compare the file",
     "isaacsim": "it requires a licence to be accepted: run drake-diff export-model, record there, and compare the file",
@@ -45,18 +45,18 @@ def load_engine(name: str, model: Any, **options: Any) -> Engine:
 
     Args:
         name: "numpy", "drake", "mujoco", "mjx", "pinocchio", "casadi", "newton", "pybullet" or "sapien".
-        model: the `Model`; "numpy" also takes a form of `engines.closed_form`.
-        **options: "drake" takes `contact` ("sap", "similar", "lagged") and `method` (of `differentiate_step`);
-            "mujoco" and "mjx" take `path`, an MJCF file of your own; "mujoco" takes `time_step` [s], another than the
-            model's; such a form needs it.
+        model: The `Model`. "numpy" also takes a form of `engines.closed_form`.
+        **options: "drake" takes `contact` ("sap", "similar", "lagged") and `method` (of `differentiate_step`). "mujoco"
+            and "mjx" take `path`, a custom MJCF file. "mujoco" takes `time_step` [s] if it differs from the model's.
+            A form of `engines.closed_form` requires `time_step`.
 
     Returns:
-        An `Engine`: step, Jacobians, energy, mass matrix and contract of the model in that simulator.
+        An `Engine` with the step, Jacobians, energy, mass matrix and contract of the model in that simulator.
 
     Raises:
-        UnknownNameError: there is no engine of that name; the message lists those there are.
-        MissingDependencyError: the engine is not installed; the message says how to install it.
-        ModelError: the engine cannot have this model; the message names the element.
+        UnknownNameError: There is no engine of that name. The message lists the known names.
+        MissingDependencyError: The engine is not installed. The message states how to install it.
+        ModelError: The engine does not support this model. The message names the element.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -80,7 +80,7 @@ def load_engine(name: str, model: Any, **options: Any) -> Engine:
 
 @contextmanager
 def _safe_children() -> Iterator[None]:
-    """Let no `python -c` that a library starts import from the working directory, as glfw's does for MuJoCo."""
+    """Prevent `python -c` child processes, such as glfw's for MuJoCo, from importing from the working directory."""
     before = os.environ.get(SAFE_PATH)
     os.environ[SAFE_PATH] = "1"
     try:
@@ -93,20 +93,20 @@ def _safe_children() -> Iterator[None]:
 
 
 def load_spec(spec: str, model: Model) -> Engine:
-    """The engine of a name, or Drake's "drake:CONTACT" or "drake:CONTACT:METHOD", as in drake:lagged:implicit."""
+    """Load an engine by name, or Drake by "drake:CONTACT" or "drake:CONTACT:METHOD", as in drake:lagged:implicit."""
     name, *chosen = spec.split(":")
     if chosen and (name != "drake" or len(chosen) > 2):
         raise InputError("engine", got=spec, expected="a name, drake:CONTACT or drake:CONTACT:METHOD")
     return load_engine(name, model, **dict(zip(("contact", "method"), chosen, strict=False)))
 
 
-TAKEN = ("drake", "pinocchio", "casadi")  # engines that a model with reduced coordinates can be given to
+TAKEN = ("drake", "pinocchio", "casadi")  # engines that support a model with reduced coordinates
 
 
 class ReducedEngine(EulerEngine):
-    """`whole` is the engine on `model.whole`, one of an Euler step of the description of its plant.
+    """An engine in independent coordinates. `whole` is the engine on `model.whole`, an `EulerEngine` of its plant.
 
-    With v = E v_own the force that an acceleration needs is E' of that which E a_own needs of the whole.
+    With v = E v_own, the force for an acceleration a_own is E' times the force for E a_own in the whole plant.
     """
 
     def __init__(self, whole: Any, model: Model):
@@ -150,7 +150,7 @@ class ReducedEngine(EulerEngine):
 
 
 def reduced_contract(contract: EngineContract, model: Model) -> EngineContract:
-    """Of the independent coordinates: followers show in M(q) and the bias, and in the damping of what they follow."""
+    """Reduce a contract to independent coordinates. Followers add to M(q), bias and damping of their leaders."""
     coupling: JointCoupling | None = model.coupling
     if coupling is None:
         return contract

@@ -1,7 +1,7 @@
 """MuJoCo MJX: MuJoCo's step written in JAX, on the same MJCF, in float64, differentiated forward by `jax.jacfwd`.
 
-Two derivatives MJX does not have. Of a free body that does not turn it drops that by the angular velocity, which is put
-back. Where a pair with an elliptic cone does not slip at all, its line search takes the root of 0: a GradientError.
+MJX drops the derivative with respect to the angular velocity of a free body that does not rotate. The engine adds it.
+If a pair with an elliptic cone does not slip, MJX differentiates a square root at 0, which raises a GradientError.
 """
 
 from importlib.metadata import version
@@ -26,15 +26,15 @@ except ImportError as error:
     raise MissingDependencyError(f"this engine needs MJX ({error}): pip install 'drake-diff[mjx]'") from error
 
 PYRAMIDAL = {name: number for number, name in CONES.items()}["pyramidal"]
-# [N or N m] of M a - f, relative to f: MJX does not say whether its solver came to its end, which leaves 1e-12 or so.
+# Residual M a - f, relative to f (at least 1 N or N m). MJX does not report convergence, which leaves about 1e-12.
 UNBALANCED = 1e-6
-STILL = 1e-8  # [rad/s] that MJX takes for 0, dropping the turn
+STILL = 1e-8  # [rad/s] speed below which MJX drops the rotation
 
 
 class MjxEngine(PlantEngine):
-    """`path` is the user's own MJCF, with joints and actuators of the names that Drake's plant has.
+    """The MJX engine. `path` is a custom MJCF file, whose joints and actuators have the names of Drake's plant.
 
-    `mjcf` is the text that was generated or read. ModelError where MJX cannot have it.
+    `mjcf` is the generated or given text. Raises ModelError if MJX does not support the model.
     """
 
     name, version = "mjx", version("mujoco-mjx")
@@ -43,14 +43,14 @@ class MjxEngine(PlantEngine):
         super().__init__(model)
         self.mjcf, compiled = mujoco_model(self.description, model.time_step, path)
         if not touches(compiled):
-            compiled.opt.cone = PYRAMIDAL  # MJX cannot have limits with elliptic cones and no contact that has one
+            compiled.opt.cone = PYRAMIDAL  # MJX does not support joint limits with elliptic cones and no contact
         with jax.enable_x64(True):
             try:
                 self.mjx = mjx.put_model(compiled, impl="jax")
                 self.data = mjx.make_data(self.mjx)
             except NotImplementedError as error:
                 raise ModelError(f"MJX cannot take this model: {error}") from error
-        self.model = jax.tree.map(np.asarray, self.mjx)  # as it is in MJX, to be read
+        self.model = jax.tree.map(np.asarray, self.mjx)  # MJX's values, for reading
         self.native = MujocoCoordinates(self.description, self.model)
 
     def step(self, x: ArrayLike, u: ArrayLike) -> Array:
@@ -73,7 +73,7 @@ class MjxEngine(PlantEngine):
         return StepJacobian(frozen(A), frozen(B), method)
 
     def _put_turns_back(self, x_next: Array, A: Array, B: Array) -> str:
-        """In native tangent coordinates, where a body that does not turn moves by h w'; what the method adds."""
+        """Add derivatives of bodies without rotation, which move by h w' in native tangents, and return the remark."""
         _, qvel = self.native.to_native(x_next)
         starts = [j for _, j in self.native.coordinates.free]
         still = [d for d in (self.native.dofs[j : j + 3] for j in starts) if np.all(np.abs(qvel[d]) <= STILL)]
@@ -122,11 +122,11 @@ class MjxEngine(PlantEngine):
         )  # fmt: skip
 
     def _terms(self, x: Array) -> Any:
-        """mjx.Data of NumPy arrays, with what depends on position and velocity alone."""
+        """Return mjx.Data of NumPy arrays, with the terms that depend only on position and velocity."""
         return self._run(_terms_at, x, np.zeros(self.nu))
 
     def _run(self, function: Any, x: Array, u: Array) -> Any:
-        with jax.enable_x64(True):  # JAX's own setting, float32 unless told otherwise, stays as it is
+        with jax.enable_x64(True):  # JAX's global setting, float32 by default, is unchanged
             native = np.concatenate([*self.native.to_native(x), self.native.control(u)])
             return jax.tree.map(np.asarray, function(self.mjx, self.data, native))
 
@@ -136,7 +136,7 @@ def _placed(m: Any, d: Any, native: Any) -> Any:
 
 
 def _stepped(m: Any, d: Any, native: Any) -> tuple[Any, Any]:
-    """(nq + nv,) after the step, and what the solver left of the forces unbalanced."""
+    """Return the state (nq + nv,) after the step, and the relative residual of the solver's forces."""
     d = mjx.step(m, _placed(m, d, native))
     force = d.qfrc_smooth + d.qfrc_constraint
     left = jnp.abs(mjx.mul_m(m, d, d.qacc) - force).max() / jnp.maximum(1.0, jnp.abs(force).max())

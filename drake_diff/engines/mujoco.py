@@ -1,7 +1,7 @@
-"""MuJoCo, on MJCF generated from Drake's plant, numbers to the last digit, or on the user's own.
+"""MuJoCo, on MJCF generated from Drake's plant with all digits, or on a custom MJCF file.
 
-With Euler or implicitfast joint damping is implicit, (M + h D) a = ..., and v' = v + h a: Drake's free step, but for a
-free body's quaternion (`exponential_gap`). The contract says where an MJCF asks for another.
+With Euler or implicitfast, joint damping is implicit, (M + h D) a = ..., and v' = v + h a. This is Drake's step without
+contact, except that quaternions are updated by the exponential map. The contract reports other integrators of an MJCF.
 """
 
 from pathlib import Path
@@ -27,19 +27,19 @@ try:
 except ImportError as error:
     raise MissingDependencyError("this engine needs MuJoCo: pip install 'drake-diff[engines]'") from error
 
-BAD = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")  # warnings after which a step means nothing
-# What sticks slips beyond 1e-5 m/s or so, and a larger step would leave the mode: good to 1e-9.
+BAD = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")  # warnings after which a step is invalid
+# Sticking contacts slip beyond about 1e-5 m/s, so that a larger step would leave the mode. Accurate to 1e-9.
 DIFFERENCE_STEP = 1e-6
-# Where nothing touches: at this step and at twice it, extrapolated, truncation is far below rounding's 1e-11.
+# Without contact, extrapolation from this step and twice this step has truncation errors far below rounding, 1e-11.
 FREE_STEP = 3e-5
-# What the two may differ by; if a contact is made between them, they differ by 1 and more.
+# Largest difference between the results of both steps. If a contact begins between them, they differ by 1 or more.
 SAME_JACOBIAN = 1e-7
 
 
 class MujocoEngine(PlantEngine):
-    """`path` is the user's own MJCF, with joints and actuators of the names that Drake's plant has.
+    """The MuJoCo engine. `path` is a custom MJCF file, whose joints and actuators have the names of Drake's plant.
 
-    `time_step` [s] is another than the model's, for a generated MJCF. `mjcf` is the text that was generated or read.
+    `time_step` [s] replaces the model's time step in a generated MJCF. `mjcf` is the generated or given text.
     """
 
     name, version = "mujoco", str(mujoco.__version__)
@@ -77,7 +77,7 @@ class MujocoEngine(PlantEngine):
         return StepJacobian(frozen(A), frozen(B), method)
 
     def _differences(self, step: float) -> tuple[Array, Array]:
-        """A (2 nv, 2 nv) and B (2 nv, nu) in MuJoCo's tangent coordinates and inputs."""
+        """Return A (2 nv, 2 nv) and B (2 nv, nu) in MuJoCo's tangent coordinates and inputs."""
         n = 2 * self.nv
         A, B = np.zeros((n, n)), np.zeros((n, self.nu))
         mujoco.mjd_transitionFD(self.model, self.data, step, True, A, B, None, None)
@@ -120,13 +120,13 @@ class MujocoEngine(PlantEngine):
         return read_contract(self.model, self.data, self.native, self.description, **fields)
 
     def _set(self, x: Array, u: Array) -> None:
-        mujoco.mj_resetData(self.model, self.data)  # which takes the warm start too
+        mujoco.mj_resetData(self.model, self.data)  # also removes the warm start
         self.data.qpos[:], self.data.qvel[:] = self.native.to_native(x)
         self.data.ctrl[:] = self.native.control(u)
 
 
 def mujoco_model(description: Description, time_step: float, path: str | Path | None) -> tuple[str, Any]:
-    """The MJCF, generated or read from `path`, and its MjModel; ModelError for what the contract has no line for."""
+    """Return the MJCF, generated or read from `path`, and its MjModel. Raises ModelError for unsupported features."""
     if path is None:
         text = generated(description, time_step)
         model = _compile(text)
@@ -137,7 +137,7 @@ def mujoco_model(description: Description, time_step: float, path: str | Path | 
 
 
 def followers_in(path: str | Path) -> tuple[Follower, ...]:
-    """The joints that follow others in an MJCF; ModelError for equalities of another kind."""
+    """Return the joints that follow others in an MJCF. Raises ModelError for equalities of another kind."""
     return read_followers(_read(path))
 
 
@@ -149,7 +149,7 @@ def _read(path: str | Path) -> Any:
 
 
 def generated(description: Description, time_step: float) -> str:
-    """The MJCF that is compared and exported; ModelError where MuJoCo cannot have the model."""
+    """Return the MJCF for comparison and export. Raises ModelError if MuJoCo does not support the model."""
     bare = mjcf(description, time_step)
     if not description.pairs:
         return bare

@@ -1,15 +1,15 @@
-"""The contract of a compiled MuJoCo model, whoever wrote its MJCF, and Drake's coordinates in it, without MuJoCo.
+"""Read the contract of a compiled MuJoCo model from any MJCF, and map its coordinates to Drake's, without MuJoCo.
 
 `m` is an MjModel or an mjx.Model of NumPy arrays, `d` the MjData or mjx.Data. A free body's native velocity is (v in
-world, w in the body): v_native = Q v with Q = [[0, 1], [R', 0]].
+world, w in the body), v_native = Q v with Q = [[0, 1], [R', 0]].
 
 MuJoCo's contact has the force f for which the overlap r accelerates by r'' = -B r' - K d r + R f, where d is the
-impedance and R = (1 - d) / d / m, with 1 / m the sum of the bodies' inverse weights. Where nothing accelerates this is
+impedance and R = (1 - d) / d / m, with 1 / m the sum of the bodies' inverse weights. Without acceleration, this is
 
     f = k (r + tau r'),   k = K d^2 m / (1 - d),   tau = B / (K d)
 
-so that with a constant d a weight rests m g / k deep, as on the spring of Drake's point contact. With solref = (-S, -D)
-K is S / d^2 and B is D / d. As it moves, r'' = -B d r' - K d^2 r: it is damped critically where B is 2 sqrt(K).
+For constant d, a weight rests at the depth m g / k, as on the spring of Drake's point contact. With solref = (-S, -D),
+K is S / d^2 and B is D / d. The motion r'' = -B d r' - K d^2 r is critically damped if B is 2 sqrt(K).
 """
 
 from collections.abc import Iterator
@@ -42,7 +42,7 @@ KINDS = {0: "quaternion_floating", 1: "ball", 2: "prismatic", 3: "revolute"}  # 
 
 
 class MujocoCoordinates:
-    """Drake's joints and actuators in `m` (MjModel or mjx.Model); InputError where they are not there by name."""
+    """Drake's joints and actuators in `m` (MjModel or mjx.Model). Raises InputError if the names do not match."""
 
     def __init__(self, description: Description, m: Any):
         self.coordinates = description.coordinates
@@ -69,25 +69,25 @@ class MujocoCoordinates:
                 self.positions[x.q_start], self.dofs[x.v_start] = at_q, at_v
 
     def to_native(self, x: Array) -> tuple[Array, Array]:
-        """qpos (nq,) and qvel (nv,), quaternions of norm 1."""
+        """Return qpos (nq,), with quaternions of norm 1, and qvel (nv,)."""
         q = unit(self.coordinates, x[: self.nq])
         qpos = np.empty(self.nq)
         qpos[self.positions] = q
         return qpos, self.turn(q) @ x[self.nq :]
 
     def to_drake(self, qpos: Array, qvel: Array) -> Array:
-        """x (nx,)."""
+        """Return Drake's state x (nx,)."""
         q = np.array(qpos[self.positions])
         return np.concatenate([q, self.turn(q).T @ qvel])
 
     def control(self, u: Array) -> Array:
-        """ctrl (nu,)."""
+        """Return ctrl (nu,)."""
         ctrl = np.empty(len(self.actuator))
         ctrl[self.actuator] = u
         return ctrl
 
     def turn(self, q: Array) -> Array:
-        """Q (nv, nv) with v_native = Q v."""
+        """Return Q (nv, nv) with v_native = Q v."""
         Q = np.zeros((self.nv, self.nv))
         Q[self.dofs, np.arange(self.nv)] = 1.0
         for i, j in self.coordinates.free:
@@ -95,7 +95,7 @@ class MujocoCoordinates:
         return Q
 
     def jacobian(self, x: Array, x_next: Array, A: Array, B: Array) -> tuple[Array, Array]:
-        """Drake's A (nx, nx) and B (nx, nu), from MuJoCo's in its tangent coordinates, (2 nv, 2 nv) and (2 nv, nu)."""
+        """Return Drake's A (nx, nx) and B (nx, nu), from A (2 nv, 2 nv) and B (2 nv, nu) in MuJoCo's tangent space."""
         into, out = self._tangent_map(x), np.linalg.inv(self._tangent_map(x_next))
         W, N = self.coordinates.motion(x[: self.nq]), self.coordinates.rate(x_next[: self.nq])
         eye = np.eye(self.nv)
@@ -103,7 +103,7 @@ class MujocoCoordinates:
         return wide @ out @ A @ into @ narrow, wide @ out @ B[:, self.actuator]
 
     def on_tangent(self, x: Array, x_next: Array, by_native: Array) -> tuple[Array, Array]:
-        """A and B for `jacobian`, from the step's derivative by qpos, qvel and ctrl, (nq + nv, nq + nv + nu)."""
+        """Return A and B for `jacobian`, from derivatives (nq + nv, nq + nv + nu) with respect to qpos, qvel, ctrl."""
         n, eye = self.nq + self.nv, np.eye(self.nv)
         q, q_next = (unit(self.coordinates, state[: self.nq]) for state in (x, x_next))
         move, see = np.zeros((self.nq, self.nv)), np.zeros((self.nv, self.nq))
@@ -113,7 +113,7 @@ class MujocoCoordinates:
         return narrowed[:, :n] @ _diagonal(move, eye), narrowed[:, n:]
 
     def _tangent_map(self, x: Array) -> Array:
-        """(2 nv, 2 nv) from Drake's (small motion, dv) to MuJoCo's."""
+        """Return the matrix (2 nv, 2 nv) from Drake's (small motion, dv) to MuJoCo's."""
         q, v = x[: self.nq], x[self.nq :]
         T = _diagonal(self.turn(q), self.turn(q))
         for i, j in self.coordinates.free:
@@ -123,7 +123,7 @@ class MujocoCoordinates:
 
 
 def name_of(m: Any, address: Any) -> str:
-    """The name at this address of the model's text."""
+    """Return the name at this address of the model's text."""
     start = int(address)
     return str(m.names[start : m.names.index(b"\0", start)].decode())
 
@@ -141,13 +141,13 @@ Given = tuple[int, Array, Array, Array, Array, Array]
 
 
 def geometry_name(m: Any, g: int) -> str:
-    """The geom's own name, or its number and its body's."""
+    """Return the name of the geom, or a name from its number and its body if it has none."""
     given = name_of(m, m.name_geomadr[g])
     return given or f"geom {g} of {name_of(m, m.name_bodyadr[int(m.geom_bodyid[g])])}"
 
 
 def read_geometries(m: Any, d: Any) -> tuple[GeometryContract, ...]:
-    """Every geom, where `d` is at Drake's q = 0; a mesh or height field without sizes."""
+    """Return all geoms, with `d` at Drake's q = 0. A mesh or height field has no sizes."""
     geometries = []
     for g in range(m.ngeom):
         body = int(m.body_weldid[int(m.geom_bodyid[g])])
@@ -164,7 +164,7 @@ def read_geometries(m: Any, d: Any) -> tuple[GeometryContract, ...]:
 
 
 def read_pairs(m: Any) -> tuple[PairContract, ...]:
-    """Every pair of geoms that may touch: those that are listed, then those that MuJoCo's filters leave."""
+    """Return all pairs of geoms that may collide: explicit pairs, then the pairs that pass MuJoCo's filters."""
     listed = {frozenset(map(int, pair)): i for i, pair in enumerate(zip(m.pair_geom1, m.pair_geom2, strict=True))}
     return (
         *(_contract(m, (int(m.pair_geom1[i]), int(m.pair_geom2[i])), *_of_pair(m, i)) for i in listed.values()),
@@ -189,14 +189,14 @@ def _unfiltered(m: Any) -> Iterator[tuple[int, int]]:
 
 
 def _of_pair(m: Any, i: int) -> Given:
-    """The dimension of the contact, friction (5,), solref (2,), solref of friction (2,), solimp (5,), (margin, gap)."""
+    """Return the contact's dimension, friction (5,), solref (2,), solreffriction (2,), solimp (5,), (margin, gap)."""
     numbers = (np.array(getattr(m, f"pair_{name}")[i]) for name in ("friction", "solref", "solreffriction", "solimp"))
     friction, solref, of_friction, solimp = numbers
     return int(m.pair_dim[i]), friction, solref, of_friction, solimp, np.array([m.pair_margin[i], m.pair_gap[i]])
 
 
 def _of_geoms(m: Any, a: int, b: int) -> Given:
-    """As `_of_pair`, by MuJoCo's rules for two geoms."""
+    """Return the values of `_of_pair` by MuJoCo's rules for two geoms."""
     apart = np.array([max(numbers[a], numbers[b]) for numbers in (m.geom_margin, m.geom_gap)])
     none, rank = np.zeros(2), int(m.geom_priority[a]) - int(m.geom_priority[b])
     if rank:
@@ -231,7 +231,7 @@ def _contract(
     more |= {"solreffriction": float(np.abs(of_friction).max()), "gap [m]": float(apart[1])}
     least, most = (float(d) for d in np.clip(solimp[:2], 1e-4, 0.9999))
     K, B = _reference(m, solref, solimp)
-    if solimp[2] <= SMALL:  # no width: the mean of the two everywhere
+    if solimp[2] <= SMALL:  # without width, MuJoCo uses the mean of the two
         least = most = (least + most) / 2
     stiffness = _stiffness(m, both, dim, friction, K, least)
     if least != most:
@@ -248,7 +248,7 @@ def _contract(
 
 
 def _reference(m: Any, solref: Array, solimp: Array) -> tuple[float, float]:
-    """K and B of solref, given by stiffness and damping or by a time constant and damping ratio."""
+    """Return K and B from solref, which is (-stiffness, -damping) or (time constant, damping ratio)."""
     d = float(np.clip(solimp[1], 1e-4, 0.9999))
     if solref[0] <= 0:
         return -float(solref[0]) / d**2, -float(solref[1]) / d
@@ -258,7 +258,7 @@ def _reference(m: Any, solref: Array, solimp: Array) -> tuple[float, float]:
 
 
 def _stiffness(m: Any, both: tuple[int, int], dim: int, friction: Array, K: float, d: float) -> float:
-    """[N/m] where the contact rests, at the impedance `d`; a pyramid's edges share the force."""
+    """Return the stiffness [N/m] of a contact at rest, at the impedance `d`. A pyramid's edges share the force."""
     bodies = [int(m.geom_bodyid[g]) for g in both]
     inverse_mass = sum(float(m.body_invweight0[b][0]) for b in bodies)
     stiffness = K * d**2 / ((1 - d) * inverse_mass) if inverse_mass else np.inf
@@ -269,7 +269,7 @@ def _stiffness(m: Any, both: tuple[int, int], dim: int, friction: Array, K: floa
 
 
 CONES = {0: "pyramidal", 1: "elliptic"}  # mjtCone
-INTEGRATORS = {0: "EULER", 2: "IMPLICIT", 3: "IMPLICITFAST"}  # mjtIntegrator; MuJoCo differentiates no step of others
+INTEGRATORS = {0: "EULER", 2: "IMPLICIT", 3: "IMPLICITFAST"}  # mjtIntegrator; MuJoCo cannot differentiate others
 OTHERS = {1: "RK4", 4: "DISCRETE"}
 SOLVERS = {0: "PGS", 1: "CG", 2: "Newton's method"}  # mjtSolver
 JOINT_TRANSMISSION = 0  # mjtTrn
@@ -280,11 +280,11 @@ DISABLED = (
     "island", "multiccd",
 )  # fmt: skip  # mjtDisableBit, in the order of its bits
 NO_EULERDAMP = 1 << DISABLED.index("eulerdamp")
-# Of no effect on a step, or told of by the contract.
+# Flags without effect on a step, or reported by the contract.
 HARMLESS = ("warmstart", "eulerdamp", "filterparent", "refsafe", "sensor", "midphase", "autoreset", "island")
-ENABLED = ("override", "energy", "fwdinv", "invdiscrete")  # mjtEnableBit; later ones by their bits
+ENABLED = ("override", "energy", "fwdinv", "invdiscrete")  # mjtEnableBit; later flags are named by their bits
 HARMLESS_ENABLED = ("energy", "fwdinv", "invdiscrete")
-# By array of the model: what is there where it is not zero. Older MuJoCos do not have all of them.
+# Features for which an array of the model is not zero, by array. Older versions of MuJoCo lack some arrays.
 UNKNOWN = {
     "dof_frictionloss": "friction loss", "dof_dampingpoly": "damping that is not linear",
     "jnt_stiffnesspoly": "springs that are not linear", "jnt_springyield": "springs that yield",
@@ -301,7 +301,7 @@ COUNTED = {
 
 
 def check_known(m: Any) -> None:
-    """Refuse, naming it, what the contract has no line for."""
+    """Raise ModelError with the names of features that the contract does not cover."""
     number = int(m.opt.integrator)
     if number not in INTEGRATORS:
         expected = f"one of {', '.join(INTEGRATORS.values())}, whose steps MuJoCo differentiates"
@@ -326,7 +326,7 @@ def _named_bits(flags: int, names: tuple[str, ...], harmless: tuple[str, ...]) -
 
 
 def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Description, **fields: Any) -> EngineContract:
-    """What `m` has, where `d` is at Drake's q = 0; `own` are the fields and `reasons` that MuJoCo and MJX differ in."""
+    """Read the contract of `m`, with `d` at Drake's q = 0. `fields` are those in which MuJoCo and MJX differ."""
     limits, B = [], np.zeros((len(native.dofs), len(native.actuator)))
     pairs, geometries = read_pairs(m), read_geometries(m, d)
     there = {g.name for g in geometries}
@@ -337,7 +337,7 @@ def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Descri
             raise ModelError(f"actuator {name} of the MJCF: expected a motor on a joint, got another transmission")
         row = int(np.flatnonzero(native.dofs == m.jnt_dofadr[m.actuator_trnid[i][0]])[0])
         B[row, column] = m.actuator_gainprm[i][0] * m.actuator_gear[i][0]
-        # Of MuJoCo's limits of control and force those which are reached first.
+        # The tighter of MuJoCo's limits on control and force.
         sides = [np.sort(m.actuator_forcerange[i] / m.actuator_gainprm[i][0])] if m.actuator_forcelimited[i] else []
         sides += [m.actuator_ctrlrange[i]] if m.actuator_ctrllimited[i] else []
         limits.append(max(abs(max(s[0] for s in sides)), abs(min(s[1] for s in sides))) if sides else np.inf)
@@ -374,12 +374,12 @@ def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Descri
 
 
 def _not_given(description: Description, pair: PairContract) -> bool:
-    """Whether one of the two is of a shape that MJCF is not written for."""
+    """Return whether one of the two geometries has a shape that the MJCF export does not support."""
     return any(not shape_of(g)[1] for g in description.geometries if g.name in pair.names)
 
 
 def read_followers(m: Any) -> tuple[Follower, ...]:
-    """The joints that follow others; ModelError for an equality that is something else."""
+    """Return the joints that follow others. Raises ModelError for other kinds of equalities."""
     followers = []
     for k in range(m.neq):
         joint, leader, coefficients = int(m.eq_obj1id[k]), int(m.eq_obj2id[k]), [float(x) for x in m.eq_data[k][:5]]
@@ -393,14 +393,14 @@ def read_followers(m: Any) -> tuple[Follower, ...]:
 
 
 def touches(m: Any) -> bool:
-    """Whether any two geometries may."""
+    """Return whether any two geometries may collide."""
     return bool(read_pairs(m))
 
 
 def _read_joint(m: Any, d: Any, j: int) -> JointContract:
-    """Joint `j` and what it carries, where `d` is at Drake's q = 0."""
+    """Read joint `j` and the bodies that it carries, with `d` at Drake's q = 0."""
     kind, dof, body = KINDS[int(m.jnt_type[j])], int(m.jnt_dofadr[j]), int(m.jnt_bodyid[j])
-    last = j == int(m.body_jntadr[body]) + int(m.body_jntnum[body]) - 1  # only it carries the body
+    last = j == int(m.body_jntadr[body]) + int(m.body_jntnum[body]) - 1  # only the last joint of a body carries it
     carried = []
     for b in (b for b in range(1, m.nbody) if last and int(m.body_weldid[b]) == body):
         R = np.array(d.ximat[b]).reshape(3, 3)

@@ -1,8 +1,8 @@
 """Newton's SolverFeatherstone on the CPU, in single precision, on a model built joint by joint from Drake's plant.
 
-Its step is semi-implicit Euler as Drake's, but joint damping is explicit, M a = ... - D v, a free body moves by the
-velocity of its centre of mass, and its quaternion has the norm 1 after the step. Isaac Lab's SolverMuJoCo is MuJoCo's
-step (this package's engine mujoco) by mujoco-warp, which does not come with Newton.
+Its step is semi-implicit Euler like Drake's, except that joint damping is explicit, M a = ... - D v, a free body moves
+with the velocity of its centre of mass, and its quaternion is normalized after the step. Isaac Lab's SolverMuJoCo is
+MuJoCo's step (engine mujoco of this package) by mujoco-warp, which is not included in Newton.
 """
 
 from typing import Any
@@ -33,19 +33,19 @@ from drake_diff.model.model import Model
 try:
     import warp as wp
 
-    wp.config.log_level = wp.LOG_ERROR  # it tells of every kernel that it builds or loads
+    wp.config.log_level = wp.LOG_ERROR  # suppresses messages on kernels
     import newton
 except ImportError as error:
     raise MissingDependencyError("this engine needs Newton: pip install 'drake-diff[forward]'") from error
 
-# Newton takes friction and stiffness of a contact for not given where they are 0; of this nothing is felt.
+# Replaces 0 in friction and stiffness of a contact, which Newton takes for unset. The effect is negligible.
 NONE = 1e-30
 KINDS = {0: "prismatic", 1: "revolute", 4: "quaternion_floating"}  # newton.JointType
 OF_JOINTS = ("damping", "armature", "stiffness", "limit_lower", "limit_upper", "rest_q", "axis")
 
 
 class NewtonEngine(RigidEngine):
-    """Trees of hinges, slides and free bodies; contacts of spheres, boxes, cylinders, capsules and half spaces."""
+    """An engine for hinges, slides and free bodies, with spheres, boxes, cylinders, capsules and half spaces."""
 
     name, version = "newton (SolverFeatherstone)", str(newton.__version__)
 
@@ -54,7 +54,7 @@ class NewtonEngine(RigidEngine):
         with silent():
             self.newton, self.shapes = _build(self.tree, self.description.gravity)
         self.solver = newton.solvers.SolverFeatherstone(self.newton, update_mass_matrix_interval=1)
-        # Newton's places in Drake's order, and the centres of mass that it uses.
+        # Newton's indices in Drake's order, and Newton's centres of mass.
         q_starts, v_starts = self.newton.joint_q_start.numpy(), self.newton.joint_qd_start.numpy()
         self.positions, self.dofs = np.zeros(self.nq, dtype=int), np.zeros(self.nv, dtype=int)
         of_free = {}
@@ -82,9 +82,9 @@ class NewtonEngine(RigidEngine):
         return self._drakes(after, x, u)
 
     def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
-        """NotOfferedError where something touches: Newton's tape holds the points of contacts fixed in the bodies.
+        """Differentiate a step without contact, as Newton's tape keeps contact points fixed in the bodies.
 
-        Through it a ball that slides would spin up by where it is on the ground, 15 rad/s per metre in one step.
+        In contact, raise NotOfferedError. The tape would make a sliding ball spin by 15 rad/s per metre in one step.
         """
         x, u = self._point(x, u)
         if self.contact_depth(x) > 0:
@@ -175,13 +175,13 @@ class NewtonEngine(RigidEngine):
         return self._given(np.concatenate([q, np.zeros(self.nv)]), np.zeros(self.nu))[0]
 
     def _given(self, x: Array, u: Array) -> tuple[Any, Any]:
-        """Newton's state, with the poses of its bodies, and control; both new, so that nothing is left over."""
+        """Return a new state of Newton, with the poses of its bodies, and a new control."""
         state, control = self.newton.state(requires_grad=True), self.newton.control(requires_grad=True)
         q = unit(self.coordinates, x[: self.nq])
         native_q, native_v, force = np.zeros(self.nq), np.zeros(self.nv), np.zeros(self.nv)
         native_q[self.positions], native_v[self.dofs] = q, self.centers.turn(q) @ x[self.nq :]
         force[self.dofs] = self._effort(u)
-        with np.errstate(over="ignore"):  # what is beyond single precision is inf, and SimulationError after the step
+        with np.errstate(over="ignore"):  # overflow of float32 gives inf, and SimulationError after the step
             for array, values in ((state.joint_q, native_q), (state.joint_qd, native_v), (control.joint_f, force)):
                 array.assign(values.astype(np.float32))
         newton.eval_fk(self.newton, state.joint_q, state.joint_qd, state)
@@ -192,7 +192,7 @@ class NewtonEngine(RigidEngine):
         return self._drake_state("Newton", q, v, x, u)
 
     def _mass(self, state: Any) -> Array:
-        """(nv, nv) of Newton's velocities in Drake's order."""
+        """Return the mass matrix (nv, nv) for Newton's velocities in Drake's order."""
         blocks, M = _numbers(newton.eval_mass_matrix(self.newton, state)), np.zeros((self.nv, self.nv))
         starts = self.newton.joint_qd_start.numpy()
         for block, tree in zip(blocks, self.tree.trees, strict=True):
@@ -201,14 +201,14 @@ class NewtonEngine(RigidEngine):
         return M[np.ix_(self.dofs, self.dofs)]
 
     def _native_springs(self, state: Any) -> tuple[Array, Array]:
-        """(nv,) of the springs, and their stiffness; 0 for free bodies."""
+        """Return the deflection (nv,) of the springs and their stiffness, 0 for free bodies."""
         stretch, native = np.zeros(self.nv), _numbers(state.joint_q) - _numbers(self.newton.joint_rest_q)
         for i, j in self.coordinates.single:
             stretch[j] = native[self.positions[i]]
         return stretch, _numbers(self.newton.joint_stiffness)[self.dofs]
 
     def _contacts(self, state: Any) -> Any:
-        """With the stiffness and friction of Drake's pair on each; what Drake does not give is Newton's own."""
+        """Compute the contacts, with the stiffness and friction of Drake's pairs where defined, else Newton's."""
         if self.pipeline is None:
             return None
         contacts = self.pipeline.contacts()
@@ -218,14 +218,14 @@ class NewtonEngine(RigidEngine):
         for i in range(_count(contacts)):
             pair = self.laws[tuple(sorted(int(side[i]) for side in sides))]
             stiffness[i] = 0.0 if pair.stiffness is None else max(pair.stiffness, NONE)
-            friction[i] = 1.0 if pair.friction is None else max(pair.friction, NONE)  # times Newton's own, which is 1
+            friction[i] = 1.0 if pair.friction is None else max(pair.friction, NONE)  # factor on Newton's friction of 1
         for name, values in (("stiffness", stiffness), ("friction", friction), ("damping", np.zeros_like(stiffness))):
             setattr(contacts, f"rigid_contact_{name}", wp.array(values, dtype=wp.float32, device="cpu"))
         return contacts
 
 
 def _build(tree: RigidLinks, gravity: Array) -> tuple[Any, dict[str, int]]:
-    """Newton's model, and the number of each geometry's shape in it."""
+    """Build Newton's model, and return it with the number of each geometry's shape."""
     builder = newton.ModelBuilder(gravity=tuple(float(g) for g in gravity))
     for members in tree.trees:
         joints = []
@@ -268,18 +268,18 @@ def _add_shape(builder: Any, number: int, geometry: Geometry) -> int:
 
 
 def _numbers(array: Any) -> Array:
-    """A warp array in double precision."""
+    """Convert a warp array to double precision."""
     return np.asarray(array.numpy(), dtype=float)
 
 
 def _centers_of_mass(m: Any, state: Any) -> Array:
-    """(bodies, 3) in world."""
+    """Return the centres of mass (bodies, 3) in world."""
     poses = zip(_numbers(state.body_q), _numbers(m.body_com), strict=True)
     return np.array([pose[:3] + _matrix(pose) @ center for pose, center in poses])
 
 
 def _read_joints(m: Any, state: Any, tree: RigidLinks) -> tuple[JointContract, ...]:
-    """In Drake's order, where `state` is at Drake's q = 0."""
+    """Read the joints in Drake's order, with `state` at Drake's q = 0."""
     values = {name: _numbers(getattr(m, f"joint_{name}")) for name in OF_JOINTS}
     centers, poses, inertias, contracts = (
         _centers_of_mass(m, state),
@@ -302,12 +302,12 @@ def _read_joints(m: Any, state: Any, tree: RigidLinks) -> tuple[JointContract, .
 
 
 def _matrix(pose: Array) -> Array:
-    """(3, 3) of (p, quaternion x y z w)."""
+    """Return the rotation matrix (3, 3) of the pose (p, quaternion x y z w)."""
     return rotation(pose[[6, 3, 4, 5]])
 
 
 def _listed(array: Any) -> str:
-    """The different values of an array."""
+    """Format the distinct values of an array."""
     return " or ".join(f"{value:g}" for value in sorted(set(_numbers(array))))
 
 

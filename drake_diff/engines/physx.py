@@ -1,7 +1,7 @@
 """PhysX by SAPIEN on the CPU, in single precision, on articulations built link by link from Drake's plant.
 
-With PhysX's own solver (PGS, which SAPIEN's default TGS is not: it damps in sub-steps) the step of hinges and slides is
-Drake's; the contract tells how that of free bodies is not. PhysX has friction by shape, and a pair's is the mean.
+With PhysX's PGS solver, the step of hinges and slides equals Drake's. SAPIEN's default solver TGS damps in sub-steps.
+The contract lists the differences for free bodies. PhysX has friction per shape, and a pair has the mean of two shapes.
 """
 
 import warnings
@@ -29,23 +29,23 @@ from drake_diff.model.model import Model
 
 try:
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Failed to find system libvulkan")  # nothing is drawn here
+        warnings.filterwarnings("ignore", "Failed to find system libvulkan")  # rendering is not used
         import sapien
         from sapien import physx
 except ImportError as error:
     raise MissingDependencyError("this engine needs SAPIEN: pip install 'drake-diff[forward]'") from error
 
 KINDS = {"revolute_unwrapped": "revolute", "prismatic": "prismatic", "undefined": "quaternion_floating"}
-GROUPS = 32  # bits of a collision group
+GROUPS = 32  # number of bits of a collision group
 UNLIMITED = 1e6  # [rad/s or m/s] instead of PhysX's 100 and 50
-# PhysX takes a mass [kg] or moment of inertia [kg m^2] of 0 for infinite: massless links and point masses get this.
+# Mass [kg] and moment of inertia [kg m^2] of massless links and point masses, as PhysX takes 0 for infinite.
 SMALLEST = 1e-9
-ITERATIONS = 100  # of the solver, instead of 10: damping of one joint is felt by the others
+ITERATIONS = 100  # of the solver, instead of 10, because the damping of one joint affects the others
 NOT_OFFERED = "PhysX gives neither mass matrix nor inverse dynamics; SAPIEN's are those of Pinocchio on another model"
 
 
 class World(NamedTuple):
-    """One scene: its links in the order of the rigid links, and the articulation of each tree."""
+    """A scene with its links, in the order of the rigid links, and the articulation of each tree."""
 
     system: Any
     scene: Any
@@ -54,9 +54,9 @@ class World(NamedTuple):
 
 
 class SapienEngine(RigidEngine):
-    """Trees of hinges, slides and free bodies; contacts of spheres, boxes, cylinders, capsules and half spaces.
+    """An engine for hinges, slides and free bodies, with spheres, boxes, cylinders, capsules and half spaces.
 
-    `status` is "ok" after every step that is finite: PhysX does not say how well it solved.
+    `status` is "ok" after every step with a finite result, as PhysX does not report the convergence of its solver.
     """
 
     name, version = "sapien (PhysX, PGS)", str(sapien.__version__)
@@ -65,11 +65,11 @@ class SapienEngine(RigidEngine):
         super().__init__(model)
         owner = {geometry.name: number for number, geometry in self.tree.geometries}
         sides = {pair.names: sorted(owner[name] for name in pair.names) for pair in self.tree.pairs}
-        # A link and its parent never touch in PhysX.
+        # A link and its parent never collide in PhysX.
         self.adjacent = [names for names, (a, b) in sides.items() if a >= 0 and self.tree.links[b].parent == a]
         self.pairs = tuple(pair for pair in self.tree.pairs if pair.names not in self.adjacent)
         self.groups = groups_by_shape(self.pairs)
-        # Friction of each shape, as near to those of the pairs as they can come; the contract shows what comes of it.
+        # Friction of each shape, fitted to the friction of the pairs. The contract reports the result.
         given = [(pair.names, 2 * pair.friction) for pair in self.pairs if pair.friction is not None]
         self.friction = {name: max(value, 0.0) for name, value in split(given).items()}
         centers = {x.joint.v_start: x.center_of_mass for x in self.tree.links if x.free}
@@ -114,7 +114,7 @@ class SapienEngine(RigidEngine):
         return float(total)
 
     def contact_depth(self, x: ArrayLike) -> float:
-        """PhysX finds contacts as it steps, where the bodies are before it."""
+        """Return the penetration depth. PhysX computes contacts in a step, from the poses before the step."""
         world = self._world(self._state(x)[0], np.zeros(self.nv))
         world.scene.step()
         points = [point for contact in world.system.get_contacts() for point in contact.points]
@@ -155,8 +155,8 @@ class SapienEngine(RigidEngine):
         )  # fmt: skip
 
     def _world(self, x: Array, force: Array) -> World:
-        """A scene at `x` (nx,), with `force` (nv,) on its joints; new, as PhysX keeps contacts from step to step."""
-        # PhysX's configuration is one for the whole process, and read as a system and a link are made.
+        """Create a scene at `x` (nx,) with `force` (nv,) on its joints, as PhysX keeps contacts between steps."""
+        # PhysX's configuration is global. It is read when a system and a link are created.
         of_scene, of_body = physx.get_scene_config(), physx.get_body_config()
         gravity = [float(g) for g in self.description.gravity]
         try:
@@ -193,7 +193,7 @@ class SapienEngine(RigidEngine):
             link.mass = max(rigid.mass, SMALLEST)
             link.cmass_local_pose = sapien.Pose(rigid.center_of_mass, turn)
             link.inertia = np.maximum(moments, SMALLEST)
-            link.linear_damping = link.angular_damping = 0.0  # without PhysX's drag and bounds
+            link.linear_damping = link.angular_damping = 0.0  # removes PhysX's default damping and limits
             link.max_linear_velocity = link.max_angular_velocity = UNLIMITED
             for geometry in (g for number, g in self.tree.geometries if number == i and g.name in self.groups):
                 link.attach(self._shape(geometry))
@@ -239,14 +239,14 @@ class SapienEngine(RigidEngine):
             tree.root_linear_velocity, tree.root_angular_velocity = v[j + 3 : j + 6], v[j : j + 3]
         joints = [rigid[joint.name].joint for joint in tree.active_joints]
         if joints:
-            with np.errstate(over="ignore"):  # what is beyond single precision is inf, and SimulationError
+            with np.errstate(over="ignore"):  # overflow of float32 gives inf, and SimulationError
                 tree.qpos = np.array([q[x.q_start] for x in joints]).astype(np.float32)
                 tree.qvel = np.array([v[x.v_start] for x in joints]).astype(np.float32)
                 tree.qf = np.array([force[x.v_start] for x in joints]).astype(np.float32)
 
 
 def groups_by_shape(pairs: tuple[PairContract, ...]) -> dict[str, tuple[int, int]]:
-    """Of each shape its own bit and those of its partners; those with the same partners share a bit. ModelError."""
+    """Return each shape's bit and its partners' bits. Shapes with the same partners share a bit. Raises ModelError."""
     names = sorted({name for pair in pairs for name in pair.names})
     partners = {a: frozenset(b for pair in pairs if a in pair.names for b in pair.names if b != a) for a in names}
     kinds = list(dict.fromkeys(partners[name] for name in names))
@@ -261,7 +261,7 @@ def groups_by_shape(pairs: tuple[PairContract, ...]) -> dict[str, tuple[int, int
 
 
 def _read_part(link: Any) -> tuple[float, Array, Array, Array]:
-    """Mass, centre of mass (3,), inertia (3, 3) about it and orientation of the body (3, 3), in world."""
+    """Return mass, centre of mass (3,), inertia (3, 3) about it and orientation of the body (3, 3), in world."""
     pose, frame = link.entity_pose, link.cmass_local_pose
     body = rotation(np.array(pose.q, dtype=float))
     R = body @ rotation(np.array(frame.q, dtype=float))
@@ -270,7 +270,7 @@ def _read_part(link: Any) -> tuple[float, Array, Array, Array]:
 
 
 def _read_joint(link: Any, rigid: RigidLink) -> JointContract:
-    """Where PhysX is at Drake's q = 0; springs are those of the engine."""
+    """Read a joint from PhysX at Drake's q = 0. The springs are those of the engine."""
     mass, center, inertia, body = _read_part(link)
     joint, kind = link.joint, KINDS[link.joint.type]
     single, pose = kind != "quaternion_floating", link.joint.pose_in_child
@@ -286,7 +286,7 @@ def _read_joint(link: Any, rigid: RigidLink) -> JointContract:
 
 
 def _fixed(scene: Any) -> Any:
-    """A new link that is fixed to the world."""
+    """Create a link that is fixed to the world."""
     link = physx.PhysxArticulationLinkComponent(None)
     entity = sapien.Entity()
     entity.add_component(link)
@@ -297,7 +297,7 @@ def _fixed(scene: Any) -> Any:
 
 
 def _material(friction: float | None) -> Any:
-    """SAPIEN's own where Drake gives none."""
+    """Return the material with this friction, or SAPIEN's default if friction is None."""
     if friction is None:
         return physx.get_default_material()
     return physx.PhysxMaterial(friction, friction, 0.0)

@@ -1,6 +1,6 @@
-"""Pinocchio: a model built joint by joint from Drake's plant, its RNEA derivatives in Drake's semi-implicit Euler step.
+"""Pinocchio, on a model built joint by joint from Drake's plant, with RNEA derivatives in Drake's semi-implicit Euler.
 
-`native_positions` and `turn` of `mechanics.coordinates` say how Pinocchio holds free bodies.
+`native_positions` and `turn` of `mechanics.coordinates` define Pinocchio's coordinates of free bodies.
 """
 
 from typing import Any
@@ -23,7 +23,7 @@ except ImportError as error:
 
 
 class PinocchioEngine(PlantEngine, EulerEngine):
-    """Trees of hinges, slides and free bodies; no contact and no joint limits."""
+    """An engine for trees of hinges, slides and free bodies, without contact and joint limits."""
 
     name, version, method = "pinocchio", str(pin.__version__), "analytic (RNEA derivatives)"
 
@@ -50,7 +50,7 @@ class PinocchioEngine(PlantEngine, EulerEngine):
         return np.asarray(Q.T @ needed + self.stiffness * self._stretch(q))
 
     def _needed_derivative(self, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
-        """Of Q' tau(q, Q v, Q (a - w x v)), whose Q is that of `turn`."""
+        """Return the derivatives of Q' tau(q, Q v, Q (a - w x v)), with Q from `turn`."""
         Q, native_q = turn(self.coordinates, q), native_positions(self.coordinates, q)
         native_v, native_a = Q @ v, Q @ (a - turning(self.coordinates, v))
         needed = pin.rnea(self.pin, self.data, native_q, native_v, native_a)
@@ -103,9 +103,9 @@ class PinocchioEngine(PlantEngine, EulerEngine):
 
 
 def build(links: tuple[Link, ...], gravity: Array) -> tuple[Any, float]:
-    """The pin.Model, and the potential energy of what is fixed to the world.
+    """Build the pin.Model, and compute the potential energy of the bodies that are fixed to the world.
 
-    Raises ModelError where Pinocchio takes no such inertia, or orders the joints otherwise.
+    Raises ModelError if Pinocchio does not accept an inertia, or orders the joints differently.
     """
     model, fixed = pin.Model(), 0.0
     model.gravity.linear = gravity

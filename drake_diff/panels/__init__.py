@@ -1,4 +1,4 @@
-"""Many trials from one file, on many processes, resumed where they stopped."""
+"""Evaluate many trials from one file in parallel processes, with resumption after an interruption."""
 
 from drake_diff._base import attach_stub as _attach_stub
 

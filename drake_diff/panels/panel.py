@@ -1,8 +1,8 @@
-"""Run a panel: from its file to its table, going on where an earlier run was stopped.
+"""Run a panel, from its file to its table, and resume an interrupted run.
 
-The function that the file names is evaluated in parallel through joblib: by processes of this machine, or Ray. A trial
-whose process dies is evaluated once more, alone; if that process dies too, its row is an error. Every row is the same
-for any number of workers and for both engines.
+The function that the file names is evaluated in parallel through joblib, by processes of this machine or by Ray. If the
+process of a trial dies, the trial is evaluated once more, alone. If that process dies too, its row is an error. Every
+row is the same for any number of workers and for both engines.
 """
 
 import importlib
@@ -44,28 +44,28 @@ from drake_diff.panels.results import (
 from drake_diff.runs.provenance import provenance_of
 
 ENGINES = ("local", "ray")
-WAVE = 8  # trials for each process that may end before their rows are written: a kill loses no more
-CHECK_PARENT = 0.5  # seconds between two checks of a worker that its parent lives
-# A worker has one core: its libraries start no threads.
+WAVE = 8  # trials per process in one batch, the largest loss if the run is killed
+CHECK_PARENT = 0.5  # [s] interval at which a worker checks whether its parent is alive
+# A worker uses one core, so that its libraries must not start threads.
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 Function = Callable[[dict[str, Any]], Mapping[str, Any]]
-# A worker dies when it is killed, runs out of memory, or crashes below Python.
+# A worker dies if it is killed, runs out of memory, or crashes outside Python.
 DIED: Row = {"error": "WorkerDied: the process that evaluated this trial died, and so did a second one"}
 
 
 @dataclass(frozen=True)
 class TrialFunction:
-    """What `evaluate` names: "FILE.py:function", the file beside the panel in `directory`, or "module:function".
+    """The function named by `evaluate`: "FILE.py:function" for a file in the panel's `directory`, or "module:function".
 
-    Workers run in the panel's directory, so that relative paths in a panel start from there.
+    Workers run in the panel's directory, so that paths in a panel are relative to it.
     """
 
     evaluate: str
     directory: str
 
     def load(self) -> tuple[Function, str | None]:
-        """The function, and the hash of its file, which does not cover what that imports. InputError without one."""
+        """Return the function and the hash of its file, without imported modules. Raises InputError on failure."""
         source, _, name = self.evaluate.rpartition(":")
         try:
             if source.endswith(".py"):
@@ -84,9 +84,9 @@ class TrialFunction:
 
 
 def row_of(function: Function, fields: Mapping[str, Any]) -> Row:
-    """What `function` returns for one trial, in JSON's types, or {"error": "Type: message"} where it raises.
+    """Return the result of `function` for one trial in JSON's types, or {"error": "Type: message"} if it raises.
 
-    NaN and infinity become None. The global generators of NumPy and Python start from the trial's seed.
+    NaN and infinity become None. The global generators of NumPy and Python are seeded with the trial's seed.
     """
     random.seed(fields["seed"])
     np.random.seed(fields["seed"] % 2**32)
@@ -103,7 +103,7 @@ def row_of(function: Function, fields: Mapping[str, Any]) -> Row:
 
 
 def _plain(value: Any) -> Any:
-    """`value` in JSON's types."""
+    """Convert `value` to JSON's types."""
     if isinstance(value, (np.generic, np.ndarray)):
         value = value.tolist()
     if value is None or isinstance(value, (str, bool)):
@@ -122,16 +122,16 @@ def _plain(value: Any) -> Any:
 def evaluate(
     trials: Sequence[PanelTrial], function: TrialFunction, workers: int | None, engine: str, address: str | None
 ) -> Generator[tuple[PanelTrial, Row]]:
-    """(trial, row) as they finish.
+    """Yield (trial, row) in the order in which trials finish.
 
     `workers` None means all cores that this process may use ("local"), or all of the cluster ("ray").
     """
     left = list(trials)
     if not left:
         return
-    suspects: list[PanelTrial] = []  # in flight when a process died
+    suspects: list[PanelTrial] = []  # trials in progress when a process died
     with _loky(workers) if engine == "local" else _ray(workers, address) as (count, crash):
-        # joblib evaluates in this process where n_jobs is 1: then there are two processes, and one trial at a time.
+        # For n_jobs of 1, joblib would evaluate in this process. Two processes with one trial at a time avoid this.
         options = {"n_jobs": max(2, count), "pre_dispatch": count, "batch_size": 1}
         with joblib.Parallel(**options, return_as="generator_unordered") as parallel:
             while left:
@@ -156,7 +156,7 @@ def evaluate(
 def _answers(
     parallel: Any, trials: Sequence[PanelTrial], function: TrialFunction, started: dict[str, PanelTrial]
 ) -> Iterator[tuple[PanelTrial, Row]]:
-    """(trial, row) as they finish; `started` collects those that were given to a process."""
+    """Yield (trial, row) in the order in which trials finish. `started` collects the trials sent to a process."""
 
     def tasks() -> Iterator[Any]:
         for trial in trials:
@@ -172,7 +172,7 @@ def _answers(
 
 
 def _answer(function: TrialFunction, trial: PanelTrial) -> tuple[PanelTrial, Row, str]:
-    """In the worker: the row, or why the function cannot be loaded there."""
+    """Return the row, or the reason why the worker cannot load the function. Runs in the worker."""
     try:
         call = _entered(function)
     except Exception as error:
@@ -182,25 +182,25 @@ def _answer(function: TrialFunction, trial: PanelTrial) -> tuple[PanelTrial, Row
 
 @cache
 def _entered(function: TrialFunction) -> Function:
-    """The function, loaded in the directory of its panel."""
+    """Load the function in the directory of its panel."""
     os.chdir(function.directory)
     return function.load()[0]
 
 
 @contextmanager
 def _loky(workers: int | None) -> Iterator[tuple[int, type[BaseException]]]:
-    """Processes of this machine; how many, and the error of one that died."""
+    """Start processes on this machine, and yield their number and the error type of a dead process."""
     count = workers or joblib.cpu_count()
     options = {"inner_max_num_threads": 1, "initializer": _begin, "initargs": (os.getpid(),)}
     try:
         with joblib.parallel_config(backend="loky", **options):
             yield count, BrokenProcessPool
-    finally:  # finished trials are on the disk; others are evaluated again by the next call
+    finally:  # finished trials are on disk, and the next call evaluates the others
         get_reusable_executor().shutdown(kill_workers=True)
 
 
 def _begin(parent: int) -> None:
-    """In a new worker: ignore Ctrl-C, which a terminal sends to all processes, and end with the parent."""
+    """Initialize a worker: ignore Ctrl-C, which a terminal sends to all processes, and end with the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def end_with_parent() -> None:
@@ -213,7 +213,7 @@ def _begin(parent: int) -> None:
 
 @contextmanager
 def _ray(workers: int | None, address: str | None) -> Iterator[tuple[int, type[BaseException]]]:
-    """The cluster at `address`, or one on this machine that listens on loopback only."""
+    """Connect to the cluster at `address`, or start one on this machine that listens on loopback only."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     if address is None:
         os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # makes Ray take the loopback address, on Linux too
@@ -224,7 +224,7 @@ def _ray(workers: int | None, address: str | None) -> Iterator[tuple[int, type[B
         raise MissingDependencyError(f"Ray is not installed ({error}): pip install 'drake-diff[cluster]'") from error
 
     class Streaming(RayBackend):  # type: ignore[misc]
-        """Ray's backend of joblib, which returns results as they come, and no trial in place of a lost one."""
+        """Ray's joblib backend, with results in the order of completion, and a placeholder for a lost trial."""
 
         supports_return_generator = True
 
@@ -246,7 +246,7 @@ def _ray(workers: int | None, address: str | None) -> Iterator[tuple[int, type[B
         if address is None and ray.util.get_node_ip_address() != "127.0.0.1":
             expected = "no import of ray before run_panel, so that Ray listens on loopback only"
             raise InputError("ray", got="an earlier import", expected=expected)
-        # A process that died is started again, and Ray evaluates its trial once more.
+        # Ray restarts a process that died, and evaluates its trial once more.
         options = {"max_restarts": -1, "max_task_retries": 1, "scheduling_strategy": "SPREAD"}
         with joblib.parallel_config(backend="ray", ray_remote_args=options):
             yield workers or int(ray.cluster_resources().get("CPU", 1)), ray.exceptions.RayError
@@ -255,7 +255,7 @@ def _ray(workers: int | None, address: str | None) -> Iterator[tuple[int, type[B
 
 
 def _check_listens(address: str | None) -> None:
-    """Refuse an address where nothing listens: Ray waits for minutes, and then ends this process."""
+    """Raise InputError if no server listens at the address. Ray would wait for minutes and end this process."""
     host, _, port = (address or "").rpartition(":")
     try:
         if address is not None:
@@ -276,28 +276,28 @@ def run_panel(
     address: str | None = None,
     progress: Progress | None = None,
 ) -> PanelTable:
-    r"""Evaluate every trial of a panel file in parallel, and write the table and summary of what was found.
+    r"""Evaluate every trial of a panel file in parallel, and write the table and summary of the results.
 
-    Each finished trial has at once its record in `trials/`. After a kill or Ctrl-C the same call evaluates only what
-    is missing. Table and summary are the same to the byte as without the interruption, for any number of workers and
-    for both engines. A trial that raises is a row with the column `error`. `dd.load_record`, `dd.verify` and
-    `drake-diff list` take the directory, and the record of each trial in it.
+    The record of each finished trial is written to `trials/` immediately. After a kill or Ctrl-C, the same call
+    evaluates only the missing trials. Table and summary are the same to the byte as without the interruption, for any
+    number of workers and for both engines. A trial that raises an error is a row with the column `error`.
+    `dd.load_record`, `dd.verify` and `drake-diff list` accept the directory, and the record of each trial in it.
 
     Args:
-        path: the panel, a TOML file; `drake_diff.panels.results` says what stands in it.
-        out: the directory to write; artifacts/<name of the file> where None.
-        workers: how many processes; None means one for each core.
+        path: The panel, a TOML file in the format described in `drake_diff.panels.results`.
+        out: The output directory. The default is artifacts/<name of the file>.
+        workers: The number of processes. None means one for each core.
         engine: "local" (processes of this machine) or "ray".
-        address: "HOST:PORT" of a running Ray cluster; None starts one on this machine.
-        progress: called with the numbers of finished trials, of all trials and of errors.
+        address: "HOST:PORT" of a running Ray cluster. None starts one on this machine.
+        progress: Called with the numbers of finished trials, of all trials and of errors.
 
     Returns:
         The rows and the summary, as in `table.csv` and `summary.json`.
 
     Raises:
-        InputError: the panel file is wrong, its function cannot be loaded, or `out` holds what no panel wrote.
-        ArtifactError: `out` holds another panel or a damaged record, or another process is writing there.
-        MissingDependencyError: Ray is asked for and not installed.
+        InputError: The panel file is invalid, its function cannot be loaded, or `out` has files not from a panel.
+        ArtifactError: `out` contains another panel or a damaged record, or another process is writing there.
+        MissingDependencyError: Ray is requested and not installed.
 
     Example:
         >>> from pathlib import Path
@@ -320,7 +320,7 @@ def run_panel(
     function = TrialFunction(panel.evaluate, str(path.resolve().parent))
     _, function_sha256 = function.load()
     used = provenance_of()
-    # What must be the same for two trials to stand in one table.
+    # The conditions that must be equal for all trials of a table.
     made = {
         "sha256": panel.sha256,
         "evaluate": panel.evaluate,

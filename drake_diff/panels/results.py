@@ -1,20 +1,20 @@
-"""A panel: its file, the trials that it stands for, and what it writes.
+"""The file of a panel, its trials, and its results.
 
-That is a record of each finished trial, which a later run goes on from, and at the end the table, summary and ranking
-that are made of these records. The file is TOML, and may say:
+The results are a record of each finished trial, from which a later run can resume, and at the end the table, summary
+and ranking of all records. The file is TOML with these fields:
 
-evaluate = "trials.py:balance"   # a file beside this one, or "package.module:function"
+evaluate = "trials.py:balance"   # a file in the same directory, or "package.module:function"
 seed = 0
 seeds = 20                       # trials of each cell
 
-[axes]                           # every combination of their values is a cell
+[axes]                           # every combination of the values is a cell
 method = ["ilqr", "shooting"]
 level = [0.0, 0.1]
 
-[fixed]                          # the same in all trials
+[fixed]                          # equal in all trials
 model = "models/pendulum.urdf"
 
-[[cells]]                        # one more cell
+[[cells]]                        # an additional cell
 method = "none"
 """
 
@@ -46,13 +46,13 @@ from drake_diff.runs.fields import FiniteTable, SealedRecord, read_fields
 from drake_diff.runs.other_records import TRIALS, ComparisonRecord, PanelSection, TrialSection, trial_record
 from drake_diff.runs.provenance import header
 
-# Names of what drake_diff itself gives each trial; an axis, cell or fixed value cannot have them.
+# Names of the fields that drake_diff adds to each trial, which axes, cells and fixed values cannot use.
 OURS = ("id", "repeat", "seed")
-Row = dict[str, Any]  # what came of a trial, in JSON's types
+Row = dict[str, Any]  # result of a trial, in JSON's types
 
 
 class Panel(BaseModel):
-    """What a panel file says."""
+    """The content of a panel file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -84,17 +84,17 @@ class Panel(BaseModel):
 
     @property
     def sha256(self) -> str:
-        """The hash of what the file says; comments and the order of its tables do not change it."""
+        """The hash of the file's content, independent of comments and of the order of its tables."""
         return sha256(canonical(self.model_dump())).hexdigest()
 
 
 @dataclass(frozen=True)
 class PanelTrial:
-    """One trial of a panel: its `cell` (its values on the axes) and `fields`, all that its function is given.
+    """A trial of a panel: its `cell` (its values on the axes) and `fields`, the arguments of its function.
 
-    `fields` are the cell, the fixed values, `repeat` (its number within the cell, from 0) and its own `seed` of 53
-    bits, drawn from the panel's seed and all other fields, so that a new value on an axis changes no other trial.
-    `id` is the start of the SHA-256 of the fields.
+    `fields` are the cell, the fixed values, `repeat` (its number within the cell, from 0) and a `seed` of 53 bits. The
+    seed is drawn from the panel's seed and all other fields, so that a new value on an axis does not change other
+    trials. `id` is the start of the SHA-256 of the fields.
     """
 
     cell: dict[str, Any]
@@ -106,22 +106,22 @@ class PanelTrial:
 
     @property
     def name(self) -> str:
-        """As people read it: `method=ilqr level=0.1 repeat=3`."""
+        """The readable name, such as `method=ilqr level=0.1 repeat=3`."""
         return f"{cell_name(self.cell)} repeat={self.fields['repeat']}"
 
 
 def canonical(value: Any) -> bytes:
-    """The same value always gives the same JSON: sorted keys, no spaces, no NaN."""
+    """Convert a value to canonical JSON: sorted keys, no spaces, no NaN."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
 def cell_name(cell: dict[str, Any]) -> str:
-    """A cell in one line."""
+    """Format a cell in one line."""
     return " ".join(f"{k}={v if isinstance(v, str) else canonical(v).decode()}" for k, v in cell.items())
 
 
 def load_panel(path: Path) -> Panel:
-    """The panel in the TOML file at `path`; InputError names every wrong entry."""
+    """Read the panel in the TOML file at `path`. Raises InputError with all invalid entries."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -135,7 +135,7 @@ def load_panel(path: Path) -> Panel:
 
 
 def expand(panel: Panel) -> tuple[PanelTrial, ...]:
-    """Every trial: the axes' combinations (the last axis fastest), then the cells, each `panel.seeds` times."""
+    """Return all trials: the axes' combinations (last axis fastest), then the cells, each `panel.seeds` times."""
     axes: dict[str, Any] = panel.axes
     combinations = product(*axes.values()) if axes else ()
     cells = [*(dict(zip(axes, values, strict=True)) for values in combinations), *panel.cells]
@@ -152,24 +152,24 @@ def expand(panel: Panel) -> tuple[PanelTrial, ...]:
 
 
 TABLE, SUMMARY, PAGE = "table.csv", "summary.json", "panel.html"
-STATED = ("panel", "verdict", "sentence")  # of the record of a panel, by its table
-RANKED = ("place", "name", "apart", "trials", "errors", "success", "numbers")  # of a cell in the record of a panel
-SHOWN_CELLS = 8  # in a repr
-COST = "cost"  # the number that ranks where nothing is judged, and among equals: less is better
+STATED = ("panel", "verdict", "sentence")  # fields of a panel's record that follow from its table
+RANKED = ("place", "name", "apart", "trials", "errors", "success", "numbers")  # fields of a cell in a panel's record
+SHOWN_CELLS = 8  # number of cells in a repr
+COST = "cost"  # the number that ranks cells without success rates or with equal rates; less is better
 
 
 class Finished:
-    """The rows of the finished trials, by id, each in the record of its trial on the disk."""
+    """The rows of the finished trials by id, each saved in the record of its trial."""
 
     def __init__(self, directory: Path, conditions: Mapping[str, Any]):
         self.folder, self.conditions = directory / TRIALS, dict(conditions)
         make_folder(self.folder)
-        for partial in self.folder.glob("*.partial"):  # a killed process leaves a record half written
+        for partial in self.folder.glob("*.partial"):  # incomplete records of a killed process
             partial.unlink()
         self.rows = {path.stem: self._read(path) for path in sorted(self.folder.iterdir())}
 
     def add(self, trial: PanelTrial, row: Row) -> None:
-        """Write the record of a finished trial to the disk."""
+        """Write the record of a finished trial to disk."""
         record = trial_record(trial.id, trial.name, trial.cell, trial.fields, row, self.conditions)
         write_whole(self.folder / f"{trial.id}.json", record.to_json().encode())
         self.rows[trial.id] = row
@@ -185,10 +185,10 @@ class Finished:
 
 @contextmanager
 def finished_trials(directory: Path, begun: ComparisonRecord, conditions: Mapping[str, Any]) -> Iterator[Finished]:
-    """What an earlier run of the panel finished in `directory`, in which nobody else writes while the block runs.
+    """Lock `directory` for the duration of the block, and yield the trials that an earlier run finished in it.
 
-    ArtifactError where the directory is another panel's, where a record is damaged, or where another process writes
-    there; InputError where the directory holds what no panel wrote.
+    Raises ArtifactError if the directory belongs to another panel, a record is damaged, or another process writes
+    there. Raises InputError if the directory contains files that are not from a panel.
     """
     with writing(directory.resolve()):
         if is_taken(directory):
@@ -199,7 +199,7 @@ def finished_trials(directory: Path, begun: ComparisonRecord, conditions: Mappin
 
 def _check_same_panel(directory: Path, conditions: Mapping[str, Any]) -> None:
     record = None
-    with suppress(ArtifactError):  # what has no record of a panel is refused below
+    with suppress(ArtifactError):  # a directory without a panel's record raises an error below
         record = load_record(directory)
     if not isinstance(record, ComparisonRecord) or record.panel is None:
         expected = "a new or empty directory, or the directory of an unfinished panel"
@@ -213,7 +213,7 @@ def _check_same_panel(directory: Path, conditions: Mapping[str, Any]) -> None:
 
 
 def _read_trial(path: Path) -> tuple[TrialSection, tuple[str, ...]]:
-    """The record of a trial, and what in it is damaged or does not fit its inputs."""
+    """Return the record of a trial, and its problems: damage, or values that do not match the inputs."""
     record, problems = read_checked(path)
     trial = record.trial if isinstance(record, ComparisonRecord) else None
     if trial is None:
@@ -224,7 +224,7 @@ def _read_trial(path: Path) -> tuple[TrialSection, tuple[str, ...]]:
 
 
 def _follows(path: Path, record: SealedRecord, trial: TrialSection) -> bool:
-    """Whether all of a trial's record follows from its inputs, its result and the panel's conditions."""
+    """Return whether the whole record of a trial follows from its inputs, its result and the panel's conditions."""
     if not trial.cell.items() <= trial.inputs.items() or not {"repeat", "seed"} <= trial.inputs.keys():
         return False
     made = PanelTrial(trial.cell, trial.inputs)
@@ -238,11 +238,11 @@ def _follows(path: Path, record: SealedRecord, trial: TrialSection) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class PanelTable(ShowsItsRepr):
-    """What `run_panel` found.
+    """The result of `run_panel`.
 
-    `rows` has a row for each trial, in the panel's order: its cell, id, repeat and seed, then what its function
-    returned. `summary` has the counts, means and success rates of each cell. They are what `table.csv` and
-    `summary.json` in `directory` hold.
+    `rows` has a row for each trial, in the panel's order: its cell, id, repeat and seed, then the values that its
+    function returned. `summary` contains the counts, means and success rates of each cell. They are equal to the
+    contents of `table.csv` and `summary.json` in `directory`.
     """
 
     directory: Path
@@ -251,7 +251,7 @@ class PanelTable(ShowsItsRepr):
 
     @property
     def errors(self) -> int:
-        """How many trials ended in an error."""
+        """The number of trials with an error."""
         return int(self.summary["errors"])
 
     def __repr__(self) -> str:
@@ -269,8 +269,8 @@ class PanelTable(ShowsItsRepr):
 def write_table(
     directory: Path, trials: Sequence[PanelTrial], results: Mapping[str, Row], made: Mapping[str, Any]
 ) -> PanelTable:
-    """Write `table.csv`, `summary.json` and the ranking of all `trials`; `made` says what the panel is."""
-    results = {name: dict(sorted(row.items())) for name, row in results.items()}  # as in the records of trials
+    """Write `table.csv` and `summary.json` for all `trials`. `made` contains the conditions of the panel."""
+    results = {name: dict(sorted(row.items())) for name, row in results.items()}  # in the order of trial records
     cells: dict[bytes, list[PanelTrial]] = {}
     for trial in trials:
         cells.setdefault(canonical(trial.cell), []).append(trial)
@@ -291,7 +291,7 @@ def write_table(
 
 
 def begun_record(directory: Path, trials: int, made: Mapping[str, Any]) -> ComparisonRecord:
-    """The record while trials are missing."""
+    """Return the record of an unfinished panel."""
     return ComparisonRecord(
         verdict="incomplete",
         sentence="the panel has started and not finished: it is still running, or it was killed",
@@ -301,7 +301,7 @@ def begun_record(directory: Path, trials: int, made: Mapping[str, Any]) -> Compa
 
 
 def ended_record(begun: ComparisonRecord, table: PanelTable, seconds: float) -> ComparisonRecord:
-    """The record at the end; `seconds` is how long this call of the panel took."""
+    """Return the record of a finished panel. `seconds` is the duration of this call."""
     by, rows = ranked(table.summary)
     ranking = [{key: row[key] for key in RANKED if key in row} for row in rows]
     results = {"errors": table.errors, "ranked_by": by, "ranking": ranking}
@@ -318,11 +318,11 @@ def ended_record(begun: ComparisonRecord, table: PanelTable, seconds: float) -> 
 
 
 def ranked(summary: Mapping[str, Any]) -> tuple[str, list[dict[str, Any]]]:
-    """By what the cells of `summary` are ranked, and a row for each, the best first.
+    """Return the criterion by which the cells of `summary` are ranked, and a row for each cell, the best first.
 
-    Cells with a success rate are ranked by the lower end of its 95 % interval, equals by the mean cost; others by the
-    mean cost. A trial that ended in an error is no success, and has no cost: of cells without rates those with fewer
-    errors come first. `apart` says whether the interval of a cell lies below that of the best; None without rates.
+    Cells with success rates are ranked by the lower end of the 95 % interval, then by the mean cost. Cells without
+    success rates are ranked by the number of errors, then by the mean cost. A trial with an error is not a success and
+    has no cost. `apart` is whether the interval of a cell is below that of the best cell, or None without rates.
     """
     cells = summary["cells"]
     judged = all("success" in cell for cell in cells)
@@ -331,7 +331,7 @@ def ranked(summary: Mapping[str, Any]) -> tuple[str, list[dict[str, Any]]]:
         cost = cell["numbers"].get(COST, {}).get("mean", float("inf"))
         return (-cell["success"]["low"] if judged else cell["errors"], cost)
 
-    ordered = sorted(cells, key=key)  # equals stay in the panel's order
+    ordered = sorted(cells, key=key)  # equal cells keep the panel's order
     keys = [key(cell) for cell in ordered]
     rows = [
         {
@@ -353,13 +353,13 @@ def write_ranking(path: Path, summary: Mapping[str, Any], record: ComparisonReco
     """Write the page of a panel's `summary` and its `record`."""
     by, rows = ranked(summary)
     stated = record.model_dump(mode="json", include={"name", "verdict", "provenance"})
-    stated = json.loads(canonical(stated))  # in the order in which the record is written
+    stated = json.loads(canonical(stated))  # in the order of the record's file
     shown = {**stated, "sentence": f"{rows[0]['name']} is the best of {len(rows)} cells, by {by}", **summary}
     write_page(path, "panel.html.j2", record=shown, data=page_data(0.0, []), rows=rows)
 
 
 def _csv(rows: Sequence[Row], answered: set[str]) -> bytes:
-    """RFC 4180: the cells' columns before the function's, each in the order in which it first appears; error last."""
+    """Format rows by RFC 4180: columns of cells, then of the function, in order of first appearance, then error."""
     names = list(dict.fromkeys(name for row in rows for name in row))
     given = [name for name in names if name not in {*answered, "repeat", "seed"}]
     columns = [*given, "repeat", "seed", *(name for name in names if name in answered - {"error"}), "error"]
@@ -369,12 +369,12 @@ def _csv(rows: Sequence[Row], answered: set[str]) -> bytes:
 
 
 def _text(value: Any) -> str:
-    """A value in a field: nothing for null, words as they are, everything else as in JSON."""
+    """Format a value for a field: "" for None, strings unchanged, other values as JSON."""
     return "" if value is None else value if isinstance(value, str) else canonical(value).decode()
 
 
 def _cell(cell: dict[str, Any], rows: Sequence[Row], judged: bool) -> dict[str, Any]:
-    """One cell: a trial that ended in an error is no success."""
+    """Summarize one cell. A trial with an error does not count as a success."""
     numbers: dict[str, list[float]] = {}
     for name, value in (item for row in rows for item in row.items()):
         if isinstance(value, (int, float)) and not isinstance(value, bool):
@@ -386,7 +386,7 @@ def _cell(cell: dict[str, Any], rows: Sequence[Row], judged: bool) -> dict[str, 
     summary["numbers"] = {
         name: {
             "count": len(values),
-            "mean": statistics.mean(values),  # its sums are exact and rounded once
+            "mean": statistics.mean(values),  # the sum is exact, and rounded once
             "std": statistics.stdev(values) if len(values) > 1 else None,
             "min": min(values),
             "max": max(values),
@@ -397,7 +397,7 @@ def _cell(cell: dict[str, Any], rows: Sequence[Row], judged: bool) -> dict[str, 
 
 
 def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Reproduced:
-    """What of a panel's directory, or of the record of one trial at `folder`, does not follow from the trials."""
+    """Write the page again, and report differences of a panel's directory or of a trial's record at `folder`."""
     if record.trial is not None:
         return Reproduced({}, {}, problems=tuple(_odd_trial(folder)))
     with TemporaryDirectory() as location:
@@ -408,7 +408,7 @@ def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Re
 
 
 def _odd_trial(path: Path) -> Iterator[str]:
-    """What of a trial does not fit its inputs, or the panel's record and table where they are beside it."""
+    """Yield problems of a trial: values that do not match its inputs, or the panel's record and table if present."""
     trial, problems = _read_trial(path)
     yield from problems
     panel = path.parent.parent
@@ -421,9 +421,9 @@ def _odd_trial(path: Path) -> Iterator[str]:
 
 
 def _odd_panel(folder: Path, record: ComparisonRecord, again: Path) -> list[str]:
-    """What of the table, the summary and the record of a panel does not come out of the records of its trials again.
+    """Return differences of a panel's table, summary and record from those computed again from its trials.
 
-    They are made in the folder `again`, and the page with them.
+    The new files, including the page, are written to the folder `again`.
     """
     if record.panel is None:
         raise ArtifactError(f"{record.FILE}: expected the record of a panel")
@@ -432,7 +432,7 @@ def _odd_panel(folder: Path, record: ComparisonRecord, again: Path) -> list[str]
     result = [f"{TABLE} and {TRIALS}: only one of them has trial {name}" for name in sorted(listed ^ table.keys())]
     if result:
         return result
-    # Records sort names; the summary has those of a cell in the panel's order.
+    # Records have sorted names. The summary has the names of a cell in the panel's order.
     ordered = {canonical(entry["cell"]): entry["cell"] for entry in summary.get("cells") or ()}
     trials, rows = [], {}
     for name in table:
@@ -454,7 +454,7 @@ def _odd_panel(folder: Path, record: ComparisonRecord, again: Path) -> list[str]
 
 
 def _read_table(path: Path) -> dict[str, dict[str, str]]:
-    """The rows of a table by the id of their trial; ArtifactError where it is none."""
+    """Return the rows of a table by trial id. Raises ArtifactError if the file is not a table of trials."""
     data = read_plain(path, MOST_TEXT)
     most = csv.field_size_limit(len(data) + 1)
     try:
@@ -463,6 +463,6 @@ def _read_table(path: Path) -> dict[str, dict[str, str]]:
         raise ArtifactError(f"{TABLE}: not a table of trials: {type(error).__name__}: {error}") from error
     finally:
         csv.field_size_limit(most)
-    if any(not name.isalnum() for name in rows):  # it becomes a path
+    if any(not name.isalnum() for name in rows):  # ids are used in paths
         raise ArtifactError(f"{TABLE}: expected ids of trials, got other names")
     return rows

@@ -1,4 +1,4 @@
-"""A plan under perturbations: how often it succeeds, and why it fails."""
+"""Success rates of a plan under perturbations, and the causes of failures."""
 
 from drake_diff._base import attach_stub as _attach_stub
 

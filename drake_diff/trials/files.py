@@ -1,6 +1,7 @@
-"""Robustness saved: its record, a page, a row for each trial, and the worst trials as directories of their own.
+"""Write robustness results: the record, a page, a row for each trial, and a directory for each of the worst trials.
 
-A trial on disk is what it was, a trace of all that the loop saw and did, a replay beside the plan, and its latencies.
+A saved trial consists of its description, a trace of all signals in the loop, a replay together with the plan, and its
+latencies.
 """
 
 from __future__ import annotations
@@ -47,25 +48,25 @@ PLAIN = Loop()
 
 
 def save_robustness(result: Robustness, directory: str | Path, run: str | Path | None = None) -> PlanRecord:
-    """Write the directory of a robustness result: report, every trial's row, and the worst trials in full.
+    """Write the directory of a robustness result: the report, a row for each trial, and the worst trials in full.
 
-    robustness.html is the report, trials.csv has a row for each trial, and worst/NAME_LEVEL/ has, for each
-    perturbation, the worst trial at the lowest level where one fails (without a failure, the one furthest from the
-    goal): trial.json, trace.mcap, replay.html, latencies.json. All of it is written beside `directory`, and takes its
-    place at the end. The same trials give the same bytes, but for wall-clock times.
+    robustness.html is the report, and trials.csv has a row for each trial. For each perturbation, worst/NAME_LEVEL/
+    contains the worst trial at the lowest level with a failure (without a failure, the trial furthest from the goal):
+    trial.json, trace.mcap, replay.html, latencies.json. The files are written to a temporary directory, which replaces
+    `directory` at the end. The same trials give the same bytes, except for wall-clock times.
 
     Args:
-        result: what `robustness` returned.
-        directory: where to write; it is created, and an earlier run there is replaced.
-        run: the run directory that the plan is from, if there is one: its trials can then be run again from it.
+        result: The result of `robustness`.
+        directory: The output directory. It is created, and replaces an earlier run.
+        run: The run directory of the plan, if there is one, from which the trials can be run again.
 
     Returns:
         The record, as in record.json.
 
     Raises:
-        InputError: `directory` holds what no run wrote.
-        ArtifactError: there is no record in `run`.
-        WriteError: the disk is full, or does not let a file be written.
+        InputError: `directory` contains files that are not from a run.
+        ArtifactError: There is no record in `run`.
+        WriteError: The disk is full or does not permit writing.
 
     Example:
         >>> from tempfile import mkdtemp
@@ -82,7 +83,7 @@ def save_robustness(result: Robustness, directory: str | Path, run: str | Path |
 
 
 def write_robustness(result: Robustness, folder: Path, run: str | Path | None) -> PlanRecord:
-    """Write what `save_robustness` does into `folder`, which `written_whole` gave."""
+    """Write the files of `save_robustness` to `folder`, which comes from `written_whole`."""
     task, name = result.task, name_of(folder)
     source = None if run is None else RunEvidence(path=str(run), record_sha256=load_plan_record(run).record_sha256)
     sentence = "the trials are still being written, or writing them was killed or failed"
@@ -111,7 +112,7 @@ def write_robustness(result: Robustness, folder: Path, run: str | Path | None) -
 
 
 def _is_repeatable(task: Task) -> bool:
-    """Whether a trial can be run again from what trial.json says: nothing in its loop is a user's."""
+    """Return whether a trial can be run again from trial.json alone, which requires a loop without custom parts."""
     loop, named = task.loop, ("sensor", "actuator", "fallback", "substeps")
     plain_loop = all(repr(getattr(loop, name)) == repr(getattr(PLAIN, name)) for name in named)
     return plain_loop and isinstance(task.controller, str) and type(loop.estimator) is Hold and not loop.pushes
@@ -142,7 +143,7 @@ def _times(result: Robustness, clock: WallClock) -> WallClock:
 
 
 def _table(result: Robustness) -> str:
-    """A row for each trial: all that the rates are made of."""
+    """Return the table with a row for each trial, from which the rates are computed."""
     text = io.StringIO(newline="")
     rows = csv.writer(text, lineterminator="\n")
     ends = [f"last {name}" for name in result.task.model.state_names]
@@ -155,14 +156,14 @@ def _table(result: Robustness) -> str:
 
 
 def _page_facts(folder: Path, record: PlanRecord) -> dict[str, Any]:
-    """What the page is written of, but for its plots: the record, and the worst trial of the weakest point."""
+    """Return the data of the page without plots: the record, and the worst trial of the weakest perturbation."""
     section: Any = record.robustness
     worst = weakest_of(section.perturbations).worst
     trial: Any = read_fields(folder / worst / TRIAL)
     reason = trial["reason"] or "it succeeds, but it ends furthest from the goal of all trials"
     much = sized(trial["perturbation"], trial["level"])
     return {
-        "record": json.loads(canonical(record.model_dump(mode="json"))),  # in the order in which it is written
+        "record": json.loads(canonical(record.model_dump(mode="json"))),  # in the order of the file
         "view": read_plain(folder / worst / REPLAY).decode(errors="replace"),
         "caption": f"The worst trial of {trial['perturbation']} {much}, with the plan as a ghost: {reason}.",
         "enough": ENOUGH,
@@ -171,7 +172,7 @@ def _page_facts(folder: Path, record: PlanRecord) -> dict[str, Any]:
 
 
 def reproduce(folder: Path, record: PlanRecord, models: Path | None) -> Reproduced:
-    """The sentence and the pages of a robustness record, with the plots and the motions that those in `folder` have."""
+    """Write the sentence and pages of a robustness record again, with the plots and motions of those in `folder`."""
     from drake_diff.pages.meshcat import replay_again
 
     section, files = record.robustness, dict[str, bytes]()
@@ -193,7 +194,7 @@ def reproduce(folder: Path, record: PlanRecord, models: Path | None) -> Reproduc
 
 
 def robustness_data(result: Robustness) -> dict[str, Any]:
-    """What the page draws; see `page_data`."""
+    """Return the plots of the page, see `page_data`."""
     task = result.task
     plots = list(_trial_plots(task, result.worst(result.weakest).worst))
     for name in result.names:
@@ -202,7 +203,7 @@ def robustness_data(result: Robustness) -> dict[str, Any]:
 
 
 def _trial_plots(task: Task, trial: Trial) -> Iterator[Plot]:
-    """Of one trial: each coordinate as it was, seen, estimated and planned; the inputs; the controller's status."""
+    """Yield plots of a trial: actual, measured, estimated and planned coordinates, inputs, controller status."""
     run, setup = trial.outcome.run, perturbed(task.setup, trial.levels, trial.seed)
     planned = planned_states(task, setup)
     planned_us = np.repeat(task.us, (len(planned) - 1) // len(task.us), axis=0)
@@ -210,7 +211,7 @@ def _trial_plots(task: Task, trial: Trial) -> Iterator[Plot]:
 
 
 def _level_plots(result: Robustness, name: str) -> Iterator[Plot]:
-    """Of one perturbation, over its levels: success, displacement, and where every trial ends."""
+    """Yield plots of a perturbation over its levels: success, displacement, and the last state of every trial."""
     task, cells = result.task, result.of(name)
     levels = [c.level for c in cells]
     axis_options: dict[str, Any] = {"axis": "level", "levels": True, "marks": "both", "place": name}
@@ -225,7 +226,7 @@ def _level_plots(result: Robustness, name: str) -> Iterator[Plot]:
     moved += [Line("predicted", [c.predicted for c in cells], dashed=True)] if known else []
     note = "" if known else "no gradient predicts it"
     yield Plot("displacement of the last state", "q, v", levels, moved, log=True, note=note, **axis_options)
-    # Last states in the two coordinates that spread most for what is tolerated, a colour for each level and the plan.
+    # Last states in the two coordinates that spread most relative to the scale, one colour per level and for the plan.
     ends = [*(np.array([e.last for e in c.endings]) for c in cells), task.xs[-1:]]
     spread = np.ptp(np.vstack(ends), axis=0) / task.plan.scale
     i, j = sorted(np.argsort(-spread, kind="stable")[:2])
@@ -242,14 +243,13 @@ def _level_plots(result: Robustness, name: str) -> Iterator[Plot]:
 
 
 TRIAL, TRACE, REPLAY, LATENCIES = "trial.json", "trace.mcap", "replay.html", "latencies.json"
-FAR = f", drawn up to {FURTHEST:g} only"  # in the title of such a page
+FAR = f", drawn up to {FURTHEST:g} only"  # title of a page with a clipped motion
 
 
 def write_trial(folder: Path, task: Task, trial: Trial, run: str | None) -> None:
-    """Write trial.json, trace.mcap, replay.html and latencies.json of `trial` into `folder`.
+    """Write trial.json, trace.mcap, replay.html and latencies.json of `trial` to `folder`.
 
-    `run` is the run directory that its plan is from, if there is one. The same trial gives the same bytes, but for the
-    latencies.
+    `run` is the run directory of its plan, if there is one. The same trial gives the same bytes, except for latencies.
     """
     from drake_diff.pages.meshcat import write_replay
     from drake_diff.pages.scene import BLUE, scene_of
@@ -278,7 +278,7 @@ def write_trial(folder: Path, task: Task, trial: Trial, run: str | None) -> None
     with applied(select(setup.model, setup.parameters)) as model:
         _write_trace(folder / TRACE, Shown(model, model.time_step, planned, motion), trial)
         xs, ghost = (np.clip(states, -FURTHEST, FURTHEST) for states in (motion.xs, planned))
-        xs = xs if len(xs) > 1 else np.repeat(xs, 2, axis=0)  # it broke off at once
+        xs = xs if len(xs) > 1 else np.repeat(xs, 2, axis=0)  # the run stopped before its first step
         times = np.asarray(model.time_step * np.arange(len(xs)), dtype=float)
         contacts = motion.contacts if len(motion.contacts) == len(xs) - 1 else ()
         scene = scene_of(model, times, xs, us=motion.us, contacts=contacts, ghosts={"plan": (ghost[: len(xs)], BLUE)})
@@ -287,13 +287,13 @@ def write_trial(folder: Path, task: Task, trial: Trial, run: str | None) -> None
 
 
 def planned_states(task: Task, setup: Setup) -> Array:
-    """(n+1, nx) of the plan at each step of the plant of `setup`."""
+    """Return the states (n+1, nx) of the plan at each step of the plant of `setup`."""
     finer = round(task.model.time_step / setup.model.time_step)
     return np.asarray(task.plan.sample(task.parts * finer)[0])
 
 
 def _write_trace(path: Path, shown: Shown, trial: Trial) -> None:
-    """`shown` has the motion of the trial and the plan. Latencies differ each time and are not in it."""
+    """Write the trace of the trial and the plan in `shown`, without latencies, as these differ in each run."""
     run, event, planned = trial.outcome.run, TYPES["Event"].cls, shown.planned_xs
     contract = shown.model.contract
     events = [event(time=e.t, kind=e.kind, message=e.message) for e in run.events]

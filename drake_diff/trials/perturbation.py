@@ -1,7 +1,7 @@
-"""Perturbations: named, seeded changes of the plant, its start and what is around the controller.
+"""Perturbations: named, seeded changes of the plant, the initial state, the sensor, the actuator and external forces.
 
-A level says how large a change is. U is uniform in [-level, level], N normal with standard deviation `level`, drawn
-anew for every number. Perturbations that are applied together do not disturb each other's draws.
+The level is the size of a change. U is uniform in [-level, level], and N is normal with standard deviation `level`,
+both drawn independently for every number. The draws of a perturbation do not depend on other perturbations.
 """
 
 import zlib
@@ -25,7 +25,7 @@ Levels = Mapping[str, Sequence[float]]
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What is run: the plant and its parameters by name, the start, what is around the controller, and how long."""
+    """The setup of a run: the plant and its parameters by name, the initial state, the loop, and the duration."""
 
     model: Model
     x0: Array
@@ -36,17 +36,17 @@ class Setup:
 
 @dataclass(frozen=True)
 class Perturbation:
-    """One kind of change, with the unit of its levels, the usual levels, and what it does."""
+    """A kind of perturbation, with the unit of its levels, the default levels, and its meaning."""
 
     name: str
     unit: str
     levels: tuple[float, ...]
     meaning: str
     apply: Callable[[Setup, float, Random], Setup]
-    quantity: str = ""  # whose parameters it scales, if any
+    quantity: str = ""  # quantity whose parameters are scaled, if any
 
     def applies_to(self, model: Model) -> bool:
-        """Whether there is anything in `model` for it to change."""
+        """Return whether the perturbation changes anything in `model`."""
         if self.quantity:
             return bool(parameters_of(model, self.quantity))
         if self.name in ("contact_approximation", "time_step"):
@@ -55,12 +55,12 @@ class Perturbation:
         return model.nu > 0 or self.name in ("initial_state", "push")
 
     def with_unit(self, level: float) -> str:
-        """A level with its unit."""
+        """Format a level with its unit."""
         return f"{level:g}" + ("" if self.unit == "1" else f" {self.unit}")
 
 
 def perturbation_for(name: str, model: Model | None = None) -> Perturbation:
-    """The perturbation called `name`. UnknownNameError; InputError where it changes nothing in `model`."""
+    """Return the perturbation `name`. Raises UnknownNameError, or InputError if it does not apply to `model`."""
     if name not in PERTURBATIONS:
         raise UnknownNameError("perturbation", got=name, known=PERTURBATIONS)
     if model is not None and not PERTURBATIONS[name].applies_to(model):
@@ -69,7 +69,7 @@ def perturbation_for(name: str, model: Model | None = None) -> Perturbation:
 
 
 def perturbed(setup: Setup, levels: Mapping[str, float], seed: int) -> Setup:
-    """`setup` with the perturbations in `levels`, in the order of PERTURBATIONS. UnknownNameError, InputError."""
+    """Apply the perturbations in `levels`, in the order of PERTURBATIONS. Raises UnknownNameError, InputError."""
     for name, level in levels.items():
         perturbation_for(name, setup.model)
         if not (np.isfinite(level) and level >= 0):
@@ -81,7 +81,7 @@ def perturbed(setup: Setup, levels: Mapping[str, float], seed: int) -> Setup:
 
 
 def levels_named(model: Model, perturbations: Levels | Sequence[str] | None) -> dict[str, tuple[float, ...]]:
-    """By name the levels to try, in increasing order. UnknownNameError; InputError for what cannot be tried."""
+    """Return levels by name, in increasing order. Raises UnknownNameError, or InputError for invalid levels."""
     if perturbations is None:
         return {name: kind.levels for name, kind in PERTURBATIONS.items() if kind.applies_to(model)}
     if not isinstance(perturbations, Mapping):
@@ -94,7 +94,7 @@ def levels_named(model: Model, perturbations: Levels | Sequence[str] | None) -> 
 
 
 def parameters_of(model: Model, quantity: str) -> dict[str, Array]:
-    """The parameters of a quantity that are not 0: those of bodies and joints, not of single geometries."""
+    """Return the nonzero parameters of a quantity, for bodies and joints but not for single geometries."""
     parameters = {p.name: p.value for p in list_parameters(model) if p.kind.quantity == quantity and "/" not in p.name}
     moving = {body.name() for body in moving_bodies(model.plant)}
     any_body = quantity not in ("inertia", "mass")
@@ -149,7 +149,7 @@ def _push(setup: Setup, level: float, random: Random) -> Setup:
 def _around(
     component: str, change: Callable[[Any, float, Random, Model], dict[str, Any]]
 ) -> Callable[[Setup, float, Random], Setup]:
-    """A change of the loop's sensor or actuator."""
+    """Return a perturbation of the loop's sensor or actuator."""
 
     def apply(setup: Setup, level: float, random: Random) -> Setup:
         old = getattr(setup.loop, component)

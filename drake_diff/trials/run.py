@@ -1,7 +1,7 @@
-"""Does a plan survive: trials under each perturbation and level, how sure the rates are, and how far one can go.
+"""Test the robustness of a plan: trials under each perturbation and level, success rates and their margins.
 
-Before anything is tried, gradients predict how far a small perturbation displaces the last state (`LoopSensitivity`);
-beside the measured displacement that shows how far first order reaches.
+Gradients predict how far a small perturbation displaces the last state (`LoopSensitivity`). A comparison with the
+measured displacement shows up to which level the first order is accurate.
 """
 
 from collections import Counter
@@ -28,10 +28,10 @@ from drake_diff.runs.plan_record import CellEvidence, Nominal, PerturbationEvide
 from drake_diff.trials.perturbation import PERTURBATIONS, Levels, levels_named, parameters_of, perturbation_for
 from drake_diff.trials.trial import MakeController, Task, Trial, run_trial
 
-WORST = "worst"  # the folder of the trials that are written in full
-AGREE = 2.0  # a prediction within this factor of what is measured counts as right
-UNIFORM = 1 / np.sqrt(3)  # the standard deviation of a number that is uniform in [-1, 1]
-# Step of the central differences of the controller's answer: about the cube root of rounding, which is best for them.
+WORST = "worst"  # folder of the trials that are written in full
+AGREE = 2.0  # a prediction within this factor of the measured value counts as correct
+UNIFORM = 1 / np.sqrt(3)  # standard deviation of the uniform distribution in [-1, 1]
+# Step of the central differences of the controller: about the cube root of rounding, which is optimal.
 DIFFERENCE = 1e-5
 FACTORS = ("inertia", "mass", "friction", "stiffness", "damping", "gravity")
 PREDICTED = ("initial_state", "sensor_noise", "sensor_bias", "actuator_strength", *FACTORS)
@@ -47,28 +47,28 @@ def robustness(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> "Robustness":
-    """Try the plan of a solution many times under each perturbation and level.
+    """Run the plan of a solution many times under each perturbation and level.
 
-    A trial succeeds where it reaches the goal (without one, the plan's end) and keeps the bounds. A failure has a
-    label that says whose fault it is. A controller, sensor or estimator that raises is such a failure too.
+    A trial succeeds if it reaches the goal (without a goal, the end of the plan) and satisfies the bounds. A failure
+    has a label for its cause. An error raised by the controller, sensor or estimator counts as a failure too.
 
     Args:
-        solution: its motion and inputs are the plan.
-        perturbations: levels by name, or names, for their usual levels (`PERTURBATIONS` lists them). None means all
-            that apply to the model.
-        trials: how many at each level.
-        controller: "tvlqr" about the plan, "mpc" (over 20 steps), "open_loop", an `MPC` of your own, or a function
+        solution: The solution whose motion and inputs are the plan.
+        perturbations: Levels by name, or names to use default levels (listed in `PERTURBATIONS`). None means all
+            perturbations that apply to the model.
+        trials: The number of trials at each level.
+        controller: "tvlqr" about the plan, "mpc" (over 20 steps), "open_loop", a custom `MPC`, or a function
             of (plan, model, xs (N+1, nx), us (N, nu)) that makes a controller u = controller(x, t).
-        loop: what stands around the controller in every trial, the unperturbed run included.
-        seed: of all draws. The same seed gives the same trials.
-        progress: called with a line of text after each level.
+        loop: Sensor, estimator, actuator and other parts of the loop in every trial, also in the unperturbed run.
+        seed: Seed of all draws. The same seed gives the same trials.
+        progress: Called with a line of text after each level.
 
     Returns:
         Success rates with their 95 % intervals, margins, labels of failures, and displacements of the last state.
 
     Raises:
-        UnknownNameError: no such perturbation or controller.
-        InputError: a level or another argument is wrong, or a function for `controller` makes none.
+        UnknownNameError: There is no such perturbation or controller.
+        InputError: A level or another argument is invalid, or a function for `controller` makes no controller.
 
     Source: Wilson's interval, J. American Statistical Association 22 (1927).
 
@@ -96,7 +96,7 @@ def robustness(
 
 
 class Ending(NamedTuple):
-    """What remains of each trial; `label` is None for a success, `reason` says why it failed, `last` is (nx,)."""
+    """The result of a trial. `label` is None for a success, `reason` explains a failure, and `last` is (nx,)."""
 
     seed: int
     label: Label | None
@@ -107,23 +107,23 @@ class Ending(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """The trials of one perturbation at one level. Displacements are root mean squares of the last state's."""
+    """The trials of one perturbation at one level. Displacements are root mean squares for the last state."""
 
     perturbation: str
     level: float
     rate: Rate
     labels: Mapping[str, int]  # of the failures
-    controller_errors: Mapping[str, int]  # "Type: message" of what the controller raised, and in how many trials
-    goal_error: float  # the median; inf where it is not finite
+    controller_errors: Mapping[str, int]  # "Type: message" of the controller's errors, and their numbers of trials
+    goal_error: float  # the median; inf if it is not finite
     worst_goal_error: float
-    displacement: float | None  # measured; None where a run broke off or it is not finite
-    predicted: float | None  # from gradients, to first order; None where they say nothing
+    displacement: float | None  # measured; None if a run stopped early or the value is not finite
+    predicted: float | None  # from gradients, to first order; None without a prediction
     worst: Trial
     endings: tuple[Ending, ...]
 
     @property
     def ratio(self) -> float | None:
-        """Measured displacement over predicted; None without one of them, or where none is predicted."""
+        """The ratio of measured to predicted displacement. None if one is missing or the prediction is 0."""
         return self.displacement / self.predicted if self.displacement is not None and self.predicted else None
 
     @property
@@ -140,7 +140,7 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class Robustness(ShowsItsRepr):
-    """What `robustness` found: a cell for each perturbation and level, and the task with its unperturbed run.
+    """The result of `robustness`: a cell for each perturbation and level, and the task with its unperturbed run.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.02)
@@ -159,39 +159,37 @@ class Robustness(ShowsItsRepr):
 
     @property
     def success(self) -> bool:
-        """Whether the unperturbed run succeeds, and each perturbation has a level above 0 that is survived."""
+        """Whether the unperturbed run succeeds and each perturbation has a margin above 0."""
         return self.task.nominal.success and all(value > 0 for value in self.margins.values())
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The perturbations that were tried."""
+        """The names of the perturbations."""
         return tuple(dict.fromkeys(c.perturbation for c in self.cells))
 
     @property
     def margins(self) -> dict[str, float]:
-        """By perturbation, the largest level up to which 95 % of the trials succeed."""
+        """The largest level up to which 95 % of the trials succeed, by perturbation."""
         return {name: margin([c.level for c in self.of(name)], [c.rate for c in self.of(name)]) for name in self.names}
 
     @property
     def weakest(self) -> str:
-        """The perturbation with the smallest margin, as a part of its largest usual level; of equals, the one that the
-        fewest trials survive.
-        """
+        """The perturbation with the smallest margin relative to its largest default level, then the lowest rate."""
 
         return weakest_of(self.perturbations).name
 
     def of(self, name: str) -> list[Cell]:
-        """The cells of one perturbation, with increasing levels."""
+        """Return the cells of one perturbation, with increasing levels."""
         return [c for c in self.cells if c.perturbation == name]
 
     def worst(self, name: str) -> Cell:
-        """The cell whose worst trial is shown: the lowest level that fails; without one, the furthest from the goal."""
+        """Return the cell of the lowest level with a failure, or the cell with the trial furthest from the goal."""
         cells = self.of(name)
         return next((c for c in cells if c.fails), max(cells, key=lambda c: c.worst_goal_error))
 
     @cached_property
     def perturbations(self) -> tuple[PerturbationEvidence, ...]:
-        """The perturbations as a record has them."""
+        """The perturbations in the format of a record."""
         return tuple(
             evidence(
                 PerturbationEvidence,
@@ -205,7 +203,7 @@ class Robustness(ShowsItsRepr):
 
     @property
     def sentence(self) -> str:
-        """The verdict in a paragraph: what fails first, whose fault it is, and what the gradients knew."""
+        """A summary: the first failure, the causes of failures, and the accuracy of predictions by gradients."""
         nominal = evidence(Nominal, self.task.nominal, ended=self.task.nominal.run.ended)
         return sentence_of(nominal, self.perturbations, self.worst(self.weakest).worst.reason)
 
@@ -226,7 +224,7 @@ class Robustness(ShowsItsRepr):
 
 
 def weakest_of(perturbations: Sequence[PerturbationEvidence]) -> PerturbationEvidence:
-    """That with the smallest margin, as a part of its largest usual level; of equals, which fewest trials survive."""
+    """Return the perturbation of the smallest margin relative to its largest default level, then the lowest rate."""
 
     def rank(p: PerturbationEvidence) -> tuple[float, float]:
         return p.margin / perturbation_for(p.name).levels[-1], sum(c.rate for c in p.cells) / len(p.cells)
@@ -235,7 +233,7 @@ def weakest_of(perturbations: Sequence[PerturbationEvidence]) -> PerturbationEvi
 
 
 def sentence_of(nominal: Nominal, perturbations: Sequence[PerturbationEvidence], reason: str) -> str:
-    """What fails first, whose fault it is, and what the gradients knew; `reason` is of the weakest's worst trial."""
+    """Summarize failures, causes and predictions. `reason` belongs to the weakest perturbation's worst trial."""
     weakest, cells = weakest_of(perturbations), [c for p in perturbations for c in p.cells]
     labels = sum((Counter(c.labels) for c in cells), Counter[str]())
     known = [agrees(c.ratio) for c in cells if c.ratio is not None]
@@ -264,7 +262,7 @@ def sentence_of(nominal: Nominal, perturbations: Sequence[PerturbationEvidence],
 
 
 def folder_of(name: str, level: float) -> str:
-    """Where the worst trial of a perturbation is written, at the level that its cell has."""
+    """Return the folder of the worst trial of a perturbation at a level."""
     return f"{WORST}/{name}_{level:g}"
 
 
@@ -286,12 +284,12 @@ def _evidence_of(c: Cell) -> CellEvidence:
 
 
 def trial_seed(seed: int, index: int) -> int:
-    """Of the `index`-th trial: the same in every cell, so that levels are compared under the same draws."""
+    """Return the seed of the `index`-th trial, equal in all cells so that levels are compared under the same draws."""
     return int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
 
 
 def cell_of(name: str, level: float, trials: Sequence[Trial], predicted: float | None) -> Cell:
-    """What `trials` of one perturbation and level amount to."""
+    """Summarize the `trials` of one perturbation and level."""
 
     def distance(trial: Trial) -> float:
         error = trial.outcome.goal_error
@@ -318,28 +316,28 @@ def cell_of(name: str, level: float, trials: Sequence[Trial], predicted: float |
 
 
 def agrees(ratio: float | None) -> bool:
-    """Whether a measured displacement is within a factor of AGREE of the predicted one."""
+    """Return whether a measured displacement is within a factor of AGREE of the predicted displacement."""
     return ratio is not None and 1 / AGREE <= ratio <= AGREE
 
 
 def sized(name: str, level: float) -> str:
-    """A level with its unit."""
+    """Format a level with its unit."""
     return perturbation_for(name).with_unit(level)
 
 
 class LoopSensitivity:
-    """How far perturbations displace the last state of a task's unperturbed run, to first order.
+    """The displacement of the last state of a task's unperturbed run by perturbations, to first order.
 
-    Along that run, with A_k, B_k, C_k the derivatives of step k by state, input and parameters on the tangent space
-    and K_k that of the controller's answer by what it sees, the closed loop moves by
+    Let A_k, B_k, C_k be the derivatives of step k with respect to state, input and parameters on the tangent space, and
+    K_k the derivative of the controller's output with respect to its measurement. The closed loop is displaced by
 
         d_(k+1) = (A_k + B_k K_k) d_k + C_k dp + B_k K_k n_k
 
     so the last displacement is linear in the first one d_0, a change dp of the parameters and the noise n_k. Its root
-    mean square, sqrt(E |d_N|^2), is for independent perturbations as `trials.perturbation` draws them.
+    mean square, sqrt(E |d_N|^2), is for the independent perturbations of `trials.perturbation`.
 
-    Known only in an ideal loop: None with a delay, a lag, lost samples, another estimator, a fallback in charge, or a
-    controller with a memory (one with `start`, as MPC), whose answer is no function of what it sees.
+    The prediction is available only for an ideal loop. It is None with a delay, a lag, lost samples, another estimator,
+    an active fallback, or a controller with memory (with `start`, as MPC), whose output also depends on the past.
     """
 
     def __init__(self, task: Task):
@@ -356,7 +354,7 @@ class LoopSensitivity:
         self.parameters = {name: parameters_of(task.model, name) for name in FACTORS}
 
     def predicted(self, name: str, level: float) -> float | None:
-        """The root mean square of the last state's displacement; None where gradients say nothing."""
+        """Return the root mean square of the last state's displacement, or None without a prediction."""
         applies = name in PREDICTED and PERTURBATIONS[name].applies_to(self.task.model)
         effects = self._effects if applies and self.is_known else None
         if effects is None:
@@ -366,12 +364,12 @@ class LoopSensitivity:
 
     @cached_property
     def _effects(self) -> dict[str, Array] | None:
-        """(nt, .) the last state's derivative by what a perturbation of level 1 draws, times its spread."""
+        """The last state's derivatives (nt, .) with respect to the draws of level 1, times their standard deviation."""
         gains = self._gains()
         if gains is None:
             return None
         task, size, xs = self.task, self.space.size, self.task.nominal.run.motion.xs
-        # The inertia by itself: a mass that is changed alone takes it along, one that is set beside it does not.
+        # The inertia is a separate group, because a mass parameter scales the inertia unless both are set together.
         inertia, others = list(self.parameters["inertia"]), [n for q in FACTORS[1:] for n in self.parameters[q]]
         groups = [inertia, others] if inertia else [others]
         us, along = task.nominal.run.applied, []
@@ -402,9 +400,9 @@ class LoopSensitivity:
         return effects
 
     def _gains(self) -> list[Array] | None:
-        """N times (nu, nt), the derivative of the controller's answer by what it sees, by central differences.
+        """Return N derivatives (nu, nt) of the controller's output with respect to its measurement, by differences.
 
-        None where it raises beside the motion, as a user's code may: then it has no derivative.
+        The result is None if the controller raises an error near the motion, so that it has no derivative.
         """
         task, gains = self.task, []
         for k, x in enumerate(task.nominal.run.motion.xs[:-1]):

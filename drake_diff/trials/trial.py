@@ -1,17 +1,17 @@
-"""One run of a plan under perturbations: does it arrive, and if not, whose fault is it.
+"""Run a plan under perturbations once, and find the cause if it fails.
 
-The label of a failure comes from running the trial again with one thing put right at a time, in this order:
+The label of a failure is found by running the trial again with one part replaced at a time, in this order:
 
-    perception_error  with a perfect sensor it succeeds
-    control_error     with a perfect actuator it succeeds
-    control_error     TVLQR or the plan's inputs succeed in place of a user's controller (unperturbed: of any)
-    planning_error    unperturbed it fails too, with each of the above
-    state_error       with the plant and the start as planned, and no pushes, it succeeds
-    control_error     no single thing helps: the controller is not up to all of them together
+    perception_error  it succeeds with a perfect sensor
+    control_error     it succeeds with a perfect actuator
+    control_error     TVLQR or the plan's inputs succeed in place of a custom controller (unperturbed: of any)
+    planning_error    the unperturbed run also fails, with each of the above
+    state_error       it succeeds with the planned plant and initial state, and without pushes
+    control_error     no single replacement helps: the controller cannot handle all perturbations together
     evaluation_error  the result cannot be judged
 
-Where a part of the loop raised, that comes before all: the sensor is a perception_error, the estimator a state_error,
-the controller a control_error. Where the unperturbed run fails too, that one is run again.
+An error raised by a part of the loop takes precedence. It is a perception_error from the sensor, a state_error from the
+estimator, and a control_error from the controller. If the unperturbed run fails, it is run again instead of the trial.
 """
 
 import atexit
@@ -50,12 +50,12 @@ MakeController = Callable[[ReplayPlan, Model, Array, Array], Controller]
 
 @dataclass(frozen=True, eq=False)
 class JudgedRun:
-    """A run and how it is judged. `failures` is empty where it succeeded."""
+    """A run and its judgement. `failures` is empty if the run succeeded."""
 
     run: ClosedLoop
     failures: tuple[str, ...]
-    goal_error: float  # the largest distance from the goal, or from the plan's end where there is none
-    displacement: Array  # (nt,) of the last state from the unperturbed run's, whose own is from the plan's
+    goal_error: float  # the largest distance from the goal, or from the end of the plan without a goal
+    displacement: Array  # (nt,) last state minus the unperturbed run's, or minus the plan's for the unperturbed run
     judged: bool
 
     @property
@@ -65,7 +65,7 @@ class JudgedRun:
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One run under `levels` with its `seed`; `label` says whose fault a failure is, None for a success."""
+    """A run under `levels` with its `seed`. `label` is the cause of a failure, or None for a success."""
 
     levels: Mapping[str, float]
     seed: int
@@ -79,9 +79,9 @@ class Trial:
 
 
 class Task:
-    """A plan to be followed: its controller, made on the plant as planned, and how a run of it is judged.
+    """A plan to follow, with a controller made for the planned plant, and the judgement of its runs.
 
-    `controller` is as `robustness` takes it. Its period is the longest of the plan's interval and its halves, quarters
+    `controller` is that of `robustness`. Its period is the longest of the plan's interval and its halves, quarters
     ... 64ths in which the unperturbed run succeeds. It is the interval itself where none does, and for MPC.
     """
 
@@ -100,7 +100,7 @@ class Task:
 
     @property
     def controller_name(self) -> str:
-        """The controller's name, or that it is a user's own."""
+        """The controller's name, or a description of a custom controller."""
         if isinstance(self.controller, str):
             return self.controller
         return "an MPC of the user" if isinstance(self.controller, MPC) else "a user's function"
@@ -111,7 +111,7 @@ class Task:
         parameters, duration = self.plan.vector.to_dict(), self.model.time_step * len(self.us)
         with applied(select(self.model, parameters)) as model:
             self.policy = self._policy(model)
-        # The plant is not the controller's own one where it can be built again: neither then disturbs the other.
+        # If possible, the plant is rebuilt, so that plant and controller do not share a model.
         plant = self.model.at_time_step(self.model.time_step) if self.model.can_rebuild else self.model
         self.setup = Setup(plant, self.xs[0], self.loop, duration, parameters)
         self._end = self.xs[-1]
@@ -144,7 +144,7 @@ class Task:
         return controller
 
     def followed_by(self, setup: Setup, seed: int) -> str:
-        """What follows the plan in `setup` in the controller's place, without a fallback or budget; "" for nothing."""
+        """Return the controller that succeeds in `setup` without a fallback and budget, or "" if there is none."""
         bare = replace(setup, loop=replace(setup.loop, fallback=None, latency_budget=None))
         for name, make in (("the plan's own inputs", lambda model: OpenLoop(self.us, model.time_step)),
                            ("TVLQR", lambda _: self.plan.follower(self.parts).law())):  # fmt: skip
@@ -152,19 +152,19 @@ class Task:
                 with applied(select(self.model, self.plan.vector.to_dict())) as model:
                     policy = make(model)
             except DrakeDiffError:
-                continue  # a plan without inputs or derivatives has no TVLQR: it follows nothing
+                continue  # a plan without inputs or derivatives has no TVLQR
             if self.run(bare, seed, policy).success:
                 return name
         return ""
 
     def run(self, setup: Setup, seed: int, policy: Controller | None = None) -> JudgedRun:
-        """One run of `setup`, judged; under `policy` in the controller's place, if it is given."""
+        """Run `setup` once and judge the run. `policy` replaces the controller if it is given."""
         with applied(select(setup.model, setup.parameters)) as model:
             loop_run = closed_loop(model, policy or self.policy, setup.x0, len(self.us), setup.loop, seed=seed)
             checks = [] if loop_run.ended else [penetration_check(model, loop_run.motion)]
         last = loop_run.motion.xs[-1]
         goal = self.plan.problem.goal_error(last) if self.judged_by == "the goal" else last - self.xs[-1]
-        if not loop_run.ended:  # a run that broke off may have no step to measure
+        if not loop_run.ended:  # a run that stopped early may have no step
             of_motion = (bounds_check(self.plan, loop_run.motion), *clearance_checks(self.plan, loop_run.motion))
             checks = [goal_check(self.plan, goal), *of_motion, *checks]
         return JudgedRun(
@@ -177,7 +177,7 @@ class Task:
 
 
 def run_trial(task: Task, levels: Mapping[str, float], seed: int) -> Trial:
-    """One run of `task` under `levels` of perturbations by name, and where it fails, why."""
+    """Run `task` once under `levels` of perturbations by name, and find the cause if it fails."""
     setup = perturbed(task.setup, levels, seed)
     outcome = task.run(setup, seed)
     if not outcome.judged:
@@ -208,7 +208,7 @@ def _label(task: Task, setup: Setup, seed: int, outcome: JudgedRun) -> tuple[Lab
 
 
 def _first_help(task: Task, setup: Setup, seed: int, other_controllers: bool) -> tuple[Label, str] | None:
-    """The first thing around the plant with which `setup` succeeds when it is put right."""
+    """Return label and reason for the first replaced part of the loop with which `setup` succeeds, or None."""
 
     def succeeds(**changes: Any) -> bool:
         return task.run(replace(setup, loop=replace(setup.loop, **changes)), seed).success
@@ -223,7 +223,7 @@ def _first_help(task: Task, setup: Setup, seed: int, other_controllers: bool) ->
 
 
 def result_of(trial: Trial) -> dict[str, Any]:
-    """What became of a trial, in JSON's types; no displacement where the run broke off or it is not finite."""
+    """Return the result of a trial in JSON's types. Displacement is None if not finite or the run stopped early."""
     outcome = trial.outcome
     return {
         "success": outcome.success,
@@ -236,17 +236,17 @@ def result_of(trial: Trial) -> dict[str, Any]:
 
 
 PANEL_FIELDS = {"run": str, "controller": str, "perturbation": str, "level": (int, float), "seed": int}
-_open = ExitStack()  # keeps the models of the runs as long as the process lives
+_open = ExitStack()  # keeps the models of the runs until the process ends
 atexit.register(_open.close)
 
 
 def evaluate(trial: Mapping[str, Any]) -> dict[str, Any]:
-    """Run the plan of the run directory `trial["run"]` once and judge it; the same fields give the same row.
+    """Run the plan of the run directory `trial["run"]` once and judge it. The same fields give the same row.
 
     `trial` has run, controller ("tvlqr", "mpc", "open_loop"), perturbation, level (0: unperturbed) and seed. Other
-    fields are ignored, so that a trial.json will do. The row is JSON: success, label (None for a success), goal_error,
-    displacement of the last state (None where it is not finite or the run broke off), failures and ended. The run is
-    read once per process. Raises InputError, UnknownNameError, and ArtifactError where the run is damaged.
+    fields are ignored, so that a trial.json is accepted. The row is JSON: success, label (None for a success),
+    goal_error, displacement of the last state (None if it is not finite or the run stopped early), failures and ended.
+    The run is read once per process. Raises InputError, UnknownNameError, or ArtifactError if the run is damaged.
     """
     for name, kind in PANEL_FIELDS.items():
         value = trial.get(name)
@@ -262,7 +262,7 @@ def evaluate(trial: Mapping[str, Any]) -> dict[str, Any]:
 
 @cache
 def _task(run: str, controller: str) -> Task:
-    from drake_diff.runs.verify import recalled  # what runs no panel need not load it
+    from drake_diff.runs.verify import recalled  # only panels need this import
 
-    # The panel file is the user's, and so is the run that it names.
+    # The run is trusted, as the user's panel file names it.
     return Task(_open.enter_context(recalled(run, models="/", trusted=True)).plan, controller)
