@@ -103,6 +103,18 @@ class Moves:
     dynamics: Array  # (N, nx) multipliers of each step: d cost / d gap
 
 
+class _Pattern:
+    """The sparsity of a matrix, and the order in which CasADi stores its entries (2, nnz)."""
+
+    def __init__(self, entries: Indices, shape: tuple[int, int]):
+        self.order = np.lexsort(entries)
+        self.sparsity = ca.DM(csc_matrix((np.ones(len(self.order)), entries), shape)).sparsity()
+
+    def matrix(self, values: Array) -> ca.DM:
+        """The matrix with `values` (nnz,); ten times faster than CasADi's conversion from SciPy."""
+        return ca.DM(self.sparsity, values[self.order])
+
+
 class SoftProgram:
     """The program for `count` steps. Its structure is constant and is set up once."""
 
@@ -121,18 +133,11 @@ class SoftProgram:
                 sides += len(r.lower) * len(bounded)
         entries = np.concatenate([np.stack(pair) for pair in places], axis=1)
         self._inside = entries[1] >= 0  # the first state is given and has no columns
-        self._a, self._shape = entries[:, self._inside], (sides, self.size)
-        self._h = self._set_hessian(n)
-        shapes = {"h": self._hessian(np.ones(len(self._h[0]))), "a": self._rows(np.ones(len(self._a[0])))}
-        shapes = {name: matrix.sparsity() for name, matrix in shapes.items()}
+        self._a = _Pattern(entries[:, self._inside], (sides, self.size))
+        self._h = _Pattern(self._set_hessian(n), (self.size, self.size))
+        shapes = {"h": self._h.sparsity, "a": self._a.sparsity}
         self._solvers = [ca.conic("step", "piqp", shapes, {"error_on_fail": False, "piqp": o}) for o in OPTIONS]
         self._free = np.full(self.size - moves, FREE)
-
-    def _rows(self, data: Array) -> ca.DM:
-        return ca.DM(csc_matrix((data, self._a), self._shape))
-
-    def _hessian(self, data: Array) -> ca.DM:
-        return ca.DM(csc_matrix((data, self._h), (self.size, self.size)))
 
     def _dynamics(self) -> tuple[Indices, Indices]:
         """Return (rows, columns) of dx_(k+1), then those of -F_k."""
@@ -186,7 +191,7 @@ class SoftProgram:
         least[:, :nu], most[:, :nu] = model.lower, model.upper
         sides = {"lba": np.concatenate(lower), "uba": np.concatenate(upper)}
         sides |= {"lbx": np.append(least.ravel(), 0.0 * self._free), "ubx": np.append(most.ravel(), self._free)}
-        given = {"h": self._hessian(h), "g": unit * g, "a": self._rows(a), **sides}
+        given = {"h": self._h.matrix(h), "g": unit * g, "a": self._a.matrix(a), **sides}
         for solver in self._solvers:
             solution, stats = solver(**given), solver.stats()
             z = np.asarray(solution["x"]).ravel()
