@@ -1,8 +1,10 @@
-"""Lists the messages of the package, or with --style those that a reader has to read twice.
+"""Checks the style of messages and pages, or with --list lists the messages of the package.
 
-    python .ci/messages.py [--style]
+    python .ci/prose.py [--list]
 
-A message is a string of four words or more that is no docstring. Exits with 1 where --style finds a fault.
+A message is a string of four words or more that is no docstring. Pages are the Markdown files of the repository, without
+their code and tables of numbers. Exits with 1 where a text has a fault. `typos` and `proselint` check spelling and usage,
+and the build of the site checks links.
 """
 
 import ast
@@ -11,16 +13,20 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-PACKAGE = Path(__file__).parents[1] / "drake_diff"
-LONGEST = 240  # characters of a text in the source, with its expressions
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "drake_diff"
+PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/**/*.md")
+LONGEST = 240  # characters of a message in the source, with its expressions
+LONGEST_SENTENCE = 45  # words of a sentence of a page: the docs of Drake, JAX and diffrax have one in 100 above it
 WORDS = 4
 FAULTS = {
-    "begins without a noun": re.compile(r"^(What|That|None|It|Of|Those) "),
+    "begins without a noun": re.compile(r"^(What|That|None|Of|Those) (?!.*\?$)"),
     "verbless 'none'": re.compile(r"\b(is|are|has|have) none\b"),
     "a chain of semicolons": re.compile(r";[^;]*;"),
     "an inverted sentence": re.compile(r"\b(is not to be|are not to be|is to be told|may not be asked)\b"),
     "a private word": re.compile(r"\b(told|tells of|apart from that|strangers?|elsewhere|untold|dry|marks)\b"),
 }
+IN_MESSAGES = {"begins without a noun": re.compile(r"^It ")}  # a message stands alone: nothing precedes its pronoun
 # How the texts of each file begin that are no sentences (CSS, patterns, policies, README of an export), or that schemas
 # and records store word for word.
 LEFT_OUT: dict[str, tuple[str, ...]] = {
@@ -32,6 +38,9 @@ LEFT_OUT: dict[str, tuple[str, ...]] = {
     "runs/plan_record.py": ("cost per s and squared unit",),
 }
 VECTOR = re.compile(r"\[[^\]]*\]")  # [q; v], whose semicolons join no clauses
+CODE = re.compile(r"^(\s*)(```|~~~).*?^\s*\2|<!--.*?-->|<[^>]+>|\$\$.*?\$\$", re.M | re.S)
+BLOCK = re.compile(r"\n\s*\n|\n(?=\s*(?:[-*|#]|\d+\.) ?)")  # a paragraph, an item, a heading, or a row of a table
+SENTENCE = re.compile(r"(?<=[.!?:])\s+(?=[A-Z`\"(*\[])")
 
 
 def text_of(node: ast.expr) -> str:
@@ -55,19 +64,41 @@ def messages(tree: ast.AST) -> Iterator[tuple[int, str]]:
             yield node.lineno, text_of(node)
 
 
+def sentences(page: str) -> Iterator[tuple[int, str]]:
+    """The line of the block and the text of each sentence in a page; rows of tables are left out."""
+    page = CODE.sub(lambda code: "\n" * code[0].count("\n"), page)
+    ends = [*(match.end() for match in BLOCK.finditer(page)), len(page)]
+    for begin, end in zip([0, *ends], ends, strict=False):
+        block = page[begin:end].strip(" \n-*#>")
+        if block and not block.startswith("|"):
+            line = page.count("\n", 0, begin) + 1
+            yield from ((line, sentence) for sentence in SENTENCE.split(" ".join(block.split())))
+
+
+def faults_in(text: str, extra: dict[str, re.Pattern[str]]) -> list[str]:
+    """The names of the faults of a text."""
+    text = re.sub(r"`[^`]*`", "`code`", VECTOR.sub("", text))
+    return [fault for patterns in (FAULTS, extra) for fault, pattern in patterns.items() if pattern.search(text)]
+
+
 def main() -> int:
-    style, count = "--style" in sys.argv, 0
+    listed, count = "--list" in sys.argv, 0
     for path in sorted(PACKAGE.rglob("*.py")):
+        skipped = LEFT_OUT.get(str(path.relative_to(PACKAGE)), ())
         for line, text in sorted(set(messages(ast.parse(path.read_text())))):
-            if style and text.startswith(LEFT_OUT.get(str(path.relative_to(PACKAGE)), ())):
-                continue
-            faults = [fault for fault, pattern in FAULTS.items() if pattern.search(VECTOR.sub("", text))]
-            faults += [f"{len(text)} characters"] * (len(text) > LONGEST)
-            if faults or not style:
+            faults = faults_in(text, IN_MESSAGES) + [f"{len(text)} characters"] * (len(text) > LONGEST)
+            if listed or (faults and not text.startswith(skipped)):
                 count += 1
-                print(f"{path.relative_to(PACKAGE.parent)}:{line}: {text}" + f"  [{'; '.join(faults)}]" * style)
-    print(f"{count} messages", file=sys.stderr)
-    return int(style and count > 0)
+                print(f"{path.relative_to(ROOT)}:{line}: {text}" + f"  [{'; '.join(faults)}]" * (not listed))
+    for path in [] if listed else sorted(path for pattern in PAGES for path in ROOT.glob(pattern)):
+        for line, text in sentences(path.read_text()):
+            words = len(re.sub(r"`[^`]*`", "code", text).split())
+            faults = faults_in(text, {}) + [f"{words} words"] * (words > LONGEST_SENTENCE)
+            if faults:
+                count += 1
+                print(f"{path.relative_to(ROOT)}:{line}: {text}  [{'; '.join(faults)}]")
+    print(f"{count} {'messages' if listed else 'faults'}", file=sys.stderr)
+    return int(not listed and count > 0)
 
 
 if __name__ == "__main__":

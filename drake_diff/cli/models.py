@@ -215,8 +215,8 @@ def excite(
     model: Any,
     file: Path,
     parameters: Annotated[str | None, names_option("Parameters to identify", "all")] = None,
-    duration: Annotated[float, typer.Option(help="Duration of the motion [s].")] = 5.0,
-    period: Annotated[float, typer.Option(help="Time between samples [s]; inputs change at samples.")] = 0.01,
+    duration: Annotated[float, typer.Option(help="Duration of the motion in seconds.")] = 5.0,
+    period: Annotated[float, typer.Option(help="Time between samples in seconds; inputs change at samples.")] = 0.01,
     x0: Annotated[
         str | None,
         typer.Option(

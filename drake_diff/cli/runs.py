@@ -233,7 +233,7 @@ def _show_record(record: Any) -> None:
 def verify(
     run: RunDirectory,
     models: ModelFolder = None,
-    time_limit: Annotated[float, typer.Option(help="Time limit of the new computation [s].")] = 60.0,
+    time_limit: Annotated[float, typer.Option(help="Time limit of the new computation in seconds.")] = 60.0,
     memory_limit: Annotated[float, typer.Option(help="Memory limit of the new computation [GiB].")] = 1.0,
 ) -> None:
     """Check every file of RUN, reproduce RUN from its own files, and compare record, trace and pages.

@@ -29,6 +29,9 @@ class DrakeEngine:
         self.method = method
         self.name = f"drake ({self.model.contract.contact.approximation}, {method})"
 
+    def __repr__(self) -> str:
+        return f"Engine {self.name} {self.version} of {self.model}"
+
     @cached_property
     def description(self) -> Description:
         """The description for the contract, with all joints. Raises ModelError for unsupported plant elements."""

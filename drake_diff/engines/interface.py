@@ -157,9 +157,15 @@ def limit(value: float) -> float:
 class Arguments:
     """Checks of an engine's arguments, which raise ShapeError or NonFiniteError."""
 
+    name: str
+    version: str
     nq: int
     nv: int
     nu: int
+
+    def __repr__(self) -> str:
+        sizes = f"nq={self.nq}, nv={self.nv}, nu={self.nu}"
+        return f"Engine {self.name} {self.version}: {sizes}; print(engine.contract) shows its properties"
 
     def _state(self, x: ArrayLike) -> tuple[Array, Array, Array]:
         """Return x (nx,), q (nq,) and v (nv,)."""

@@ -90,7 +90,7 @@ class Contract:
         >>> contract = dd.load_model("models/pendulum.urdf", time_step=0.01).contract
         >>> contract
         Contract of pendulum: time step 0.01 s, semi-implicit Euler; damping, PD control, limits and contact implicit
-          1 positions, 1 velocities, 1 inputs, 1 bodies, 1 joints, 0 collision geometries, 0 constraints
+          positions 1, velocities 1, inputs 1, bodies 1, joints 1, collision geometries 0, constraints 0
           contact point, sap; print(contract) shows everything
         >>> contract.positions[0].name, contract.positions[0].unit
         ('hinge_q', 'rad')
@@ -163,10 +163,10 @@ class Contract:
 
     def __repr__(self) -> str:
         counts = ["positions", "velocities", "inputs", "bodies", "joints", "geometries"]
-        counted = ", ".join(f"{len(getattr(self, kind))} {kind}" for kind in counts).replace("geom", "collision geom")
+        counted = ", ".join(f"{kind} {len(getattr(self, kind))}" for kind in counts).replace("geom", "collision geom")
         return (
             f"Contract of {self.name}: time step {self.time_step:g} s, {self.integrator}\n"
-            f"  {counted}, {self.constraints} constraints\n"
+            f"  {counted}, constraints {self.constraints}\n"
             f"  contact {self.contact.model}, {self.contact.approximation}; print(contract) shows everything"
         )
 

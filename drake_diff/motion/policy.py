@@ -127,7 +127,7 @@ class PD:
         return kp * error[self._positions] + kd * error[self._velocities]
 
     def __repr__(self) -> str:
-        return f"PD of {len(self.kp)} joints: kp {_range(self.kp)}, kd {_range(self.kd)}"
+        return f"PD of the joints ({len(self.kp)}): kp {_range(self.kp)}, kd {_range(self.kd)}"
 
 
 class LQR:

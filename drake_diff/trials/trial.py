@@ -81,8 +81,8 @@ class Trial:
 class Task:
     """A plan to follow, with a controller made for the planned plant, and the judgement of its runs.
 
-    `controller` is that of `robustness`. Its period is the longest of the plan's interval and its halves, quarters
-    ... 64ths in which the unperturbed run succeeds. It is the interval itself where none does, and for MPC.
+    `controller` is that of `robustness`. Its period is the longest of the plan's interval h, h/2, h/4 to h/64 for which
+    the unperturbed run succeeds. It is h for MPC, or if all these runs fail.
     """
 
     def __init__(self, plan: ReplayPlan, controller: str | MPC | MakeController = "tvlqr", loop: Loop | None = None):

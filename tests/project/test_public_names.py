@@ -1,4 +1,4 @@
-"""What is public, and what is loaded for it."""
+"""Tests of the public names, and of the modules that are loaded for them."""
 
 import importlib
 import subprocess
@@ -18,7 +18,7 @@ PACKAGE = Path(drake_diff.__file__).parent
 ROOMS = """
 certificates comparison engines export identification logs loop model motion optimize panels runs trials
 """.split()
-MODULES = ["engines", "exceptions", "loop", "model", "optimize", "quantities"]  # the others are imported by name
+MODULES = ["engines", "exceptions", "loop", "model", "optimize", "quantities"]  # other packages are imported explicitly
 PUBLIC = """
 Bounds BoxObstacle CenterOfMassGoal Constraint Dynamics FrameGoal FrameVelocityGoal JointGoal KeepLevel Model PD
 Problem QuadraticCost Recording SelfCollision Solution SphereObstacle Status audit certify certify_rollout compare
@@ -26,7 +26,7 @@ differentiate_rollout differentiate_step example_model explain identify lineariz
 load_model load_record model_from_diagram robustness rollout save sensitivity solve step
 verify
 """.split()
-MOST = 45  # names at the root: more cannot be read as a table of contents
+MOST = 45  # names at the root, few enough to be read as a table of contents
 
 
 def test_the_public_names_are_these():
@@ -46,6 +46,14 @@ def test_every_name_of_a_room_is_there_and_documented(room):
         assert getattr(package, name).__doc__, name
 
 
+@pytest.mark.parametrize("room", ROOMS)
+def test_every_public_class_has_a_readable_repr(room):
+    """The default repr of Python is a class name and an address."""
+    package = importlib.import_module(f"drake_diff.{room}")
+    for value in (getattr(package, name) for name in package.__all__):
+        assert value.__repr__ is not object.__repr__ or getattr(value, "_is_protocol", False), value
+
+
 HEAVY = (
     "numpy pydrake casadi pydantic matplotlib mcap google.protobuf foxglove_schemas_protobuf mujoco pinocchio jax ray "
     "typer rich"
@@ -59,7 +67,7 @@ def loaded(*but):
 
 
 def fresh(code):
-    """What the code prints in an interpreter of its own."""
+    """Return the output of the code in a new interpreter."""
     done = subprocess.run([sys.executable, "-c", LOADED + code], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -74,7 +82,7 @@ def test_importing_the_package_loads_nothing_heavy():
     [
         (["--help"], 0, ["typer", "rich"]),
         (["--version"], 0, ["typer", "rich"]),
-        (["run", "--help"], 0, ["typer", "rich", "pydantic"]),  # which typer imports where it is installed
+        (["run", "--help"], 0, ["typer", "rich", "pydantic"]),  # typer imports pydantic if it is installed
         (["run", "no_such_script.py"], 2, ["typer", "rich", "pydantic"]),
     ],
 )
@@ -109,7 +117,7 @@ def again():
 
 @pytest.mark.slow
 def test_every_public_name_can_be_the_first():
-    """Drake stays loaded in between: what counts are our modules."""
+    """Drake stays loaded in between. Only the modules of drake_diff are loaded again."""
     code = """
 for name in again().__all__:
     assert getattr(again(), name) is not None
