@@ -1,4 +1,4 @@
-"""Fixtures of several test modules."""
+"""Fixtures for several test modules."""
 
 import signal
 from importlib import import_module
@@ -6,7 +6,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-pytest.register_assert_rewrite("helpers")  # before any of them is imported
+pytest.register_assert_rewrite("helpers")  # before any of the helpers is imported
 
 from helpers.browser import CHROMIUM, DRIVER, FLAGS  # noqa: E402
 from helpers.loops import CART, H  # noqa: E402
@@ -16,8 +16,8 @@ import drake_diff as dd  # noqa: E402
 from drake_diff._base.sandbox import CallOutcome  # noqa: E402
 from drake_diff.runs import verify as verify_module  # noqa: E402
 
-# A shell starts what runs in the background with Ctrl-C ignored, nohup with SIGHUP ignored, and what tests start and
-# interrupt would inherit that.
+# A shell starts background processes with SIGINT ignored, and nohup starts them with SIGHUP ignored. Processes that
+# tests start and interrupt would inherit this.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
@@ -35,14 +35,14 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(autouse=True)
 def verify_in_this_process(request, monkeypatch):
-    """A child process imports Drake for two seconds: tests that ask for `child_process` use one."""
+    """A child process takes two seconds to import Drake, so only tests that ask for `child_process` use one."""
     if "child_process" not in request.fixturenames:
         monkeypatch.setattr(verify_module, "call", call_here)
 
 
 @pytest.fixture
 def child_process():
-    """What a stranger's model is read in."""
+    """Read models from unknown sources in a child process."""
 
 
 def call_here(function, arguments, *_):
@@ -53,7 +53,7 @@ def call_here(function, arguments, *_):
         return CallOutcome(error=f"{type(error).__name__}: {error}")
 
 
-# The quadruped's file has neither motors nor a ground, as most files of robots on legs.
+# The quadruped's file has neither motors nor a ground, like most files of legged robots.
 LEGS, JOINTS = ("FL", "FR", "RL", "RR"), ("abduction", "hip_pitch", "knee")
 MOTORS = {f"{leg}_{joint}": 6.0 for leg in LEGS for joint in JOINTS}  # [N m], the efforts in the file
 NEEDED = {"quadruped.urdf": {"base": "free", "actuators": MOTORS, "ground": 0.7, "contact": "ground"}}
@@ -61,7 +61,7 @@ NEEDED = {"quadruped.urdf": {"base": "free", "actuators": MOTORS, "ground": 0.7,
 
 @pytest.fixture
 def load():
-    """Load a model of this repository by its file name."""
+    """Return a function that loads a model of this repository by its file name."""
 
     def load_by_name(name, *, time_step=0.01, **options):
         return dd.load_model(MODELS / name, time_step=time_step, **(NEEDED.get(name, {}) | options))
@@ -71,7 +71,7 @@ def load():
 
 @pytest.fixture
 def write_urdf(tmp_path):
-    """A block of mass m on an actuated rail, as a model."""
+    """Return a function that loads a block of mass m on an actuated rail."""
 
     def write(*, mass=1.0, time_step=0.1, limit=1e9, gap=""):
         path = tmp_path / "block.urdf"
@@ -83,7 +83,7 @@ def write_urdf(tmp_path):
 
 @pytest.fixture
 def two_spheres(tmp_path):
-    """Both spheres with masses and a damping of our own."""
+    """Return a function that loads two spheres with given masses and damping."""
 
     def build(*, pusher=1.0, ball=0.5, damping=0.5, time_step=0.02):
         text = (MODELS / "two_spheres.sdf").read_text()
@@ -99,7 +99,7 @@ def two_spheres(tmp_path):
 
 @pytest.fixture(scope="module")
 def cart(tmp_path_factory):
-    """A double integrator: v+ = v + h u / 2, x+ = x + h v+."""
+    """Return a double integrator: v+ = v + h u / 2, x+ = x + h v+."""
     path = tmp_path_factory.mktemp("models") / "cart.urdf"
     path.write_text(CART)
     return dd.load_model(path, time_step=H)
@@ -107,7 +107,7 @@ def cart(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def thrown():
-    """A ball that falls on the ground and rolls: contact, and no actuator."""
+    """Return a solution of a ball that falls on the ground and rolls, with contact and without an actuator."""
     model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.005)
     x0 = model.default_state
     x0[6], x0[10] = 0.15, 0.5  # m high, m/s along x, which is free
@@ -131,7 +131,7 @@ BLOCK = """<robot name="block">
 
 @pytest.fixture(scope="module")
 def pushed(tmp_path_factory):
-    """A cart-pole pushed for 10 steps, its pole not driven: the model, its motion, and a folder with its trace."""
+    """Return a model of a cart-pole, its motion under a push of 10 steps, and a folder with its trace."""
     from drake_diff.runs import measure
     from drake_diff.runs.trace import write_trace
 
@@ -147,14 +147,14 @@ def pushed(tmp_path_factory):
 
 @pytest.fixture
 def browser(one_browser):
-    """Of all tests: each loads its page anew, and leaves none, which would be drawn beside the tests that follow."""
+    """Yield the browser of all tests; unload its page afterwards, as it would be drawn during later tests."""
     yield one_browser
     one_browser.get("about:blank")
 
 
 @pytest.fixture(scope="session")
 def one_browser(tmp_path_factory):
-    """A browser without a network."""
+    """Yield a browser without a network."""
     webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed (the test extra has it)")
     from selenium.webdriver.chrome.service import Service
 

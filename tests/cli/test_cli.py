@@ -1,4 +1,4 @@
-"""The command: what it prints, its exit status, and what it leaves behind."""
+"""Tests of the command line: its output, its exit status, and the files that it writes."""
 
 import os
 import re
@@ -63,7 +63,7 @@ def test_a_run_that_holds_prints_its_checks_and_exits_with_0(tmp_path):
 
 
 def test_a_script_may_define_plain_dynamics(tmp_path, monkeypatch, capsys):
-    """A block that is pushed from rest to rest over 1 m in 1 s, at a least effort of 12."""
+    """A block is pushed from rest to rest over 1 m in 1 s. The least effort is 12."""
     text = """import drake_diff as dd
 def problem():
     block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
@@ -83,7 +83,7 @@ def problem():
 
 @pytest.mark.slow
 def test_a_problem_that_cannot_be_solved_exits_with_1_and_a_complete_artifact(tmp_path):
-    """0.1 N m cannot lift 1 kg at 0.5 m, which weighs 4.9 N m, to the top within 0.8 s."""
+    """0.1 N m cannot lift 1 kg at 0.5 m, which needs 4.9 N m, to the top within 0.8 s."""
     done = drake_diff("run", script(tmp_path, limit=0.1), cwd=tmp_path)
     assert done.returncode == 1, done.stderr
     record = dd.load_record(tmp_path / "artifacts" / "task")
@@ -167,7 +167,7 @@ def test_ctrl_c_ends_the_run_with_the_best_motion_so_far(tmp_path):
     ],
 )
 def test_a_signal_before_the_search_leaves_a_record_that_says_so(tmp_path, monkeypatch, place, told):
-    """Raised by the script itself, while it is loaded and in problem(), and by what `solve` does first."""
+    """The signal is raised while the script is loaded, in problem(), or at the start of `solve`."""
     path = script(tmp_path, num_steps=5)
     signalled = "import signal; signal.raise_signal(signal.SIGTERM)"
     indent = "\n    " if place.startswith("def") else "\n"
@@ -203,7 +203,7 @@ def test_a_signal_before_the_directory_is_opened_writes_nothing_and_says_so(tmp_
 
 @contextmanager
 def kept_handlers():
-    """What the command does at a signal is undone at the end."""
+    """Restore the signal handlers at the end."""
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
     try:
         yield
@@ -240,7 +240,7 @@ def test_a_killed_run_never_looks_finished(tmp_path, delay):
     time.sleep(delay)
     os.kill(running.pid, signal.SIGKILL)
     running.wait(timeout=10)
-    if (runs / "task").exists():  # it was faster than the kill: then everything it names must be there
+    if (runs / "task").exists():  # the run ended before the kill, so all of its files must exist
         found = dd.load_record(runs / "task")
         assert found.state == "complete"
         assert all((runs / "task" / name).stat().st_size == file.bytes for name, file in found.files.items())

@@ -1,4 +1,4 @@
-"""`drake-diff mcap` and `drake-diff export`: what they print and their exit status."""
+"""Tests of `drake-diff mcap` and `drake-diff export`: their output and exit status."""
 
 import numpy as np
 import pytest

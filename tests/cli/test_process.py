@@ -1,4 +1,4 @@
-"""The command as a process: signals, closed pipes, full disks and names that are no text."""
+"""Tests of the command as a process: signals, closed pipes, full disks and names that are not UTF-8."""
 
 import os
 import subprocess
@@ -25,7 +25,7 @@ def python(tmp_path):
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_a_signal_amid_the_import_of_an_extension_comes_after_it(python, name):
-    """Drake's extension aborts, or prints the exception and goes on, where one is raised while it is imported."""
+    """If an exception is raised during the import of Drake's extension, it aborts, or prints it and continues."""
     done = python(f"""import os, signal, sys
 from drake_diff._base.clock import interrupt_alike
 interrupt_alike()

@@ -1,4 +1,4 @@
-"""A model for engines that cannot be had here: what is written is the model, or nothing is written."""
+"""Tests of exports to engines that are not installed: the written file is the model, or no file is written."""
 
 import csv
 import json
@@ -40,14 +40,14 @@ def rows_of(path):
 
 @each_row("target", list(MODEL_FILE))
 def test_the_written_file_steps_as_the_hand_calculation_does(load, tmp_path, target):
-    """m l^2 (v' - v) = h (u - m g l sin q - b v'): 1 kg at 0.5 m, b = 0.1 N m s, from the file alone."""
+    """The step is m l^2 (v' - v) = h (u - m g l sin q - b v'), with 1 kg at 0.5 m and b = 0.1 N m s."""
     files = export_model(load("pendulum.urdf"), tmp_path / "out", target=target, states=3)
     assert {f.name for f in files} == {f.name for f in (tmp_path / "out").iterdir()} == FILES | {MODEL_FILE[target]}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ModelWarning)  # of what is other engines' alone
+        warnings.simplefilter("ignore", ModelWarning)  # about elements for other engines
         model = dd.load_model(tmp_path / "out" / MODEL_FILE[target], time_step=0.01)
     x = dd.step(model, [0.7, -1.2], [0.3])
-    np.testing.assert_allclose(x, [0.686908411253, -1.309158874737], atol=1e-11)  # as many digits as are known
+    np.testing.assert_allclose(x, [0.686908411253, -1.309158874737], atol=1e-11)  # the number of known digits
 
 
 def test_a_motor_that_only_pushes_stays_so(tmp_path):
@@ -56,12 +56,12 @@ def test_a_motor_that_only_pushes_stays_so(tmp_path):
         '<actuator><motor joint="j" gear="4" ctrlrange="0 1"/></actuator></mujoco>'
     )
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ModelWarning)  # the gear
+        warnings.simplefilter("ignore", ModelWarning)  # about the gear
         model = dd.load_model(tmp_path / "m.xml", time_step=0.01)
         export_model(model, tmp_path / "out", target="mjcf")
         again = dd.load_model(tmp_path / "out" / "model.xml", time_step=0.01)
     assert (again.inputs.lower, again.inputs.upper) == (0.0, 4.0)
-    assert "in [0, 4]" in export_model(model, tmp_path / "u", target="urdf")[-1].read_text()  # URDF cannot say it
+    assert "in [0, 4]" in export_model(model, tmp_path / "u", target="urdf")[-1].read_text()  # URDF has no such limits
 
 
 def test_the_contract_is_drake_s_in_strict_json(load, tmp_path):
@@ -91,7 +91,7 @@ def test_states_and_inputs_are_the_samples_to_the_bit(load, tmp_path):
 
 
 def test_the_other_side_s_motion_comes_back_and_is_the_same(load, tmp_path):
-    """MuJoCo on the exported file alone, from the exported state and input, recorded in CSV as the README says."""
+    """MuJoCo simulates the exported file from the exported state and input, and the CSV has the README's header."""
     needs("mujoco")
     model = load("cart_pole.urdf")
     out = tmp_path / "out"
@@ -99,7 +99,7 @@ def test_the_other_side_s_motion_comes_back_and_is_the_same(load, tmp_path):
     other = engine_of("mujoco", model, path=out / "model.xml")
     states, inputs = rows_of(out / "initial_states.csv"), rows_of(out / "inputs.csv")
     x0, u = np.array(states[2][2:], dtype=float), np.array(inputs[2][1:], dtype=float)
-    motion = move(other, x0, np.tile(u, (30, 1)))  # until the rail's end, which each engine has its own law for
+    motion = move(other, x0, np.tile(u, (30, 1)))  # before the rail's end, where the engines differ
     header = next(x for x in (out / "README.md").read_text().splitlines() if x.strip().startswith("time,")).strip()
     samples = [[repr(float(n)) for n in (0.01 * k, *x, *u)] for k, x in enumerate(motion.xs)]
     (out / "run.csv").write_text("\n".join([header, *map(",".join, samples)]))
@@ -116,18 +116,18 @@ def test_trees_with_turned_joints_armature_and_limits_come_back(tmp_path, form):
 
 @pytest.mark.parametrize("form", ["urdf", "sdf"])
 def test_shapes_come_back_where_they_were(load, tmp_path, form):
-    """Overlaps at random states; a half space is in SDF alone."""
+    """Compare penetration depths at random states. Only SDF has a half space."""
     for name in ("box_push.sdf", "two_spheres.sdf", *(("sphere_on_ground.sdf",) if form == "sdf" else ())):
         model, path = load(name), tmp_path / f"model.{form}"
         path.write_text(written(form, describe(model), model.time_step))
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ModelWarning)  # gravity and time step, which Drake takes as options
+            warnings.simplefilter("ignore", ModelWarning)  # about gravity and time step, which are options in Drake
             theirs = engine_of("drake", dd.load_model(path, time_step=model.time_step))
         ours, depths, random = engine_of("drake", model), [], np.random.default_rng(0)
         for _ in range(20):
             x = model.default_state + 0.2 * random.standard_normal(model.nx)
             depths.append(ours.contact_depth(x))
-            assert theirs.contact_depth(x) == pytest.approx(depths[-1], abs=1e-12)  # of poses' rounding
+            assert theirs.contact_depth(x) == pytest.approx(depths[-1], abs=1e-12)  # rounding of poses
         assert max(depths) > 0
         if form == "sdf" and name == "sphere_on_ground.sdf":
             assert theirs.contract.contacts[0].friction == 0.5
@@ -178,7 +178,7 @@ def test_joints_that_follow_others_come_back_and_one_that_does_not_is_named(tmp_
 
 
 def test_mujoco_holds_the_exported_follower(tmp_path):
-    """(m + r^2 M) v' = u: 2 kg and 3 kg that go 1.7 times as far, of Euler's steps; MuJoCo's constraint is soft."""
+    """Euler steps of (m + r^2 M) v' = u: 2 kg, and 3 kg at 1.7 times the distance. MuJoCo's constraint is soft."""
     mujoco = pytest.importorskip("mujoco", reason="no MuJoCo (the extra `engines`)")
     model = followed(tmp_path)
     export_model(model, tmp_path / "out", target="mjcf", states=2)
@@ -188,7 +188,7 @@ def test_mujoco_holds_the_exported_follower(tmp_path):
     mujoco.mj_step(theirs, data, 100)
     a = 6.0 / (2 + 1.7**2 * 3)
     right = np.array([0.1 + 0.5 + a * 0.01**2 * 100 * 101 / 2, 0.5 + a])
-    # It gives way by 1 - 0.9999 of what would be missing after one step, 1e-7 m at such accelerations.
+    # The constraint yields by 1 - 0.9999 of the error of one step, which is 1e-7 m at such accelerations.
     np.testing.assert_allclose([data.qpos[0], data.qvel[0]], right, atol=1e-6)
     np.testing.assert_allclose(data.qpos[1], 1.7 * right[0] + 0.3, atol=1e-6)
     states = rows_of(tmp_path / "out" / "initial_states.csv")
@@ -200,7 +200,7 @@ def test_mujoco_holds_the_exported_follower(tmp_path):
     readme = (tmp_path / "out" / "README.md").read_text()
     assert "Joints that follow others: b = 1.7 a + 0.3" in readme
     assert "    time,a_x,a_v,motor" in readme
-    urdf_of = mujoco.MjModel.from_xml_string(urdf(describe_whole(model)))  # its own reader of URDF
+    urdf_of = mujoco.MjModel.from_xml_string(urdf(describe_whole(model)))  # MuJoCo's parser of URDF
     np.testing.assert_allclose(urdf_of.eq_data[:, :3], [[0.3, 1.7, 0]])
 
 
@@ -211,7 +211,7 @@ def test_followers_that_are_not_reduced_are_refused(tmp_path):
         export_model(model, tmp_path / "out", target="urdf")
 
 
-# ---- the gate ----------------------------------------------------------------------------------------------------
+# ---- errors ------------------------------------------------------------------------------------------------------
 
 
 def test_what_a_format_cannot_say_is_refused(load, tmp_path, monkeypatch):
@@ -221,7 +221,7 @@ def test_what_a_format_cannot_say_is_refused(load, tmp_path, monkeypatch):
     assert not (tmp_path / "out").exists()
     export_model(model, tmp_path / "out", target="gazebo")  # SDF has springs
     monkeypatch.setattr(export, "find_spec", lambda name: None)
-    with pytest.raises(ModelError, match="MuJoCo is not installed"):  # and Drake reads no springs in MJCF
+    with pytest.raises(ModelError, match="MuJoCo is not installed"):  # Drake reads no springs in MJCF
         export_model(model, tmp_path / "mjcf", target="mjcf")
 
 

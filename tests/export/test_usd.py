@@ -1,4 +1,4 @@
-"""The exported USD, read by Newton: another engine than the one that wrote it, float32 as USD's schemas are."""
+"""Tests of the exported USD, read by Newton and by usd-core, in float32 like USD's schemas."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def newton_of(model, tmp_path):
     pytest.importorskip("newton_usd_schemas", reason="no newton-usd-schemas")
     from drake_diff.export.usd import usd
 
-    path = tmp_path / f"{model.name}.usda"  # USD keeps files by path, and does not read one again
+    path = tmp_path / f"{model.name}.usda"  # USD caches files by path
     path.write_text(usd(describe_whole(model)))
     builder = newton.ModelBuilder()
     builder.add_usd(str(path))
@@ -29,13 +29,13 @@ def newton_of(model, tmp_path):
 def test_newton_finds_the_same_mass_matrix_damping_and_limits(tmp_path):
     model = arms(tmp_path)
     newton, builder = newton_of(model, tmp_path)
-    np.testing.assert_allclose(builder.joint_target_kd, 0.2, rtol=1e-6)  # of float32, as all below
+    np.testing.assert_allclose(builder.joint_target_kd, 0.2, rtol=1e-6)  # float32, like all tolerances below
     np.testing.assert_allclose(builder.joint_limit_lower, -2.5, rtol=1e-6)
     theirs = builder.finalize(device="cpu")
     names = [label.split("/")[-1] for label in theirs.joint_label]
     assert names == [x.joint for x in describe(model).moving]
     drake, state = engine_of("drake", model), theirs.state()
-    armature = np.diag(describe(model).by_velocity("armature"))  # an attribute of PhysX, which Newton leaves out
+    armature = np.diag(describe(model).by_velocity("armature"))  # a PhysX attribute, which Newton ignores
     for seed in range(3):
         q = np.random.default_rng(seed).standard_normal(4)
         state.joint_q.assign(q.astype(np.float32))
@@ -70,7 +70,7 @@ def test_what_usd_cannot_say_is_told_and_not_written(load, tmp_path):
 
 
 def test_friction_ground_stiffness_limits_and_springs_are_read_by_usd_core(load):
-    """By UsdPhysics' own getters, from the file alone."""
+    """Read the values with UsdPhysics' own getters, from the file only."""
     from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
 
     from drake_diff.export.usd import usd
@@ -90,13 +90,13 @@ def test_friction_ground_stiffness_limits_and_springs_are_read_by_usd_core(load)
     assert UsdGeom.Plane(plane).GetAxisAttr().Get() == "Z"
     world = UsdGeom.XformCache().GetLocalToWorldTransform(plane)
     np.testing.assert_allclose(world.TransformDir((0, 0, 1)), [0, 0, 1], atol=1e-12)
-    sprung = opened("mass_spring_damper.sdf")  # a stage, which prims do not keep alive
+    sprung = opened("mass_spring_damper.sdf")  # a variable for the stage, as prims do not keep it alive
     slide = UsdPhysics.DriveAPI.Get(sprung.GetPrimAtPath("/robot/joints/slide"), "linear")
     assert (slide.GetStiffnessAttr().Get(), slide.GetTargetPositionAttr().Get()) == pytest.approx((50, 0.1), rel=1e-6)
 
 
 def test_a_joint_that_follows_another_is_read_by_usd_core(tmp_path):
-    """In degrees for a hinge, as newton-usd-schemas says."""
+    """The offset is in degrees for a hinge, as specified by newton-usd-schemas."""
     pytest.importorskip("newton_usd_schemas", reason="no newton-usd-schemas")
     from pxr import Usd
 
@@ -122,7 +122,7 @@ def test_usd_has_no_hinge_that_follows_a_slide(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["two_fingers.sdf", "hopper.sdf", "quadruped.urdf"])
 def test_newton_finds_friction_and_every_moving_body(load, tmp_path, name):
-    """Where bodies are welded to the world, too: its importer takes no joint of two that do not move."""
+    """Some bodies are welded to the world. Newton's importer accepts no joint between two fixed bodies."""
     description = describe(load(name))
     _, builder = newton_of(load(name), tmp_path)
     frictions = {g.material["friction"] for g in description.geometries}

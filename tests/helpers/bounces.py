@@ -1,8 +1,8 @@
-"""A ball that falls on a floor, bounces and goes on, event by event: free flight in closed form, contact by a law.
+"""The motion of a ball that bounces on a floor, event by event: free flight in closed form, contact by a law.
 
-    m x'' = m g - f,   x the depth,   f = k (x + tau x')+ of sap,   f = k x (1 + d x')+ of similar and lagged
+    m x'' = m g - f,   x the depth,   f = k (x + tau x')+ for sap,   f = k x (1 + d x')+ for similar and lagged
 
-This is the truth that gradients through a bounce are judged by: it has no time step, and nothing of the package.
+This is the reference for gradients through a bounce. It has no time step and does not use the package.
 """
 
 from dataclasses import dataclass
@@ -26,24 +26,24 @@ MATERIAL = """<drake:proximity_properties xmlns:drake="http://drake.mit.edu">
 
 @dataclass(frozen=True)
 class Bounce:
-    """A ball of radius 0.1 m on a vertical slide over a floor; k, d and tau are those of the pair."""
+    """A ball of radius 0.1 m on a vertical slide over a floor. k, d and tau are parameters of the pair."""
 
     stiffness: float  # k [N/m]
-    relaxation_time: float = 0.0  # tau [s], of sap alone
-    dissipation: float = 0.0  # d [s/m], of similar and lagged alone
+    relaxation_time: float = 0.0  # tau [s], only for sap
+    dissipation: float = 0.0  # d [s/m], only for similar and lagged
     mass: float = 1.0
     gravity: float = 9.81
 
     def model(self, path, approximation, time_step, effort=0.0):
-        """It as a file, loaded: x = [height of the centre, its rate]."""
-        # Two in series: stiffnesses are halved, dissipations averaged, relaxation times added.
+        """Write a file of the ball to `path` and load it: x = [height of the centre, its rate]."""
+        # Two materials in series have half the stiffness, the mean dissipation and the sum of the relaxation times.
         material = MATERIAL.format(k=2 * self.stiffness, d=self.dissipation, tau=self.relaxation_time / 2)
         path.write_text(FILE.format(mass=self.mass, material=material, effort=effort))
         gravity = (0, 0, -self.gravity)
         return dd.load_model(path, time_step=time_step, contact_approximation=approximation, gravity=gravity)
 
     def end(self, approximation, start, duration):
-        """(height of the centre, its rate) `duration` [s] after the `start` (height, rate)."""
+        """Return (height of the centre, its rate) `duration` [s] after the `start` (height, rate)."""
         k, tau, d = self.stiffness, self.relaxation_time, self.dissipation
         m, g, is_sap = self.mass, self.gravity, approximation == "sap"
         piece = 0.01 * min(sqrt(m / k), m / (k * tau) if is_sap and tau else 1.0)
@@ -64,7 +64,7 @@ class Bounce:
 
         x, v, left = RADIUS - start[0], start[1] * -1.0, duration
         while left > 0:
-            if x < 0 or (x == 0 and v < 0):  # in the air, up to where x is 0 again or the time is over
+            if x < 0 or (x == 0 and v < 0):  # in the air, until x is 0 again or the time ends
                 # x + v t + g t^2 / 2 = 0: the later root
                 t = (-v + sqrt(max(0.0, v * v - 2 * g * x))) / g if g else (-x / v if v > 0 else left)
                 if t >= left:
@@ -87,7 +87,7 @@ class Bounce:
         return RADIUS - x, -v
 
     def slopes(self, approximation, start, duration, loss=lambda z, v: z, width=1e-5):
-        """d loss(height, rate) / d (height, rate) of the start; and how far those over ten times `width` are."""
+        """Return d loss(height, rate) / d (height, rate) of the start, and its change for ten times the `width`."""
 
         def end(z, v):
             return loss(*self.end(approximation, (z, v), duration))

@@ -1,4 +1,4 @@
-"""What a page shows in a real browser: whether there is one, and how tests use it."""
+"""Functions for tests of pages in a real browser, which are skipped if no browser is installed."""
 
 import base64
 import shutil
@@ -19,7 +19,7 @@ FLAGS = (
 
 
 def open_page(browser, page, *, size=(1440, 900), scheme="light"):
-    """Load `page` from the disk and wait until its animation is there; nothing may have gone wrong."""
+    """Load `page` from the disk and wait until its animation is ready."""
     from selenium.webdriver.support.ui import WebDriverWait
 
     set_screen(browser, size, scheme)
@@ -32,7 +32,7 @@ def open_page(browser, page, *, size=(1440, 900), scheme="light"):
 
 
 def set_screen(browser, size, scheme):
-    """The size of the screen [pixels], a phone's below 600, and whether it is "light" or "dark"."""
+    """Set the size of the screen [pixels], a phone's below 600, and its colour scheme, "light" or "dark"."""
     screen = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": size[0] < 600}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
     media = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
@@ -40,18 +40,18 @@ def set_screen(browser, size, scheme):
 
 
 def wait_for_frame(browser):
-    """Until the page has been drawn again."""
+    """Wait until the page has been drawn again."""
     browser.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
 
 
 def colours(picture):
-    """How many colours a picture (n, m, 3) of 0 to 1 has: a blank one has few."""
+    """Return the number of colours of a picture (n, m, 3) with values from 0 to 1. A blank picture has few."""
     bytes_ = np.round(255 * picture).astype(int)
     return len(np.unique(bytes_ @ [65536, 256, 1]))
 
 
 def errors(browser):
-    """What the console complains of; SwiftShader's remarks on its own speed are none of ours."""
+    """Return the messages in the console, without SwiftShader's messages about its own speed."""
     return [entry["message"] for entry in browser.get_log("browser") if "GPU stall" not in entry["message"]]
 
 
@@ -64,7 +64,7 @@ def move_slider(browser, part):
 
 
 def view_of(browser):
-    """The 3D view's pixels, as it was last drawn."""
+    """Draw the 3D view and return its pixels."""
     import matplotlib.image
 
     url = browser.execute_script(
@@ -78,15 +78,15 @@ READABLE = (Path(__file__).parent / "readable.js").read_text(encoding="utf-8")
 
 
 def faint_texts(browser):
-    """Texts in view whose contrast is below WCAG's AA, with the element and the ratio; those of drawings apart."""
+    """Return visible texts with a contrast below WCAG's AA, with element and ratio, except texts in drawings."""
     return browser.execute_script(READABLE + "return faint();")
 
 
 def nameless(browser):
-    """Controls and pictures that a screen reader has no words for."""
+    """Return the controls and pictures that have no name for a screen reader."""
     return browser.execute_script(READABLE + "return nameless();")
 
 
 def badly_laid(browser):
-    """What leaves the page, is cut without a way to read it, or lies on another text."""
+    """Return elements that leave the page, are cut without a way to read them, or overlap another text."""
     return browser.execute_script(READABLE + "return badlyLaid();")

@@ -1,4 +1,4 @@
-"""How often chance alone makes `dd.explain` name a change of a right model, as far as its motion is linear."""
+"""The probability that noise makes `dd.explain` name a change of a correct model, if its motion is linear."""
 
 import numpy as np
 
@@ -10,10 +10,10 @@ from drake_diff.mechanics.description import coordinates_of
 
 
 def chance_of_a_name(model, recording: Recording, draws: int, seed: int = 0) -> tuple[float, float]:
-    """(share of draws of noise in which some change passes the limit, and in which one passes BIC's penalty alone).
+    """Return (share of noise draws in which a change exceeds the limit, share in which one exceeds BIC's penalty).
 
-    Where the model is right and residuals are white, R' b of the least squares |b - R dz|^2 has independent normal b,
-    and a change alone lowers them by what b has in its own columns.
+    If the model is correct and residuals are white, b of the least squares |b - R dz|^2 has independent normal entries,
+    and a change by itself reduces the squares by the part of b in the change's own columns.
     """
     chart = Chart(coordinates_of(model))
     pieces, noise = read_pieces(model, recording, 0.0), given_noise(model, chart, None)

@@ -1,4 +1,4 @@
-"""Recordings of robots whose bodies touch, of which one parameter is another than the model's, or none is."""
+"""Recordings of robots in contact. In some of them, one parameter differs from the model's."""
 
 from pathlib import Path
 
@@ -11,8 +11,8 @@ from helpers.legged import LEGGED, legged_model, rest
 
 MODELS = Path(__file__).parents[2] / "models"
 DOGS = ("anymal", "go2", "solo12")
-SOFTER = {"anymal": 0.5, "go2": 0.5, "solo12": 0.25}  # of the gains of a controller that is not held for 10 ms
-FINER, MUJOCO = 5, 0.0005  # steps of Drake in one of the model's; [s] of MuJoCo
+SOFTER = {"anymal": 0.5, "go2": 0.5, "solo12": 0.25}  # relative to the gains of a controller without a hold of 10 ms
+FINER, MUJOCO = 5, 0.0005  # Drake's steps in one step of the model; [s] MuJoCo's step
 PERIOD, SAMPLES = 0.01, 60
 NOISE = {"length": 1e-4, "angle": 5e-4, "speed": 5e-3, "turn": 2.5e-2}  # [m, rad, m/s, rad/s]
 SEEN = 5
@@ -38,7 +38,7 @@ def made(robot, step):
 
 
 def started(robot, model, random):
-    """(first state, command(k, x)): a throw, or a controller whose torques are recorded."""
+    """Return (first state, command(k, x)) of a throw, or of a controller whose torques are recorded."""
     x0 = model.default_state.copy()
     if robot in DOGS:
         return squatting(robot, model, random)
@@ -80,7 +80,7 @@ def squatting(robot, model, random):
 
 
 def changed(model, name, random):
-    """(parameters, bias by column): the value that is planted."""
+    """Return (parameters, bias by column) with the changed value."""
     if name.endswith(".bias"):
         return {}, {name.rsplit(".", 1)[0]: random.choice([-1, 1]) * random.uniform(0.003, 0.01)}
     value = np.array({p.name: p.value for p in dd.list_parameters(model)}[name], dtype=float)
@@ -90,7 +90,7 @@ def changed(model, name, random):
 
 
 def moved(model, x0, command, parameters, bias, by="same"):
-    """(states (n + 1, nx), inputs (n, nu)) what the controller does on the model as it really is."""
+    """Return (states (n + 1, nx), inputs (n, nu)) of the controller on the model with the changed value."""
     shift = np.zeros(model.nx)
     for column, value in bias.items():
         shift[model.state_names.index(column)] = value
@@ -108,7 +108,7 @@ def moved(model, x0, command, parameters, bias, by="same"):
 
 
 def scales(model):
-    """(2 nv,) of the noise."""
+    """Return the chart and the scales (2 nv,) of the noise."""
     chart = Chart(coordinates_of(model))
     turns = np.zeros(model.nv, dtype=bool)
     for i, j in chart.coordinates.single:

@@ -4,7 +4,7 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorC
 
 
 def error_controlled_end(plant, diagram, duration):
-    """Where the motion ends, (nx,), as a function of its start (nx,): Runge-Kutta 3 of accuracy 1e-8."""
+    """Return a function from the start (nx,) of a motion to its end (nx,): Runge-Kutta 3 with an accuracy of 1e-8."""
     simulator = Simulator(diagram)
     config = SimulatorConfig(
         integration_scheme="runge_kutta3", max_step_size=0.01, accuracy=1e-8, use_error_control=True

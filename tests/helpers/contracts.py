@@ -1,4 +1,4 @@
-"""Two arms, the changes that are made to one of them, and what the match of contracts finds."""
+"""Two arms, changes of one of them, and the differences that a match of their contracts must find."""
 
 import drake_diff as dd
 
@@ -18,7 +18,7 @@ PLAIN = {
 
 
 def arms(tmp_path, *, time_step=0.002, gravity=None, **changes):
-    """Two arms of two links each, on the world; `changes` are made to the left arm's second joint and link."""
+    """Load two arms of two links each, on the world; `changes` apply to the left arm's second joint and link."""
     values = {**PLAIN, **changes}
     text = []
     for side in values["order"]:
@@ -36,7 +36,7 @@ def different(a, b):
 
 
 FOLLOWS = {"M(q)", "bias(q, v)"}
-# What is changed: the quantities that must be named, those that may be, and words that must be in the first's detail.
+# For each change: the quantities that must be named, those that may be, and words in the first quantity's detail.
 CHANGES = {
     "mass + 1 %": ({"mass": 1.3 * 1.01}, {"mass", *FOLLOWS}, set(), ["left_joint_2", "1.3", "1.313"]),
     "inertia product": ({"ixy": 0.0031}, {"inertia", "M(q)"}, {"bias(q, v)"}, ["left_joint_2"]),

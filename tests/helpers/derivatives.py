@@ -5,7 +5,7 @@ from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoD
 
 
 def differentiate(function, x, u=None):
-    """(values, Jacobian by x, or by x and u)."""
+    """Return (values, Jacobian with respect to x, or to x and u)."""
     z = InitializeAutoDiff(x if u is None else np.concatenate([x, u])).ravel()
     result = function(z) if u is None else function(z[: len(x)], z[len(x) :])
     return ExtractValue(result).ravel(), ExtractGradient(result)

@@ -1,4 +1,4 @@
-"""Engines beside Drake: which are installed, the models they all have, and steps that must agree."""
+"""Engines other than Drake: which are installed, models that all of them support, and checks of their steps."""
 
 from importlib.util import find_spec
 
@@ -15,8 +15,8 @@ ROBOTS = ["panda.urdf", "ur5_robot.urdf", "solo12.urdf", "double_pendulum_contin
 G = 9.81
 
 
-# The modules that an engine needs, and the extra that has them. Importing them to see whether they are there takes
-# seconds of the collection.
+# The modules that an engine needs, and the extra that contains them. To import them only to find out whether they are
+# installed would take seconds of the collection.
 NEEDED = {
     "mujoco": (["mujoco"], "engines"),
     "pinocchio": (["pinocchio"], "engines"),
@@ -26,11 +26,11 @@ NEEDED = {
     "sapien": (["sapien"], "forward"),
     "pybullet": (["pybullet"], "forward"),
 }
-BESIDE = {"ray": (["ray"], "cluster"), "rosbags": (["rosbags"], "ros2"), "usd": (["pxr"], "usd")}  # no engines
+BESIDE = {"ray": (["ray"], "cluster"), "rosbags": (["rosbags"], "ros2"), "usd": (["pxr"], "usd")}  # not engines
 
 
 def needs(engine):
-    """Skip the test, or the module that calls this, where the engine or what is beside it is not installed."""
+    """Skip the test, or the module that calls this, if the engine or the optional package is not installed."""
     modules, extra = (NEEDED | BESIDE).get(engine, ([], ""))
     if any(find_spec(module.split(".")[0]) is None or find_spec(module) is None for module in modules):
         pytest.skip(f"{engine} is not installed: pip install 'drake-diff[{extra}]'", allow_module_level=True)
@@ -42,7 +42,7 @@ def engine_of(name, model, **options):
 
 
 class Doctored:
-    """An engine with something of it changed."""
+    """An engine with changed attributes."""
 
     def __init__(self, engine, **changes):
         self._engine = engine
@@ -54,7 +54,7 @@ class Doctored:
 
 
 def free_state(model, random):
-    """A random state inside the limits, free bodies high up."""
+    """Return a random state inside the limits, with free bodies high up."""
     x = random_state(model, random)
     lower, upper = model.plant.GetPositionLowerLimits(), model.plant.GetPositionUpperLimits()
     for i in np.flatnonzero(np.isfinite(lower) & np.isfinite(upper)):
@@ -70,7 +70,7 @@ def on_tangent(model, A, x, x_next):
 
 
 def assert_free_steps_agree(model, name, step, jacobian, *, states=5):
-    """One step and its Jacobian (on the tangent space) to these tolerances, relative to the largest entry."""
+    """Check one step and its Jacobian (on the tangent space) to these tolerances, relative to the largest entry."""
     drake, other, random = dd.engines.load_engine("drake", model), engine_of(name, model), np.random.default_rng(2)
     for _ in range(states):
         x, u = free_state(model, random), random.standard_normal(model.nu)
@@ -85,9 +85,9 @@ def assert_free_steps_agree(model, name, step, jacobian, *, states=5):
 
 
 def exponential_gap(x, x_next, h, q_start=0, w_start=7):
-    """(4,) MuJoCo's quaternion after a step less Drake's of the norm 1: exp(h w') against 1 + h w' / 2.
+    """Return (4,) MuJoCo's quaternion after a step minus Drake's unit quaternion: exp(h w'), not 1 + h w' / 2.
 
-    The one is (cos, sin) of |h w'| / 2 and the other of arctan(|h w'| / 2), about |h w'|^3 / 24 less.
+    MuJoCo's is (cos, sin) of |h w'| / 2, and Drake's of arctan(|h w'| / 2), which is about |h w'|^3 / 24 less.
     """
     q, turn = x[q_start : q_start + 4], h * x_next[w_start : w_start + 3] / 2
     angle = float(np.linalg.norm(turn))
@@ -97,7 +97,7 @@ def exponential_gap(x, x_next, h, q_start=0, w_start=7):
 
 
 def assert_free_bodies_differ_by_the_exponential(model, name, *, states=3):
-    """From Drake's step, in an engine that has MuJoCo's."""
+    """Check that an engine with MuJoCo's step differs from Drake's step by the exponential map only."""
     drake, mujoco, random = dd.engines.load_engine("drake", model), engine_of(name, model), np.random.default_rng(3)
     space = tangent_space(model)
 
@@ -109,11 +109,11 @@ def assert_free_bodies_differ_by_the_exponential(model, name, *, states=3):
     for _ in range(states):
         x, u = free_state(model, random), random.standard_normal(model.nu)
         a, b = with_gap(x, u), mujoco.step(x, u)
-        assert np.abs(b[:4] - drake.step(x, u)[:4]).max() > 1e-8  # there is something to explain
+        assert np.abs(b[:4] - drake.step(x, u)[:4]).max() > 1e-8  # the difference is not zero
         np.testing.assert_allclose(b, a, rtol=0, atol=1e-12 * abs(a).max())
         one, two = drake.differentiate_step(x, u), mujoco.differentiate_step(x, u)
         A, A2 = on_tangent(model, one.A, x, drake.step(x, u)), on_tangent(model, two.A, x, b)
-        # The turn's own rows, by differences of Drake's step and the gap: good to 1e-9.
+        # The rows of the rotation, by differences of Drake's step and the gap, are accurate to 1e-9.
         for i in range(len(A)):
             e = 1e-6 * np.eye(len(A))[i]
             ends = [space.minus(with_gap(space.plus(x, d), u), b)[:3] for d in (e, -e)]

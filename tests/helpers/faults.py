@@ -1,6 +1,6 @@
-"""Every call that changes a disk below a folder: listed by a trace, made to fail, or made the last one of its process.
+"""Calls that change a disk below a folder are listed, made to fail, or made the last calls of their process.
 
-Each try is a process of its own, forked from one that has the solution to be saved.
+Each attempt is a process of its own, which is forked from a process that has the solution to be saved.
 """
 
 import errno
@@ -18,14 +18,14 @@ from drake_diff.runs.fields import files_below
 from helpers.forks import fork, status_of
 
 ERRORS = ("ENOSPC", "EIO", "EACCES")
-FULL = "full"  # a disk that is full from then on: what writes fails, what removes and renames does not
+FULL = "full"  # a disk that is full from this call on: writing fails, removing and renaming do not
 KILLED, KILLED_AFTER = "killed", "killed after"
 FAULTS = (*ERRORS, FULL, KILLED, KILLED_AFTER)
 WRITES = ("create", "write", "mkdir", "fsync")
 
 
 class Disk:
-    """What is called below `root`; the `at`-th call meets `fault`. It patches the process that it is made in."""
+    """A list of the calls below `root`, of which the `at`-th has the `fault`. The object patches its own process."""
 
     def __init__(self, root, at=None, fault=""):
         self.root, self.at, self.fault = str(Path(root).resolve()), at, fault
@@ -51,7 +51,7 @@ class Disk:
             if dir_fd is not None:
                 more["dir_fd"] = dir_fd
             if name == "open" and not words[0] & (os.O_WRONLY | os.O_RDWR | os.O_DIRECTORY):
-                return call(path, *words, **more)  # to be read
+                return call(path, *words, **more)  # opened for reading
             told = "create" if name == "open" and words[0] & os.O_CREAT else name
             return self.meet(told, path, lambda: call(path, *words, **more), dir_fd)
 
@@ -78,7 +78,7 @@ class Disk:
 
 
 def forked(action):
-    """A running process of `action()`, which returns what JSON has, and the pipe from which `ended` takes its end."""
+    """Start a process of `action()`, which returns JSON data; return it and the pipe that `ended` reads."""
     reading, writing = os.pipe()
 
     def tell():
@@ -99,7 +99,7 @@ def forked(action):
 
 
 def ended(child, reading):
-    """What became of a process: what it returned, what it raised, or that it was killed."""
+    """Return the outcome of a process: its result, its exception, or that it was killed."""
     with os.fdopen(reading, "rb") as pipe:
         told = pipe.read()
     status = status_of(child)
@@ -108,7 +108,7 @@ def ended(child, reading):
 
 
 def tried(action, root, at=None, fault="", *, exchanges=True):
-    """What becomes of `action()` where the `at`-th call below `root` meets `fault`; without, all calls."""
+    """Return the outcome of `action()` if the `at`-th call below `root` has the `fault`; without one, all calls."""
 
     def act():
         if not exchanges:
@@ -121,7 +121,7 @@ def tried(action, root, at=None, fault="", *, exchanges=True):
 
 
 def two_solutions(folder):
-    """A plan that was saved, and one to be saved where it is, both of a pendulum in `folder` that has a mesh."""
+    """Return two plans of a pendulum with a mesh in `folder`, one that was saved and one that replaces it."""
     sphere = '<sphere radius="0.05"/>'
     urdf = Path("models/pendulum.urdf").read_text().replace(sphere, '<mesh filename="meshes/bob.obj"/>')
     (folder / "meshes").mkdir()
@@ -134,14 +134,14 @@ def two_solutions(folder):
 
 
 def quick_pages(monkeypatch):
-    """Pages of a word each, and versions that are looked up once: what is written is as much, what is computed less."""
+    """Write short pages and look up versions once, so that the same files are written with less computation."""
     monkeypatch.setattr(page, "write_pages", lambda *words: [files.write_whole(path, b"a page") for path in words[:2]])
     known = provenance.provenance_of()
     monkeypatch.setattr(provenance, "provenance_of", lambda *_: known)
 
 
 def goal_of(directory):
-    """The goal of the run that is whole in `directory`, an AssertionError where it is not."""
+    """Return the goal of the run in `directory`; raise an AssertionError if the run is not complete."""
     record = dd.load_record(directory)
     assert record.state == "complete"
     assert record.sealed() == record
@@ -150,7 +150,7 @@ def goal_of(directory):
 
 
 def has_plan(directory, solution):
-    """Whether the plan of `solution` can be read in `directory`."""
+    """Return whether the plan of `solution` can be read in `directory`."""
     try:
         with np.load(Path(directory) / "plan.npz") as plan:
             return np.array_equal(plan["xs"], solution.xs) and np.array_equal(plan["us"], solution.us)

@@ -1,4 +1,4 @@
-"""A joint that follows another, by a ratio and an offset."""
+"""A joint that follows another joint, by a ratio and an offset."""
 
 import drake_diff as dd
 
@@ -11,9 +11,9 @@ MOTOR = """<transmission><type>transmission_interface/SimpleTransmission</type><
 
 
 def followed(tmp_path, kinds=("prismatic", "prismatic"), *, damping=0.0, ratio=1.7, offset=0.3, time_step=0.01):
-    """Links of 2 and 3 kg, each on a joint of its own in the world: slides along x, hinges about y.
+    """Return a model of links of 2 and 3 kg, each on its own joint in the world: slides along x, hinges about y.
 
-    `b` follows `a`. The state of the model is that of `a`.
+    `b` follows `a`. The model's state is the state of `a`.
     """
     axes = {"prismatic": "1 0 0", "revolute": "0 1 0"}
     center = {"prismatic": 0.0, "revolute": -0.4}

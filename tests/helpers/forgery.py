@@ -1,4 +1,4 @@
-"""Run directories as a stranger forges them: anything is changed, and all hashes and content policies are renewed."""
+"""Forged run directories: any data can be changed, and all hashes and content policies are updated."""
 
 import json
 import re
@@ -14,8 +14,8 @@ from markupsafe import escape
 from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, Writer
 
-APART = ("wall_clock", "files", "record_sha256")  # of a record: what the trace does not carry
-COMMAND = re.compile(r'(?<=fetch\("data:application/octet-binary;base64,)[^"]+')  # to the viewer
+APART = ("wall_clock", "files", "record_sha256")  # fields of a record that the trace does not contain
+COMMAND = re.compile(r'(?<=fetch\("data:application/octet-binary;base64,)[^"]+')  # commands to the viewer
 SCRIPT = re.compile(r"(<script(?![^>]*json)[^>]*>)(.+?)(</script>)", re.DOTALL)
 VIEW = re.compile(r'(?<= srcdoc=")[^"]+')
 
@@ -25,7 +25,7 @@ def canonical(fields: dict[str, Any]) -> str:
 
 
 def seal(folder: Path, fields: dict[str, Any], *, attach: bool = True) -> None:
-    """Write `fields` as the record, with the hashes of all other files and its own; the trace carries it too."""
+    """Write `fields` as the record, with its hash and the hashes of all files; the trace contains it too."""
     if attach:
         carried = canonical({k: v for k, v in fields.items() if k not in APART}).encode()
         rewrite(folder / "trace.mcap", attachments={"record.json": carried})
@@ -48,7 +48,7 @@ def rewrite(
     metadata: dict[str, str] | None = None,
     drop: int | None = None,
 ) -> None:
-    """Write a trace again with some attachments, message, metadata changed, or messages dropped."""
+    """Write a trace again with changed attachments, messages or metadata, or without the message `drop`."""
     data, out = path.read_bytes(), BytesIO()
     writer = Writer(
         out, chunk_size=64 * 1024, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True
@@ -78,7 +78,7 @@ def rewrite(
 
 
 def with_scripts(page: str, change: Callable[[str], str], policy: dict[str, str] | None = None) -> str:
-    """The page with `change` made in each script, in those of the replay in it too."""
+    """Return the page with `change` applied to each script, including the scripts of the replay in it."""
     hashes = {} if policy is None else policy
 
     def changed(match: re.Match[str]) -> str:
@@ -98,14 +98,14 @@ def _hash(script: str) -> str:
 
 
 def with_scene_of(page: str, other: str) -> str:
-    """The page with the motion in 3D that another page shows."""
+    """Return the page with the 3D motion of another page."""
     scripts = [match[2] for text in (other, *map(unescape, VIEW.findall(other))) for match in SCRIPT.finditer(text)]
     (scene,) = (script for script in scripts if COMMAND.search(script))
     return with_scripts(page, lambda script: scene if COMMAND.search(script) else script)
 
 
 def with_commands(page: str, change: Callable[[int, bytes], bytes]) -> str:
-    """The page with `change` made in each command to the viewer; it is given the command's number."""
+    """Return the page with `change(number, command)` applied to each command to the viewer."""
     numbers = {command: i for i, command in enumerate(COMMAND.findall(unescape(page)))}
 
     def changed(match: re.Match[str]) -> str:

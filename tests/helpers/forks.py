@@ -1,4 +1,4 @@
-"""A process forked from a test: it ends by itself, whatever happens in it, and never goes on with the tests."""
+"""Processes that are forked from a test. They always end by themselves, and never continue with the tests."""
 
 import os
 import traceback
@@ -8,14 +8,14 @@ FAILED = 70  # the status of a process whose action raised
 
 
 def fork(action):
-    """The number of a new process that calls `action()` and ends: status 0, or FAILED with a traceback on stderr.
+    """Return the id of a new process that calls `action()` and ends: status 0, or FAILED with a traceback on stderr.
 
-    Whatever is raised in it, by a signal too, ends it: back in pytest it would run the tests a second time.
+    Any exception ends it, also one from a signal, because back in pytest it would run the tests a second time.
     """
     own, status = os.getpid(), FAILED
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # of other threads here, which the new process has not
+            warnings.simplefilter("ignore", DeprecationWarning)  # about threads that the new process does not have
             child = os.fork()
         if child == 0:
             action()
@@ -31,5 +31,5 @@ def fork(action):
 
 
 def status_of(child):
-    """The exit status of a forked process, minus the signal's number where one ended it."""
+    """Return the exit status of a forked process, or minus the number of the signal that ended it."""
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])

@@ -1,4 +1,4 @@
-"""The step of engines that only go forward, in double precision, by Drake's mass matrix and bias."""
+"""The step of engines without derivatives, in double precision, from Drake's mass matrix and bias."""
 
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
@@ -16,7 +16,7 @@ def free_box(center=(0.0, 0.0, 0.0), time_step=0.01, *, mass=2.0):
 
 
 def formula(model, x, u, *, exponential=False):
-    """One step from Drake's M and bias: explicit damping, free bodies by their centres, quaternions by their rate."""
+    """Return a step from Drake's M and bias: explicit damping, free bodies by their centres, quaternions by rates."""
     drake, h, nq = dd.engines.load_engine("drake", model), model.time_step, model.nq
     q, v = np.asarray(x)[:nq], np.asarray(x)[nq:]
     force = drake.description.actuation @ u - drake.bias(q, v) - drake.description.by_velocity("damping") * v

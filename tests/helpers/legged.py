@@ -1,4 +1,4 @@
-"""Robots, most of them of example-robot-data, that stand on spheres: their feet, as soft as their weight asks for."""
+"""Robots, most of them from example-robot-data, on spherical feet whose stiffness is chosen for their weight."""
 
 import re
 import tempfile
@@ -19,19 +19,19 @@ from drake_diff.model.step import advance
 
 from .models import robot_file
 
-# How deep a foot is under an even share of the weight: of its radius times a step in seconds. One of a radius above
-# SMALL [m] is at most as deep as one of that, or DEEPEST [m] in short steps. And how many steps it relaxes in.
+# SINK times a foot's radius times a step in seconds is its depth [m] under an even share of the weight. A radius above
+# SMALL [m] gives at most the depth of SMALL, or DEEPEST [m] in short steps. The contact relaxes in RELAXES steps.
 SINK, SMALL, DEEPEST, RELAXES = 3.9, 0.016, 1.25e-3, 2.5
 DISSIPATION, FRICTION = 0.5, 0.7  # [s/m]
-DRAWN, TURNED = 0.08, 0.05  # of the base's height, how far feet and centre of mass are drawn; [rad]
-SETTLES, SETTLE_STEP = 0.6, 0.002  # [s] of a PD controller that brings a posture to rest
+DRAWN, TURNED = 0.08, 0.05  # random offsets of feet and centre of mass, relative to the base's height; [rad]
+SETTLES, SETTLE_STEP = 0.6, 0.002  # [s] duration and step of a PD controller that brings a posture to rest
 
 
 @dataclass(frozen=True)
 class Legged:
-    """What its file does not tell: which bodies are feet, of which radius [m], its postures and its weight [N].
+    """Data that the robot's file does not contain: its feet and their radius [m], its postures and its weight [N].
 
-    Postures are those of the joints in the order of the model, gains those of a PD controller that holds them.
+    Postures are joint positions in the model's order. The gains are those of a PD controller that holds a posture.
     """
 
     file: str
@@ -45,8 +45,8 @@ class Legged:
     package: str = "example-robot-data"
     soles: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 0.0),)  # [m] centres of spheres in a foot's own frame
     drawn: float = DRAWN
-    held: str = ""  # how the names of joints begin that stay where they are
-    rotor: tuple[float, float] = (0.0, 1.0)  # [kg m^2] of each motor, and its gear ratio
+    held: str = ""  # a pattern for the start of the names of joints that are fixed
+    rotor: tuple[float, float] = (0.0, 1.0)  # [kg m^2] inertia of each motor, and its gear ratio
 
     @property
     def is_flat(self):
@@ -64,12 +64,12 @@ class Legged:
         return robot_file(self.file, self.package)
 
     def depth(self, time_step):
-        """[m] of a foot where the robot stands."""
+        """Return the depth [m] of a foot on which the robot stands."""
         return min(SINK * self.radius * time_step, max(DEEPEST, SINK * SMALL * time_step))
 
 
 def _legs(hip, knee, *, hind=1, count=4):
-    """Hips and knees of so many legs; those behind the first two are bent `hind` times as much."""
+    """Return hips and knees of `count` legs; the legs after the first two are bent `hind` times as much."""
     return tuple(v for leg in range(count) for v in (0.0, *(np.array([hip, knee]) * (hind if leg >= 2 else 1))))
 
 
@@ -86,11 +86,11 @@ LEGGED = {
         "anymal_b_simple_description/robots/anymal.urdf", ANYMAL_FEET, 0.031, _legs(0.5, -1.0, hind=-1),
         _legs(1.0, -2.0, hind=-1), 299.0, (300.0, 8.0), base="base",
     ),
-    "cheetah": Legged(  # no other package of an index has it
+    "cheetah": Legged(  # the only package that has it
         "mini_cheetah/mini_cheetah.urdf", CHEETAH_FEET, 0.015, _legs(-0.8, 1.6), _legs(-1.2, 2.4), 86.8, (40.0, 1.0),
         base="body", package="pybullet",
     ),
-    "talos": Legged(  # soles of 20 x 12 cm, as its maker has them; rotors as talos.srdf has them
+    "talos": Legged(  # soles of 20 x 12 cm, as specified by its maker; rotors as in talos.srdf
         "talos_reduced.urdf", ("leg_left_6_link", "leg_right_6_link"), 0.016, (0.0, 0.0, -0.45, 0.9, -0.45, 0.0) * 2,
         (0.0, 0.0, -0.65, 1.3, -0.65, 0.0) * 2, 885.0, (4000.0, 40.0), drawn=0.02, held="torso|arm|gripper|head",
         soles=tuple((x, y, -0.091) for x in (-0.1, 0.1) for y in (-0.06, 0.06)), rotor=(1e-5, 100.0),
@@ -100,8 +100,8 @@ LEGGED = {
 
 @cache
 def robot_on_feet(name, time_step):
-    """A file of that robot in which its feet are spheres, as soft as plans in such steps are found with; all else that
-    can touch is left out."""
+    """Write a file of the robot whose feet are spheres, as soft as plans with this step require. All other collision
+    shapes are removed."""
     robot = LEGGED[name]
     tree = ElementTree.parse(robot.path())
     root = tree.getroot()
@@ -137,7 +137,7 @@ def robot_on_feet(name, time_step):
 
 @cache
 def legged_model(name, time_step=0.02):
-    """The robot on its feet on a ground, a motor in each joint."""
+    """Return the robot on its feet on a ground, with a motor in each joint."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
         return dd.load_model(
@@ -152,10 +152,10 @@ def legged_model(name, time_step=0.02):
 
 
 def rest(name, model, joints, random=None):
-    """(nx,) a state at rest, the joints held at about `joints` by a PD controller.
+    """Return a state (nx,) at rest, in which a PD controller holds the joints near `joints`.
 
-    With a `random` generator the feet are drawn from about where they are, and the centre of mass and the base's turn.
-    The centre of mass of a robot on flat feet is brought, or drawn about, over the middle of them.
+    With a `random` generator, the feet, the centre of mass and the base's rotation have random offsets. The centre of
+    mass of a robot on flat feet is moved over the middle of the feet first.
     """
     robot, fine = LEGGED[name], model.at_time_step(SETTLE_STEP)
     nq, count, sink = model.nq, len(joints), robot.depth(model.time_step)
@@ -188,7 +188,7 @@ def rest(name, model, joints, random=None):
 
 
 def _that_hold(legs, q, count):
-    """(count,) torques of the joints that hold posture q (nq,), by the least forces at the soles."""
+    """Return the joint torques (count,) that hold posture q (nq,), with the least forces at the soles."""
     legs.put(q)
     needed, by_force = (
         legs.twin.inverse_dynamics(np.zeros(legs.model.nv)),

@@ -1,4 +1,4 @@
-"""A cart that is a double integrator, and its motions in a loop."""
+"""A cart that is a double integrator, and plans of its motion for tests of control loops."""
 
 import numpy as np
 
@@ -16,7 +16,7 @@ STEPS = 40
 
 
 def plan(model, us, x0, x_goal=None):
-    """The motion of `us`, as if it had been solved for."""
+    """Return a solution with the motion of `us`, as if a solver had found it."""
     xs = dd.rollout(model, x0, us).xs
     cost = dd.QuadraticCost(R=np.eye(model.nu)) if model.nu else dd.QuadraticCost(Q=np.eye(model.nx))
     problem = dd.Problem(model, x0=x0, num_steps=len(us), x_goal=x_goal, running_cost=cost)
@@ -24,6 +24,6 @@ def plan(model, us, x0, x_goal=None):
 
 
 def pushed_and_stopped(model, factor=1.0):
-    """Half the time forward, half the time back: from rest at 0 to rest at 50 (N/2)^2 h^2 = 2 m, `factor` 1."""
+    """Return a plan: push for half the time, then brake, from rest at 0 to 50 (N/2)^2 h^2 = 2 m for `factor` 1."""
     us = factor * 100.0 * np.repeat([[1.0], [-1.0]], STEPS // 2, axis=0)
     return plan(model, us, [0.0, 0.0], [100 / MASS * (STEPS // 2 * H) ** 2, 0.0])

@@ -1,4 +1,4 @@
-"""What many tests load or build: the models of this repository, robots, and plants under construction."""
+"""Models of many tests: the models of this repository, robots, and plants under construction."""
 
 import importlib.util
 import sys
@@ -23,7 +23,7 @@ MODELS = ROOT / "models"
 
 
 def robot_file(name, package="example-robot-data"):
-    """Where that package has it."""
+    """Return the path of the file in the package."""
     return next(f.locate() for f in files(package) if str(f).endswith("/" + name))
 
 
@@ -41,13 +41,13 @@ def contact_properties(stiffness, dissipation=0.0, friction=0.0, relaxation_time
 
 
 def add_slide(plant, name, parent, body, axis):
-    """A prismatic joint along a world axis."""
+    """Add a prismatic joint along a world axis."""
     direction = {"x": [1, 0, 0], "y": [0, 1, 0], "z": [0, 0, 1]}[axis]
     return plant.AddJoint(PrismaticJoint(name, parent, body.body_frame(), direction))
 
 
 class Plant:
-    """A plant under construction, for what no file format says."""
+    """A plant under construction, for models that no file format can describe."""
 
     def __init__(self, time_step, approximation="sap", contact_model="point", *, sampled=False, gravity=9.81):
         self.builder = DiagramBuilder()
@@ -61,7 +61,7 @@ class Plant:
         self.plant.mutable_gravity_field().set_gravity_vector([0, 0, -gravity])
 
     def ball(self, name, mass, radius, properties, *axes):
-        """A ball on prismatic joints along `axes` (x, y, z), one after the other; free where there are none."""
+        """Add a ball on prismatic joints along `axes` (x, y, z), one after the other, or a free ball without axes."""
         parent = self.plant.world_frame()
         for axis in axes[:-1]:
             link = self.plant.AddRigidBody(f"{name}_{axis}", SpatialInertia.Zero())
@@ -87,7 +87,7 @@ class Plant:
 
 
 def random_state(model, random, size=1.0):
-    """A state with unit quaternions."""
+    """Return a random state with unit quaternions."""
     x = size * random.standard_normal(model.nx)
     if model.state_names[0].endswith("_qw"):
         x[:4] = random.standard_normal(4)
@@ -100,8 +100,8 @@ MIMIC = '<mimic joint="panda_finger_joint1"/>'
 
 
 def robot(name, tmp_path):
-    """A robot of example-robot-data, but for what no other engine has: that one finger mimics the other, which is a
-    coupler in Drake, and that continuous joints have limits 0 and 0, which Drake keeps."""
+    """Load a robot of example-robot-data without features that no other engine has: one finger mimics the other, which
+    is a coupler in Drake, and continuous joints have limits 0 and 0, which Drake reads."""
     lines = robot_file(name).read_text().splitlines()
     copy = tmp_path / name
     copy.write_text("\n".join(line for line in lines if line.strip() not in ('lower="0"', 'upper="0"', MIMIC)))
@@ -111,11 +111,11 @@ def robot(name, tmp_path):
 
 
 def ur5():
-    with pytest.warns(ModelWarning):  # meshes skipped
+    with pytest.warns(ModelWarning):  # about skipped meshes
         return dd.load_model(robot_file("ur5_robot.urdf"), time_step=0.02)
 
 
-# A ball that does not turn, on slides along x and z, over flat ground.
+# A ball that does not rotate, on slides along x and z, above flat ground.
 BALL_ON_GROUND = """<sdf version="1.9" xmlns:drake="drake"><world name="flat">
 <model name="ground"><static>true</static><link name="ground"><collision name="ground">
 <geometry><plane><normal>0 0 1</normal></plane></geometry>{material}</collision></link></model>
@@ -133,7 +133,7 @@ MATERIAL = """<drake:proximity_properties><drake:point_contact_stiffness>{k}</dr
 
 
 def ball_on_ground(folder, *, time_step, stiffness, relaxation_time, friction=0.4):
-    """That ball, and the ground, each of this stiffness [N/m] and relaxation time [s]; its file is in `folder`."""
+    """Load BALL_ON_GROUND with this stiffness [N/m] and relaxation time [s] on both sides, from a file in `folder`."""
     text = BALL_ON_GROUND.format(material=MATERIAL.format(k=stiffness, tau=relaxation_time, mu=friction))
     path = folder / f"ball_{zlib.crc32(text.encode())}.sdf"  # a model is built again from its file
     path.write_text(text)
@@ -141,7 +141,7 @@ def ball_on_ground(folder, *, time_step, stiffness, relaxation_time, friction=0.
 
 
 def strike(plant, context, body, impulse):
-    """An impulse (3,) [N s] at the centre of mass of Drake's `body`: M dv = J' impulse."""
+    """Apply an impulse (3,) [N s] at the centre of mass of Drake's `body`: M dv = J' impulse."""
     world = plant.world_frame()
     at = body.CalcCenterOfMassInBodyFrame(context)
     J = plant.CalcJacobianTranslationalVelocity(context, JacobianWrtVariable.kV, body.body_frame(), at, world, world)
@@ -150,9 +150,9 @@ def strike(plant, context, body, impulse):
 
 
 def script(path):
-    """A Python file of the repository as a module."""
+    """Load a Python file of the repository as a module."""
     spec = importlib.util.spec_from_file_location(f"script_{Path(path).stem}", ROOT / path)
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where dataclasses look for their module
+    sys.modules[spec.name] = module  # dataclasses look up their module in it
     spec.loader.exec_module(module)
     return module

@@ -1,4 +1,4 @@
-"""Arms of example-robot-data in MuJoCo, without shapes, dry friction and limits, and the same file for Drake."""
+"""Arms of example-robot-data in MuJoCo, without shapes, Coulomb friction and limits, and the same file for Drake."""
 
 import warnings
 import xml.etree.ElementTree as ET
@@ -11,11 +11,11 @@ from drake_diff.model.step import set_state
 
 from .models import robot_file
 
-DAMPING = 0.5  # [N m s/rad] of every joint, which their files do not give
+DAMPING = 0.5  # [N m s/rad] of every joint, which the files do not give
 
 
 def bare_arm(folder, name="ur5_robot.urdf"):
-    """The path of the file without what the two simulators read differently."""
+    """Write the file without the elements that the two simulators read differently, and return its path."""
     root = ET.parse(robot_file(name)).getroot()
     for element in list(root.iter()):
         for child in list(element):
@@ -31,12 +31,12 @@ def bare_arm(folder, name="ur5_robot.urdf"):
 
 def drakes(path):
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ModelWarning)  # that motors were added
+        warnings.simplefilter("ignore", ModelWarning)  # about added motors
         return dd.load_model(path, time_step=0.005, actuators="all", contact=False, base="weld")
 
 
 class MuJoCoArm:
-    """The file in MuJoCo; compiled by `move`."""
+    """The file in MuJoCo, which `move` compiles."""
 
     def __init__(self, mujoco, path):
         self.mujoco = mujoco
@@ -49,9 +49,9 @@ class MuJoCoArm:
         self.spec.compiler.fusestatic = False
 
     def move(self, q0, torques, period, *, friction, step=2.5e-4):
-        """(q, v) at each sample, from rest at q0, under torques that act for a period each.
+        """Return (q, v) at each sample, from rest at q0, under torques that act for a period each.
 
-        Dry `friction` (nv,) stops a joint within two steps [s].
+        Coulomb `friction` (nv,) stops a joint within two steps [s].
         """
         mujoco = self.mujoco
         model = self.spec.compile()
@@ -73,7 +73,7 @@ class MuJoCoArm:
 
 
 def shaken(model, q0, samples, period, random):
-    """(samples, nu) torques that hold the arm up at q0 and shake it."""
+    """Return torques (samples, nu) that hold the arm up at q0 and shake it."""
     set_state(model.double, np.concatenate([q0, np.zeros(model.nv)]))
     weight, inertia = model.double.inverse_dynamics(np.zeros(model.nv)), np.diag(model.double.mass_matrix())
     t = period * np.arange(samples)

@@ -1,4 +1,4 @@
-"""Recordings of a pendulum by its equation of motion, which SciPy integrates."""
+"""Recordings of a pendulum from its equation of motion, which SciPy integrates."""
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -9,7 +9,7 @@ MASS, LEVER, GRAVITY = 1.0, 0.5, 9.81  # of models/pendulum.urdf
 
 
 def swing(*, damping=0.1, friction=0.0, times=None, start=(1.0, 0.0), noise=1e-3, seed=0, velocities=False):
-    """A recording of the pendulum by its equation of motion."""
+    """Return a recording of the pendulum from its equation of motion."""
 
     def rates(t, y):
         moment = -MASS * GRAVITY * LEVER * np.sin(y[0]) - damping * y[1] - friction * np.tanh(y[1] / 1e-3)

@@ -1,4 +1,4 @@
-"""Small plants built by hand: blocks, pendulums, trees, floating bodies and what touches the ground."""
+"""Small plants: blocks, pendulums, trees, floating bodies and bodies on the ground."""
 
 import math
 
@@ -34,7 +34,7 @@ from helpers.models import Plant, add_slide, contact_properties
 
 
 def block(*, mass=1.0, time_step=0.1, effort=math.inf, blocks=1, actuated=1, couple=False):
-    """Blocks side by side on rails, x_k along its rail; the first `actuated` of them are pushed."""
+    """Return blocks side by side on rails, with x_k along their rails; the first `actuated` of them are pushed."""
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(
         time_step=time_step, use_sampled_output_ports=False, discrete_contact_approximation="sap"
@@ -62,7 +62,7 @@ def pd_pendulum():
 
 
 def offset_pendulum():
-    """Two hinges, the second's frame on its parent being a FixedOffsetFrame whose pose is the identity."""
+    """Return two hinges. The second's frame on its parent is a FixedOffsetFrame whose pose is the identity."""
     plant = Plant(0.01)
     inertia = SpatialInertia.SolidSphereWithMass(1.0, 0.1)
     upper = plant.plant.AddRigidBody("upper", inertia)
@@ -74,7 +74,7 @@ def offset_pendulum():
 
 
 def pair(upper, lower, *, hydroelastic, height):
-    """A free body of shape `upper` at `height` over a fixed one whose top is z = 0."""
+    """Return a free body of shape `upper` at `height` above a fixed one, whose top is z = 0, and its state."""
     plant = Plant(0.01, "sap", "hydroelastic_with_fallback" if hydroelastic else "point")
     body = plant.plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
     properties = [contact_properties(1e4, friction=0.5) for _ in range(2)]
@@ -117,7 +117,7 @@ def constrained(kind):
 
 
 def springs_and_motors(*, limit=np.inf, kp=(0.0, 0.0, 0.0), gear=1.0, damping=0.2):
-    """A sprung cart, a sprung pole on it and a pole on that, all driven, PD-controlled where a gain is given."""
+    """Return a sprung cart, a sprung pole on it and a pole on that, all driven, with PD control if a gain is given."""
     made = Plant(0.01)
     plant = made.plant
     cart = plant.AddRigidBody("cart", SpatialInertia.SolidSphereWithMass(1.5, 0.1))
@@ -146,7 +146,7 @@ POINT = [0.3, 0.5, -0.4, 0.2, -0.7, 1.1], [0.4, -0.3, 0.2]
 
 
 def floating(joint_type, seed):
-    """A free body with a sprung arm on it, so that the base is pushed around."""
+    """Return a free body with a sprung arm, which pushes the base."""
     made, random = Plant(0.01), np.random.default_rng(seed)
     plant = made.plant
     inertia = RotationalInertia(0.2, 0.3, 0.25, 0.01, -0.02, 0.015)
@@ -163,7 +163,7 @@ def floating(joint_type, seed):
 
 
 def in_the_air(model, x):
-    """Free bodies a metre up, and what slides metres off whatever it could touch."""
+    """Move free bodies 1 m up, and sliding bodies metres away from every body that they could touch."""
     if model.state_names[0].endswith("_qw"):
         x[6] = 1.0
     apart = {
@@ -179,7 +179,7 @@ def in_the_air(model, x):
 
 
 def random_tree(seed, joints=6):
-    """A branching tree of hinges and slides with offset frames, welds, springs, damping and geared rotors."""
+    """Return a branching tree of hinges and slides with offset frames, welds, springs, damping and geared rotors."""
     random, made = np.random.default_rng(seed), Plant(0.01)
     plant = made.plant
 
@@ -215,7 +215,7 @@ def random_tree(seed, joints=6):
 
 
 def craft():
-    """A hull floating without gravity, turned by three reaction wheels."""
+    """Return a hull that floats without gravity and is turned by three reaction wheels."""
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(time_step=0.05, use_sampled_output_ports=False, discrete_contact_approximation="sap")
     plant, _ = AddMultibodyPlant(config, builder)
@@ -236,7 +236,7 @@ def tilted(model, angle=1.5):
 
 
 def box_on_the_ground(kind="spheres", *, pusher=False):
-    """A box of 2 kg on the ground, by four corner spheres or by hydroelastic contact."""
+    """Return a box of 2 kg on the ground, on four corner spheres or with hydroelastic contact."""
     plant = Plant(0.01, contact_model="point" if kind == "spheres" else "hydroelastic")
     ground, skin = contact_properties(2e4), contact_properties(2e4)
     if kind == "hydroelastic":
@@ -259,7 +259,7 @@ def box_on_the_ground(kind="spheres", *, pusher=False):
 
 
 def block_on_rails(time_step=0.01, friction=0.5, gravity=(0, 0, -9.81)):
-    """A ball on an x and a z rail, which slides like a block, and its state where it rests."""
+    """Return a ball on an x and a z rail, which slides like a block, and its state at rest."""
     plant = Plant(time_step, "lagged")
     plant.ball("ball", 1.0, 0.1, contact_properties(2e4, 10, friction), "x", "z")
     plant.ground(contact_properties(2e4, 10, friction))

@@ -17,13 +17,13 @@ OTHERS = [
 
 
 def lqr(h, count, Q, R, Qf, **fields):
-    """The running cost is a rate: weights divided by h give sums without h."""
+    """Return an LQR problem. The running cost is a rate, so that weights divided by h give sums without h."""
     costs = {"running_cost": dd.QuadraticCost(Q=Q / h, R=[[R / h]]), "final_cost": dd.QuadraticCost(Q=Qf)}
     return dd.Problem(block(time_step=h), **{"x0": [1, 0], "num_steps": count, **costs, **fields})
 
 
 def riccati(h, count, Q, R, Qf):
-    """(P0, gains K_0 ... K_N-1) of the double integrator as symplectic Euler steps it."""
+    """Return (P0, gains K_0 ... K_N-1) of the double integrator with symplectic Euler steps."""
     A, B = np.array([[1, h], [0, 1]]), np.array([[h**2], [h]])
     P, gains = np.array(Qf, dtype=float), []
     for _ in range(count):

@@ -1,6 +1,6 @@
-"""Robots of example-robot-data, made elsewhere, with a motor in each joint and, if asked for, feet and a ground.
+"""Robots of example-robot-data with a motor in each joint and, as an option, feet and a ground.
 
-Their meshes are skipped, so that a foot is a sphere at the end of each chain.
+Their meshes are skipped, so a foot is a sphere at the end of each chain.
 """
 
 import warnings
@@ -18,7 +18,7 @@ from drake_diff.model.load_file import read_into
 
 from .models import contact_properties, robot_file
 
-# Name of the file, and whether it stands on a floating base.
+# Name of the file, and whether the robot has a floating base.
 ROBOTS = {
     "solo12.urdf": True,
     "a1.urdf": True,
@@ -35,7 +35,7 @@ ROBOTS = {
     "so100.urdf": False,
     "allegro_left_hand.urdf": False,
 }
-FOOT = 0.02  # [m] the radius of each
+FOOT = 0.02  # [m] radius of each foot
 
 
 def example_robot(
@@ -50,9 +50,9 @@ def example_robot(
     gains=None,
     leg=None,
 ):
-    """The robot of that file; `gains` (kp, kd) gives every motor a PD controller inside the plant.
+    """Load the robot of a file; `gains` (kp, kd) gives every motor a PD controller inside the plant.
 
-    With `leg`, the joints of each leg in turn, its default state stands on its feet; controllers hold that posture.
+    With `leg`, the joint positions of one leg, the default state stands on its feet. Controllers hold that posture.
     """
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(
@@ -93,7 +93,7 @@ def example_robot(
 
 
 def _stand(plant, leg):
-    """Let the default posture be that of `leg`, the lowest foot on the ground."""
+    """Set the default posture to that of `leg`, with the lowest foot on the ground."""
     jointed = [plant.get_joint(JointIndex(i)) for i in range(plant.num_joints())]
     for i, joint in enumerate(joint for joint in jointed if joint.num_velocities() == 1):
         joint.set_default_positions([leg[i % len(leg)]])
@@ -110,7 +110,7 @@ def _stand(plant, leg):
 
 
 def state_in_range(model, random, speed=0.5):
-    """(nx,) joints from the middle half of their range (+-1 rad where there is none), base 1 m up, nearly upright."""
+    """Return a state: joints in the middle half of their range (+-1 rad without limits), base 1 m up, about upright."""
     plant = model.plant
     q = model.default_state[: model.nq].copy()
     for i in range(plant.num_joints()):
@@ -131,7 +131,7 @@ def state_in_range(model, random, speed=0.5):
 
 
 def state_in_contact(model, random, depth=1e-3, speed=0.2):
-    """A state in which the lowest foot of a floating robot is `depth` [m] in the ground."""
+    """Return a state in which the lowest foot of a floating robot is `depth` [m] in the ground."""
     plant = model.plant
     x = state_in_range(model, random, speed)
     context = plant.CreateDefaultContext()
@@ -147,7 +147,7 @@ def state_in_contact(model, random, depth=1e-3, speed=0.2):
 
 
 def arm_beside_table(folder, link, table, *, at, scale=1.0, **options):
-    """Two links of a shape on hinges about y and z, and a table beside them that is welded to the world."""
+    """Load two links of a shape on hinges about y and z, and a table near them that is welded to the world."""
     inertial = "<inertial><mass>1</mass></inertial>"
     shape = "<collision name='c'><pose>{0} 0 0 0 1.5707963267948966 0</pose><geometry>{1}</geometry></collision>"
     links, joints, middle = "", "", 0.15 * scale

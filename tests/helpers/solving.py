@@ -1,4 +1,4 @@
-"""`dd.solve` with its arguments and options side by side, for tables of tests."""
+"""`dd.solve` with arguments and options in one list of keywords, for tables of tests."""
 
 from dataclasses import fields
 

@@ -1,4 +1,4 @@
-"""Robot files with everything in them that a reader knows, and the ways in which strangers' files are broken."""
+"""Robot files with every element that the readers know, and functions that break them at random."""
 
 import copy
 import os
@@ -90,7 +90,7 @@ def put(folder: Path) -> None:
 
 
 def broken(ending: str, seed: int, count: int) -> Iterator[tuple[str, bytes]]:
-    """`count` broken variants of the file of that ending, each with a name for what was done."""
+    """Yield `count` broken variants of the file with this ending, each with a name for the change."""
     random = np.random.default_rng(seed)
     for _ in range(count):
         text = FILES[ending]
@@ -146,9 +146,9 @@ def _element(text: str, random: np.random.Generator) -> tuple[str, bytes]:
 
 
 def ends(cases: Iterator[tuple[str, bytes]], path: Path, seconds: int) -> dict[str, str]:
-    """How loading each case at `path` and one step of it ends, "ok" or the error; in a process of their own.
+    """Return "ok" or the error of each case at `path`, which is loaded and stepped in a separate process.
 
-    AssertionError where the process does not survive a case.
+    Raises AssertionError if the process does not survive a case.
     """
     log = path.with_suffix(".log")
     log.touch()
@@ -156,7 +156,7 @@ def ends(cases: Iterator[tuple[str, bytes]], path: Path, seconds: int) -> dict[s
     def load_all() -> None:
         resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what the parsers say
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # messages of the parsers
         with log.open("w") as lines:
             for name, data in cases:
                 path.write_bytes(data)

@@ -1,4 +1,4 @@
-"""A table of facts as one test: every row is checked, and each that fails is named."""
+"""A table of cases as one test. Every row is checked, and each row that fails is named."""
 
 import contextlib
 import functools
@@ -10,9 +10,9 @@ KEYWORD = inspect.Parameter.KEYWORD_ONLY
 
 
 def each_row(names, rows, *, ids=None):
-    """As `pytest.mark.parametrize`, in one test, which checks all rows whichever fails; two tables are their product.
+    """Return a decorator like `pytest.mark.parametrize`, for one test of all rows; two tables form their product.
 
-    The rows share the test's fixtures, but each has a directory (`tmp_path`) and patches (`monkeypatch`) of its own.
+    The rows share the test's fixtures, but each has its own directory (`tmp_path`) and patches (`monkeypatch`).
     """
     table = named_rows([name.strip() for name in names.split(",")], list(rows), ids)
 
@@ -38,13 +38,13 @@ def each_row(names, rows, *, ids=None):
 
 
 def slow_after(count, rows):
-    """The rows of `pytest.mark.parametrize`; those after the first `count` are slow tests."""
+    """Return rows for `pytest.mark.parametrize`; those after the first `count` are slow tests."""
     cells = [row if isinstance(row, tuple) else (row,) for row in rows]
     return [pytest.param(*row, marks=[pytest.mark.slow] if i >= count else []) for i, row in enumerate(cells)]
 
 
 def named_rows(columns, rows, ids):
-    """The name of each row and its values by column."""
+    """Return the name of each row and its values by column."""
     if not rows:
         raise ValueError("a table without rows checks nothing")
     if ids and not callable(ids) and len(ids) != len(rows):

@@ -1,4 +1,4 @@
-"""Plain dynamics that are transcribed: a block that is pushed, a pendulum, and how they are solved."""
+"""Plain dynamics for tests of transcription, a pushed block and a pendulum, and functions that solve them."""
 
 import types
 
@@ -21,7 +21,7 @@ BLOCK = Dynamics(push, 2, 1)
 
 
 def own_derivatives(dynamics):
-    """The same dynamics as an object, of which there is no expression."""
+    """Return the same dynamics as an object without an expression."""
     return types.SimpleNamespace(values=dynamics.values, linearize=dynamics.linearize)
 
 
@@ -40,7 +40,7 @@ OPTIONS = (
 
 
 def collocate(dynamics, **asked):
-    """The problem of `dynamics` with the fields and options `asked`, solved to a tolerance of 1e-9."""
+    """Solve the problem of `dynamics` with the fields and options `asked`, to a tolerance of 1e-9."""
     options = {"tolerance": 1e-9, "max_iterations": 3000, "refine": False} | {
         k: asked.pop(k) for k in OPTIONS if k in asked
     }

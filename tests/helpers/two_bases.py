@@ -12,7 +12,7 @@ ROBOT = """<link name="{0}_body"><inertial><mass>2</mass><inertia><ixx>0.05</ixx
 
 
 def two_bases(tmp_path, right_arm=0.5, time_step=0.01):
-    """`right_arm` [kg] is the mass of one of the arms, whose inertia goes with it."""
+    """Return the model; `right_arm` [kg] is the mass of the right arm, whose inertia is proportional to it."""
     path = tmp_path / f"two_{right_arm}.sdf"
     robots = ROBOT.format("left", 0.5, 0.01) + ROBOT.format("right", right_arm, 0.02 * right_arm)
     path.write_text(f'<sdf version="1.9"><model name="two">{robots}</model></sdf>')

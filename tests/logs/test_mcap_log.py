@@ -1,4 +1,4 @@
-"""The MCAP file: what goes in comes out bit for bit, and damage is noticed."""
+"""Tests of MCAP files: data is read back bit for bit, and damage raises an error."""
 
 import math
 import mmap
@@ -181,7 +181,7 @@ def test_an_attachment_whose_checksum_is_wrong_is_refused_though_every_other_hol
     write(path, states(3))
     data = bytearray(path.read_bytes())
     data[data.index(b"<robot/>")] ^= 1
-    (start,) = struct.unpack_from("<Q", data, len(data) - 8 - 20)  # of the summary; before it the data's checksum
+    (start,) = struct.unpack_from("<Q", data, len(data) - 8 - 20)  # of the summary, after the data's checksum
     struct.pack_into("<I", data, start - 4, zlib.crc32(data[: start - 13]))
     path.write_bytes(data)
     with pytest.raises(ArtifactError, match="the checksum of an attachment"):
@@ -190,7 +190,7 @@ def test_an_attachment_whose_checksum_is_wrong_is_refused_though_every_other_hol
 
 @pytest.mark.slow
 def test_a_long_log_is_streamed_not_gathered(tmp_path):
-    """40,000 messages are over 10 MB as Python objects; a few chunks and their indexes are far less."""
+    """40,000 messages are over 10 MB as Python objects, while a few chunks and their indexes are far smaller."""
     messages = ((k, STATE(time=k, q=[k] * 10)) for k in range(40_000))
     tracemalloc.start()
     write(tmp_path / "a.mcap", messages)
@@ -200,7 +200,7 @@ def test_a_long_log_is_streamed_not_gathered(tmp_path):
 
 
 def test_a_process_killed_while_it_writes_loses_no_more_than_the_chunk_in_progress(tmp_path):
-    size = 9 + 22 + len(STATE(time=1.0, q=[1.0] * 30, v=[1.0] * 30).SerializeToString())  # of a message's record
+    size = 9 + 22 + len(STATE(time=1.0, q=[1.0] * 30, v=[1.0] * 30).SerializeToString())  # size of a message's record
     seeded, lost = random.Random(2), []
     for trial in range(10):
         path, partial = tmp_path / f"{trial}.mcap", tmp_path / f"{trial}.mcap.partial"
@@ -210,11 +210,11 @@ def test_a_process_killed_while_it_writes_loses_no_more_than_the_chunk_in_progre
         assert times.tolist() == list(range(len(times)))
         lost.append((written - len(times)) * size)
     assert max(lost) <= CHUNK_SIZE + 1000  # schemas are in the first chunk, and the last message overflows it
-    assert len(set(lost)) > 5  # they did not all end at the same place
+    assert len(set(lost)) > 5  # the writes did not all end at the same place
 
 
 def readable(path):
-    """The log times of the messages before the damage in a file, by the mcap package alone."""
+    """Return the log times of the messages before the damage in a file, read with the mcap package only."""
     times = []
     with path.open("rb") as file, suppress(McapError, struct.error):
         for record in StreamReader(file, validate_crcs=True).records:
@@ -223,7 +223,7 @@ def readable(path):
 
 
 def _write_until_killed(path, *, after):
-    """How many messages the writer had taken when SIGKILL ended its process, soon after the `after`-th."""
+    """Return the number of messages that the writer took before SIGKILL, which follows the `after`-th message."""
     count = mmap.mmap(-1, 8)
 
     def forever():
@@ -249,7 +249,7 @@ def test_a_file_that_says_that_it_holds_too_much_is_refused_before_it_is_decoded
     for name, told in (("MOST_CHANNELS", "3 channels: at most 2"), ("MOST_MESSAGES", "3 messages: at most 2")):
         with monkeypatch.context() as patch:
             patch.setattr(mcap_file, name, 2)
-            patch.setattr(mcap_file, "_unpacked", None)  # which nobody calls
+            patch.setattr(mcap_file, "_unpacked", None)  # must not be called
             with pytest.raises(ArtifactError, match=told):
                 read_mcap(path)
 

@@ -1,4 +1,4 @@
-"""The routes around contact that AutoDiffXd refuses: what they change, what they keep, and that they differentiate."""
+"""Tests of the routes that replace collision shapes AutoDiffXd rejects: new shapes, properties and gradients."""
 
 import re
 from itertools import combinations_with_replacement, product
@@ -41,7 +41,7 @@ TWINS = ("autodiff", "double")
 
 @pytest.fixture(scope="module")
 def shapes(tmp_path_factory):
-    """One of each shape that a plant can collide with, about 0.2 m across."""
+    """Return one collision shape of each kind, about 0.2 m in size."""
     path = tmp_path_factory.mktemp("mesh") / "tetrahedron.obj"
     path.write_text(TETRAHEDRON)
     solids = [Sphere(0.1), Box(0.2, 0.2, 0.2), Cylinder(0.1, 0.2), Capsule(0.1, 0.2), Ellipsoid(0.1, 0.12, 0.09)]
@@ -78,7 +78,7 @@ def box_on_ground(route, contact_model="point"):
 
 
 def sliding(model, tilt, height):
-    """The box at a generic pose, sliding and turning."""
+    """Return a state in which the box has a generic pose and slides and rotates."""
     x = model.default_state.copy()
     x[:4] = RollPitchYaw(*tilt, 0.4).ToQuaternion().wxyz()
     x[4:] = [0.1, -0.2, height, 0.1, 0.2, -0.1, 0.5, 0.3, -0.2]
@@ -86,7 +86,7 @@ def sliding(model, tilt, height):
 
 
 def check_the_derivative(model, x, tolerance, verdict="agree"):
-    """Autodiff certifies and equals central differences of 4th order, relative to its largest entry."""
+    """Check that autodiff gets `verdict` and equals central differences of 4th order, relative to its largest entry."""
     A = dd.differentiate_step(model, x, method="autodiff").A
     dd.step(model, x)
     assert contacts_of_the_step(model)
@@ -100,11 +100,11 @@ def check_the_derivative(model, x, tolerance, verdict="agree"):
     assert np.abs(A - differences).max() <= tolerance * np.abs(A).max()
 
 
-# What the step does with the box as it is, and with each route.
+# The step of a box on the ground, without a route and with each route.
 
 
 def test_a_box_on_the_ground_has_the_derivative_that_autodiff_does_not():
-    """AutoDiffXd knows no penetration of a box; the step's own equation at Drake's witness points is its derivative."""
+    """AutoDiffXd has no penetration of a box, so the step's equation at Drake's witness points is differentiated."""
     model = box_on_ground("differences")
     x = sliding(model, (0.02, -0.03), 0.052)
     with pytest.raises(SimulationError, match="Penetration queries between shapes"):
@@ -112,7 +112,7 @@ def test_a_box_on_the_ground_has_the_derivative_that_autodiff_does_not():
     found = dd.differentiate_step(model, x)
     assert found.method == "analytic"
     differences = dd.differentiate_step(model, x, method="finite_difference")
-    assert np.abs(found.A - differences.A).max() <= 1e-5 * np.abs(found.A).max()  # differences of 1e-6 of a stiff step
+    assert np.abs(found.A - differences.A).max() <= 1e-5 * np.abs(found.A).max()  # increments of 1e-6 on a stiff step
 
 
 @pytest.mark.solve
@@ -120,12 +120,12 @@ def test_a_box_on_the_ground_has_the_derivative_that_autodiff_does_not():
 def test_a_sliding_hydroelastic_box_is_differentiated_by_autodiff(contact_model):
     model = box_on_ground("hydroelastic", contact_model)
     x = sliding(model, (0.3, -0.25), 0.09)
-    # Such a step is not had to rounding, so a certificate decides nothing where the solver's tolerance hides 1 %.
+    # The solver does not solve this step to rounding: the certificate is undecided where its tolerance hides 1 %.
     check_the_derivative(model, x, 1e-6, "undecided")  # measured 1.4e-9
 
 
 def test_the_box_rests_on_four_springs():
-    """m g = 4 k depth, where each contact is two springs in series."""
+    """The penetration depth satisfies m g = 4 k depth, where each contact is two springs in series."""
     model = box_on_ground("corner_spheres")
     x = model.default_state.copy()
     x[6] = SIZE[2] / 2 + 0.001
@@ -133,11 +133,11 @@ def test_the_box_rests_on_four_springs():
         x = dd.step(model, x)
     k = BOX_STIFFNESS * GROUND_STIFFNESS / (BOX_STIFFNESS + GROUND_STIFFNESS)
     assert len(contacts_of_the_step(model)) == 4
-    # 3 s of dissipation leave a speed of 1e-8 m/s, and the depth within 6e-7 of its limit
+    # After 3 s of dissipation, the speed is 1e-8 m/s and the depth is within 6e-7 of its limit.
     np.testing.assert_allclose(SIZE[2] / 2 - x[6], MASS * 9.81 / (4 * k), rtol=1e-5)
 
 
-# What is registered in place of what.
+# The shapes that replace the original shapes.
 
 
 X_BG = RigidTransform(RollPitchYaw(0.3, -0.5, 0.9), [0.1, 0.2, -0.3])
@@ -147,8 +147,8 @@ CORNERS = [X_BG @ (np.array(signs) * [0.145, 0.095, 0.045]) for signs in product
 @each_row(
     "shape, pose, radius, centres",
     [
-        (Box(*SIZE), X_BG, 0.005, CORNERS),  # 0.05 of the edge of 0.1 m: each touches three faces from inside
-        (Capsule(0.1, 0.4), RigidTransform([0, 0, 1.0]), 0.1, [[0, 0, 0.8], [0, 0, 1.2]]),  # its two ends
+        (Box(*SIZE), X_BG, 0.005, CORNERS),  # 5 % of the edge of 0.1 m; each is tangent to three faces from inside
+        (Capsule(0.1, 0.4), RigidTransform([0, 0, 1.0]), 0.1, [[0, 0, 0.8], [0, 0, 1.2]]),  # the capsule's two ends
     ],
     ids=["box", "capsule"],
 )
@@ -180,7 +180,7 @@ def test_a_moving_cylinder_becomes_spheres_along_its_rims_approximately():
 
 
 def test_many_geometries_on_one_body_are_each_replaced():
-    """The ids of plant.GetCollisionGeometriesForBody dangle as soon as a geometry is added to that body."""
+    """The ids of plant.GetCollisionGeometriesForBody become invalid when a geometry is added to that body."""
     plant = Plant(0.005)
     body = add_body(plant, Sphere(0.1))
     for i in range(40):
@@ -267,7 +267,7 @@ def test_hydroelastic_in_a_plant_with_point_contact_is_an_error():
         replaced(plant, "hydroelastic")
 
 
-# The other route, and errors.
+# Errors.
 
 
 def test_an_unknown_route_lists_those_that_exist():
@@ -284,11 +284,11 @@ def test_a_finalized_plant_is_an_error():
         replaced(plant)
 
 
-# Which pairs Drake supports, measured again.
+# The pairs that Drake supports, measured with Drake's own step.
 
 
 def step_throws(a, b, contact_model, *, half_space="rigid", twin="autodiff"):
-    """Whether the step of two overlapping free bodies throws."""
+    """Return whether the step of two overlapping free bodies throws."""
     plant = Plant(0.005, contact_model=contact_model)
     for name, shape in (("a", a), ("b", b)):
         properties = ProximityProperties() if contact_model == "point" else hydroelastic(shape, half_space)
@@ -300,9 +300,9 @@ def step_throws(a, b, contact_model, *, half_space="rigid", twin="autodiff"):
         dd.differentiate_step(model, x, method="autodiff") if twin == "autodiff" else dd.step(model, x)
     except SimulationError as error:
         if not re.search("are not supported|that is not allowed", str(error)):
-            raise  # something other than the pair
+            raise  # an error that does not concern the pair
         return True
-    assert contacts_of_the_step(model)  # so that silence means support, not a miss
+    assert contacts_of_the_step(model)  # without contact, a step without an error would not show support
     return False
 
 
@@ -329,6 +329,6 @@ def test_autodiff_throws_where_the_table_says_so_and_nowhere_else(shapes, a, b, 
 
 @each_row("kind", SHAPES)
 def test_a_compliant_half_space_meets_no_compliant_body(shapes, kind):
-    """Why the route hydroelastic makes half spaces rigid: not even the double step takes these."""
+    """Drake's step, even with doubles, rejects these pairs, so the route hydroelastic makes half spaces rigid."""
     for twin in TWINS:
         assert step_throws(shapes[kind], HalfSpace(), "hydroelastic", half_space="compliant", twin=twin)

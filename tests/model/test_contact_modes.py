@@ -1,4 +1,4 @@
-"""Contact modes from Drake's own forces, and where they change beside a step."""
+"""Tests of contact modes, which are computed from Drake's forces, and of mode changes near a step."""
 
 import numpy as np
 import pytest
@@ -11,12 +11,12 @@ import drake_diff as dd
 from drake_diff.model import contact_modes
 
 G, K, MU, H = 9.81, 1e4, 0.5, 0.01
-REST = 0.1 - G / K  # [m] of a ball of 1 kg on a ground, both of stiffness 2 K
+REST = 0.1 - G / K  # [m] height of a ball of 1 kg at rest on a ground, both of stiffness 2 K
 PAIR = ("ball/ball", "world/ground")
 
 
 def pushed_ball(approximation, mu=MU):
-    """A ball on slides along x and z over the ground, pushed along x."""
+    """Return a model of a ball that slides along x and z above the ground, with a force input along x."""
     plant = Plant(H, approximation)
     plant.ball("ball", 1.0, 0.1, contact_properties(2 * K, 0.0, mu, 0.0), "x", "z")
     plant.ground(contact_properties(2 * K, 0.0, mu, 0.0))
@@ -27,7 +27,7 @@ def pushed_ball(approximation, mu=MU):
 @each_row("approximation", ["sap", "similar", "lagged"])
 @each_row("mu", [0.3, 0.5])
 def test_a_push_below_the_friction_limit_sticks_and_one_above_slides(approximation, mu):
-    """The limit is mu m g."""
+    """The friction limit is mu m g."""
     model, x = pushed_ball(approximation, mu), [0.0, REST, 0.0, 0.0]
     assert contact_modes(model, x, [0.5 * mu * G]) == {PAIR: "sticking"}
     assert contact_modes(model, x, [-0.5 * mu * G]) == {PAIR: "sticking"}
@@ -38,7 +38,7 @@ def test_a_push_below_the_friction_limit_sticks_and_one_above_slides(approximati
 def test_a_ball_in_the_air_is_separated_and_so_is_one_that_leaves(approximation):
     model = pushed_ball(approximation)
     assert contact_modes(model, [0.0, 0.2, 0.0, 0.0], [0.0]) == {PAIR: "separated"}
-    # Overlapping by 1e-5 m and leaving at 1 m/s, it is out within the step.
+    # The ball overlaps by 1e-5 m and leaves at 1 m/s, so it separates within the step.
     assert contact_modes(model, [0.0, 0.1 - 1e-5, 0.0, 1.0], [0.0]) == {PAIR: "separated"}
 
 
@@ -72,7 +72,7 @@ def test_a_hydroelastic_patch_has_a_mode_too(push, mode):
 
 
 def test_a_change_of_mode_beside_the_step_is_named_with_the_entries_it_touches():
-    """The ball hangs 5e-5 m over the ground at the end of the step's start: 1e-4 m lower it touches."""
+    """The ball starts 5e-5 m above the ground, and touches it if it is displaced down by 1e-4 m."""
     model = pushed_ball("lagged")
     certificate = dd.certify(model, [0.0, 0.1 + 5e-5, 0.0, 0.0], [0.0])
     changes = certificate.mode_changes
@@ -85,10 +85,10 @@ def test_a_change_of_mode_beside_the_step_is_named_with_the_entries_it_touches()
 
 @pytest.mark.slow
 def test_at_the_edge_of_friction_the_push_changes_the_mode():
-    """sap: at 0.3 N short of mu m g no change within 1e-4 N, at the limit one."""
+    """With SAP, the mode changes within 1e-4 N at the friction limit mu m g, and does not change 0.3 N below it."""
     model, x = pushed_ball("sap"), [0.0, REST, 0.0, 0.0]
     limit = next(u for u in np.arange(4.0, 6.0, 1e-4) if contact_modes(model, x, [u])[PAIR] == "sliding")
-    assert limit == pytest.approx(MU * G, rel=0.02)  # sap's regularization
+    assert limit == pytest.approx(MU * G, rel=0.02)  # SAP's regularization
     columns = {c.column for c in dd.certify(model, x, [limit]).mode_changes}
     assert "push" in columns
     assert not dd.certify(model, x, [limit - 0.3]).mode_changes

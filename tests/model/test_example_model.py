@@ -1,4 +1,4 @@
-"""The models that come with the package: found from anywhere, named, and in the wheel."""
+"""Tests of the example models in the package: their list and size, errors, and the Panda arm."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ import drake_diff as dd
 from drake_diff.exceptions import UnknownNameError
 from drake_diff.model.example import example_files
 
-LARGEST = 100_000  # bytes of one file
+LARGEST = 100_000  # [bytes] maximum size of one file
 
 
 def test_every_file_of_models_is_an_example_and_small():
@@ -25,7 +25,7 @@ def test_an_unknown_example_is_refused_and_the_known_ones_are_listed():
 
 
 def test_the_panda_moves_like_the_one_it_was_made_of():
-    """Drake reads both files; the fingers of ours are fixed 2 cm out, where those of the other are set to."""
+    """Drake reads both files. The fingers of our file are fixed at 2 cm, and those of the original are set to 2 cm."""
     ours = dd.example_model("panda")
     plant = MultibodyPlant(0.0)
     parser = Parser(plant)
@@ -44,4 +44,4 @@ def test_the_panda_moves_like_the_one_it_was_made_of():
         mass = plant.CalcMassMatrix(theirs)[:7, :7]
         assert ours.plant.CalcMassMatrix(context) == pytest.approx(mass, abs=1e-12)  # rounding of numbers near 1
         gravity = plant.CalcGravityGeneralizedForces(theirs)[:7]
-        assert ours.plant.CalcGravityGeneralizedForces(context) == pytest.approx(gravity, abs=1e-11)  # of tens
+        assert ours.plant.CalcGravityGeneralizedForces(context) == pytest.approx(gravity, abs=1e-11)  # values near 10

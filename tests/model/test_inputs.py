@@ -1,4 +1,4 @@
-"""Inputs beside actuators: what a user's diagram exports, and forces on bodies."""
+"""Tests of inputs other than actuators: exported ports of a user's diagram, and forces on bodies."""
 
 import json
 from itertools import pairwise
@@ -58,7 +58,7 @@ def rotation(q):
 
 
 def newton_euler(x, u):
-    """dw/dt and dv/dt in the world frame, by hand."""
+    """Return dw/dt and dv/dt in the world frame from the Newton-Euler equations."""
     R, w = rotation(x[:4]), x[7:10]
     inertia = R @ np.diag(INERTIA) @ R.T
     moment = R @ (np.cross(POINTS, np.outer(u, [0, 0, 1])).sum(axis=0) + np.array([0, 0, RATIO * TURNS @ u]))
@@ -97,11 +97,11 @@ def test_a_quadrotor_hovers_under_a_quarter_of_its_weight_per_rotor():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_quadrotor_steps_and_moves_by_newton_and_euler(seed):
-    """Anywhere, at any speed; derivatives against central differences of the formulas, good to 1e-9 of the largest."""
+    """Check random states. Central differences of the formulas are accurate to 1e-9 of the largest entry."""
     model, (x, u) = quadrotor(), random_point(seed)
     assert dd.step(model, x, u) == pytest.approx(step_by_hand(x, u), abs=1e-13)
     z, e = np.concatenate([x, u]), 1e-6
-    moves = e * np.eye(17)[4:]  # of a quaternion no small change keeps the norm, which the formulas ask for
+    moves = e * np.eye(17)[4:]  # without the quaternion, whose norm the formulas require to be 1
     slopes = [(step_by_hand(*np.split(z + m, [13])) - step_by_hand(*np.split(z - m, [13]))) / (2 * e) for m in moves]
     d = dd.differentiate_step(model, x, u)
     assert np.hstack([d.A, d.B])[:, 4:] == pytest.approx(np.array(slopes).T, abs=1e-8 * np.abs(slopes).max())
@@ -126,27 +126,27 @@ def test_a_false_derivative_by_a_rotor_is_refuted():
     d = dd.differentiate_step(model, x, u)
     for i in range(4):
         B = np.array(d.B)
-        B[:, i] = 0.0  # as of a source that does not see the diagram's systems
+        B[:, i] = 0.0  # as from a source that ignores the diagram's systems
         false = type(d)(d.x_next, d.A, B, d.C, d.parameters, d.sources, d.method, d.reason)
         assert dd.certify(model, x, u, derivatives=false).verdict == "disagree"
 
 
 def test_rotors_do_work_that_the_energy_balance_has():
-    """A climb under constant thrust: the work is thrust times height, and no energy comes from nowhere."""
+    """In a climb under constant thrust, the work is thrust times height and the energy balance closes."""
     model, us = quadrotor(), np.tile(1.5 * HOVER, (100, 1))
     motion = dd.rollout(model, model.default_state, us)
     v = H * 0.5 * 9.81 * np.arange(101)
     assert motion.xs[:, 12] == pytest.approx(v, abs=1e-12)
     thrust = 1.5 * MASS * 9.81
     assert motion.work == pytest.approx(thrust * np.append(0, np.cumsum(H * (v[1:] + v[:-1]) / 2)), abs=1e-12)
-    assert abs(motion.energy_drift) < 0.02 * motion.energy_exchanged  # h g v is lost a step by semi-implicit Euler
+    assert abs(motion.energy_drift) < 0.02 * motion.energy_exchanged  # semi-implicit Euler loses h g v per step
     smooth = replayed(model, model.default_state, us, len(us))
     assert smooth.work[-1] == pytest.approx(thrust * 0.5 * 4.905 * (100 * H) ** 2, rel=1e-9)
     assert abs(smooth.energy_drift) < 1e-9 * smooth.energy_exchanged
 
 
 def propelled(forces=ROTORS, *, export=True):
-    """The same quadrotor, built by hand in a diagram with Drake's Propeller."""
+    """Build the same quadrotor in a diagram with Drake's Propeller; return the builder, plant and propeller."""
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlant(MultibodyPlantConfig(time_step=H, use_sampled_output_ports=False), builder)
     inertia = UnitInertia(*(INERTIA / MASS))
@@ -219,7 +219,7 @@ def test_a_body_force_that_makes_no_sense_is_refused(options, words):
 
 
 def pushed(add, *, robot_diagram=False, gains=None, mass=2.0):
-    """A block of `mass` on a slide with a motor; `add(builder, plant)` adds the rest."""
+    """Return a model of a block of `mass` on a slide with a motor; `add(builder, plant)` adds further systems."""
     robot = RobotDiagramBuilder(time_step=H) if robot_diagram else None
     builder = robot.builder() if robot else DiagramBuilder()
     if robot:
@@ -237,7 +237,7 @@ def pushed(add, *, robot_diagram=False, gains=None, mass=2.0):
 
 
 def behind(system):
-    """`system` between an exported input and the motor."""
+    """Return a function that connects `system` between an exported input and the motor."""
 
     def add(builder, plant):
         builder.AddSystem(system)
@@ -254,11 +254,11 @@ def behind(system):
         (MatrixGain(np.array([[1.0, -2.0, 0.5]])), [1.0, 2.0, 3.0], -1.5, [1.0, -2.0, 0.5]),
         (Saturation([-1.0], [4.0]), [2.0], 2.0, [1.0]),
         (Saturation([-1.0], [4.0]), [7.0], 4.0, [0.0]),
-        (Gain(30.0, 1), [2.0], 50.0, [0.0]),  # the motor's own limit
+        (Gain(30.0, 1), [2.0], 50.0, [0.0]),  # the motor's effort limit
     ],
 )
 def test_a_system_before_a_motor_is_part_of_the_model(system, u, force, slope):
-    """v+ = v + h f(u) / m, in steps and in continuous time, of which only the second has no limit of the motor."""
+    """The result is v+ = v + h f(u) / m in steps, and v' = f(u) / m in continuous time."""
     model = pushed(behind(system))
     assert model.nu == len(u)
     x = [0.3, 1.0]
@@ -276,7 +276,7 @@ def test_a_system_before_a_motor_is_part_of_the_model(system, u, force, slope):
 
 
 def drag_system(coefficient=1.5):
-    """A system of one's own: the force u - c v^3 on the first body, with a form for AutoDiffXd."""
+    """Return a user-defined system with the force u - c v^3 on the first body, which supports AutoDiffXd."""
 
     @TemplateSystem.define("Drag_")
     def Drag_(T):
@@ -301,7 +301,7 @@ def drag_system(coefficient=1.5):
 
 
 class PlainPush(LeafSystem):
-    """The same without drag, in Python's floats alone."""
+    """The same system without drag, which supports only Python floats."""
 
     def __init__(self):
         super().__init__()
@@ -326,7 +326,7 @@ def as_generalized_force(system, *, velocity=False):
 
 @pytest.mark.solve
 def test_a_system_of_ones_own_that_sees_the_state():
-    """v+ = v + h (motor + u - c v^3) / m; the motor, which is not exported, is the first input."""
+    """The result is v+ = v + h (motor + u - c v^3) / m. The motor is not exported and is the first input."""
     model = pushed(as_generalized_force(drag_system(), velocity=True))
     assert model.input_names == ("push", "u")
     x, u = np.array([0.3, 1.2]), np.array([2.0, -0.7])
@@ -340,7 +340,7 @@ def test_a_system_of_ones_own_that_sees_the_state():
     assert B[1] == pytest.approx([0.5, 0.5], abs=1e-14)
     assert dd.certify(model, x, u).verdict == "agree"
     motion = dd.rollout(model, x, np.zeros((100, 2)))
-    assert abs(motion.energy_drift) < 0.02 * motion.energy_exchanged  # what the drag takes is told
+    assert abs(motion.energy_drift) < 0.02 * motion.energy_exchanged  # the balance includes the work of the drag
     assert motion.work[-1] == pytest.approx(motion.kinetic_energy[-1] - motion.kinetic_energy[0], abs=1e-12)
 
 
@@ -357,7 +357,7 @@ def test_a_system_without_an_autodiff_form_is_differenced_and_refused_by_colloca
 
 
 def feeding(*systems):
-    """The systems one after the other onto the generalized force, the first one's input exported if it has one."""
+    """Return a function that connects `systems` in series to the generalized force and exports the first input."""
 
     def add(builder, plant):
         for system in systems:
@@ -377,7 +377,7 @@ def named_system(system, name):
 
 
 def unconnected_drag():
-    """Its input v is not connected."""
+    """Return a function that adds the drag system without a connection to its input v."""
 
     def add(builder, plant):
         system = builder.AddSystem(drag_system())
@@ -402,7 +402,7 @@ def test_systems_that_a_step_of_x_and_u_does_not_know_are_refused_by_name(add, w
 
 
 def test_targets_of_pd_control_can_be_inputs():
-    """m v+ = m v + h (u - p (q + h v+ - target) - d v+); AutoDiffXd carries the derivative by the target."""
+    """m v+ = m v + h (u - p (q + h v+ - q_target) - d (v+ - v_target)); AutoDiffXd gives the derivative."""
 
     def add(builder, plant):
         target = builder.AddSystem(Gain(2.0, 2))
@@ -416,9 +416,9 @@ def test_targets_of_pd_control_can_be_inputs():
     d = dd.differentiate_step(model, x, u)
     total = 2.0 + H * 5 + H**2 * 40
     v = (2.0 * 0.4 + H * (1.0 - 40 * (0.1 - 0.4) + 5 * 0.2)) / total
-    assert d.x_next[1] == pytest.approx(v, rel=1e-7)  # solved by SAP
+    assert d.x_next[1] == pytest.approx(v, rel=1e-7)  # the tolerance of SAP
     assert d.B[1] == pytest.approx(np.array([H, 2 * H * 40, 2 * H * 5]) / total, rel=1e-6)
-    assert dd.certify(model, x, u).verdict == "undecided"  # no closer than Drake's solver ends
+    assert dd.certify(model, x, u).verdict == "undecided"  # the tolerance of Drake's solver limits the comparison
 
 
 def test_what_knows_actuators_alone_refuses_other_inputs():
@@ -430,7 +430,7 @@ def test_what_knows_actuators_alone_refuses_other_inputs():
 
 
 def test_a_wing_glides_as_a_flat_plate():
-    """Lift and drag of Hoerner's flat plate: F = rho S sin(alpha) |v|^2 along the plate's normal."""
+    """The force on Hoerner's flat plate is F = rho S sin(alpha) |v|^2 along the plate's normal."""
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlant(MultibodyPlantConfig(time_step=H, use_sampled_output_ports=False), builder)
     body = plant.AddRigidBody("plane", SpatialInertia.SolidBoxWithMass(0.5, 0.6, 0.3, 0.1))
@@ -451,7 +451,7 @@ def test_a_wing_glides_as_a_flat_plate():
 
 
 def lander(time_step):
-    """The quadrotor's body with one engine through its centre of mass."""
+    """Return a model of the quadrotor's body with one engine through its centre of mass."""
     engine = BodyForce("engine", "body", upper=30.0)
     return dd.load_model(MODELS / "quadrotor.urdf", time_step=time_step, body_forces=[engine])
 
@@ -466,9 +466,9 @@ def lander(time_step):
     ],
 )
 def test_a_rocket_lands_with_least_effort(method, steps, close):
-    """From z, v to rest at 0 in T, least integral of (f - m g)^2: m^2 (12 z^2 / T^3 + 12 z v / T^2 + 4 v^2 / T).
+    """The least integral of (f - m g)^2 from z, v to rest in T is m^2 (12 z^2 / T^3 + 12 z v / T^2 + 4 v^2 / T).
 
-    The thrust is linear in time, so that collocation is exact; steps of T / 40 are so to first order.
+    The optimal thrust is linear in time, so collocation is exact. Steps of T / 40 have an error of first order.
     """
     z, v, T = 5.0, -2.0, 2.0
     model = lander(T / steps)

@@ -1,4 +1,4 @@
-"""Loops: points of two bodies that <connect>, <weld> or a joint of SDF holds together."""
+"""Tests of loops, which <connect>, <weld> or a joint of SDF closes by constraining points of two bodies."""
 
 import dataclasses
 import re
@@ -24,7 +24,7 @@ def load(path, **options):
 
 
 def parallelogram(tmp_path, equality=None, more=""):
-    """Cranks that hang down from two hinges; the bar is the first crank's child."""
+    """Write a parallelogram of cranks that hang down from two hinges; the bar is the first crank's child."""
     rod = f'<inertial pos="0 0 {-L / 2}" mass="{MASS}" diaginertia="{MASS * L**2 / 12} {MASS * L**2 / 12} 1e-4"/>'
     bar = f'<inertial pos="{WIDTH / 2} 0 0" mass="{BAR}" diaginertia="1e-4 0.01 0.01"/>'
     equality = equality or f'<connect body1="bar" body2="second" anchor="{WIDTH} 0 0"/>'
@@ -47,7 +47,7 @@ SDF_LINK = (
 
 
 def scaled(text, scale):
-    """The poses of an SDF file in another unit of length."""
+    """Return the text of an SDF file with the positions of its poses multiplied by `scale`."""
 
     def pose(match):
         numbers = [float(word) * (scale if i < 3 else 1.0) for i, word in enumerate(match[2].split())]
@@ -57,7 +57,7 @@ def scaled(text, scale):
 
 
 def sdf(tmp_path, kind="revolute", effort="0", expressed=""):
-    """The hinges of a four-bar whose planes are tilted by 0.3 rad about x, of a hinge at 1 m height."""
+    """Write a four-bar linkage. The hinges of its crank and its rocker are at 1 m height."""
     axis = f"<axis><xyz{expressed}>0 1 0</xyz><limit><effort>{{}}</effort></limit></axis>"
 
     def joint(name, parent, child, effort, kind="revolute", pose=""):
@@ -77,7 +77,7 @@ def sdf(tmp_path, kind="revolute", effort="0", expressed=""):
 
 
 def gaps(model, x):
-    """[m] between the points of each pair."""
+    """Return the distances [m] between the points of each pair."""
     plant, context = model.plant, model.plant.CreateDefaultContext()
     plant.SetPositions(context, x[: model.nq])
     return [
@@ -96,14 +96,14 @@ def gaps(model, x):
     ],
 )
 def test_a_parallelogram_swings_as_a_pendulum(tmp_path, equality):
-    """Each crank turns by the same angle and the bar by none: (2 m L^2 / 3 + M L^2) a = u - (m + M) g L sin(angle).
+    """The cranks turn by one angle and the bar by none: (2 m L^2 / 3 + M L^2) a = u - (m + M) g L sin(angle).
 
-    The points are held nearly rigidly: Drake's compliance gives way by (0.1 / 2 pi)^2 = 2.5e-4 of the motion.
+    The constraint is nearly rigid: Drake's compliance changes the motion by (0.1 / 2 pi)^2 = 2.5e-4.
     """
     model = load(parallelogram(tmp_path, equality))
     angle, u = 0.4, 1.5
     x = np.array([angle, -angle, angle, 0.0, 0.0, 0.0])
-    x[:3] *= -1  # a positive turn about y moves what hangs to -x
+    x[:3] *= -1  # a positive turn about y moves a hanging body to -x
     assert max(gaps(model, x)) < 1e-12
     end = dd.step(model, x, [u])
     wanted = (u + (MASS + BAR) * G * L * np.sin(angle)) / (2 * MASS * L**2 / 3 + BAR * L**2)
@@ -119,7 +119,7 @@ def test_a_parallelogram_swings_as_a_pendulum(tmp_path, equality):
         (
             '<connect body1="first" anchor="0 0 -0.1"/>',
             False,
-        ),  # on the world a ball constraint ends the process in Drake
+        ),  # Drake aborts on a ball constraint with the world body
         ('<connect body1="first" body2="world" anchor="0 0 -0.1"/>', False),
         ('<connect body1="first" body2="world" anchor="0 0 -0.1" active="false"/>', True),
     ],
@@ -133,7 +133,7 @@ def test_a_body_is_held_at_the_world(tmp_path, connect, moves):
 
 
 def test_a_gap_closes_within_some_steps(tmp_path):
-    """The constraint takes half of the gap away in each step."""
+    """The constraint halves the gap in each step."""
     model = load(parallelogram(tmp_path), gravity=[0, 0, 0])
     x = np.array([0.0, 0.01, 0, 0, 0, 0])
     before = max(gaps(model, x))
@@ -145,17 +145,17 @@ def test_a_gap_closes_within_some_steps(tmp_path):
 
 @each_row("kind", ["revolute", "ball", "fixed"])
 def test_a_joint_of_sdf_that_closes_a_loop_holds(tmp_path, kind):
-    """A weld leaves nothing to move; the others let the crank turn. Every derivative is right."""
+    """With a weld nothing can move; with the other joints the crank turns. Every derivative is right."""
     model, x = load(sdf(tmp_path, kind), time_step=0.005), np.zeros(6)
     for _ in range(40):
         x = dd.step(model, x, [0.2])
-    assert max(gaps(model, x)) < 1e-4  # at 2 rad/s a step of 5 ms leaves (0.01 rad)^2 0.5 m / 2
+    assert max(gaps(model, x)) < 1e-4  # a step of 5 ms at 2 rad/s opens a gap of (0.01 rad)^2 0.5 m / 2
     assert (abs(x[0]) > 0.02) == (kind != "fixed")
     dd.certify(model, x, [1.0]).require()
 
 
 def test_ends_of_a_joint_of_sdf_are_frames_or_links_of_a_nested_model(tmp_path):
-    """The same four-bar, whose rocker is in a nested model and whose closing joint names frames: one motion."""
+    """The same four-bar with its rocker in a nested model and a closing joint between frames has the same motion."""
     plain = sdf(tmp_path)
     text = plain.read_text()
     rocker = SDF_LINK.format("rocker", "0.5 0 1")
@@ -172,7 +172,7 @@ def test_ends_of_a_joint_of_sdf_are_frames_or_links_of_a_nested_model(tmp_path):
         for _ in range(20):
             x = dd.step(model, x, [0.2])
         ends.append(x)
-    assert ends[0] == pytest.approx(ends[1], abs=1e-9)  # rounding: one mechanism
+    assert ends[0] == pytest.approx(ends[1], abs=1e-9)  # rounding, as both are one mechanism
     assert abs(ends[0][0]) > 0.005
     lost = tmp_path / "lost.sdf"
     lost.write_text(text.replace("<parent>bar</parent>", "<parent>inner::bar</parent>"))
@@ -195,7 +195,7 @@ def test_a_loop_that_points_cannot_hold_is_refused(tmp_path, options, words):
 
 @pytest.mark.parametrize("fixed", [(), ("c",)])
 def test_points_coincide_in_the_pose_of_the_file_wherever_the_robot_starts(tmp_path, fixed):
-    """A .dmd.yaml lets it start 0.4 rad away, or a joint be fixed there: the loop is that of the file all the same."""
+    """The points do not change if a .dmd.yaml sets initial angles of 0.4 rad, or if a joint is fixed at that angle."""
     moved = tmp_path / "moved.dmd.yaml"
     moved.write_text(
         "directives:\n- add_model:\n    name: loop\n    file: file://"
@@ -210,7 +210,7 @@ def test_points_coincide_in_the_pose_of_the_file_wherever_the_robot_starts(tmp_p
 
 @each_row("relpose", ["", 'relpose="0.3 0 0.1 0.8 0 0.6 0"', 'relpose="0.356 0 -0.092 0.8 0 0.6 0" anchor="0.2 0 0"'])
 def test_a_weld_holds_a_body_in_its_pose(tmp_path, relpose):
-    """To another or to the world; a relpose is taken on, as in MuJoCo, where it is not the file's."""
+    """The body is welded to another body. A relpose that differs from the file's pose applies, as in MuJoCo."""
     free = (
         '<body name="free" pos="0.2 0.1 0.5"><freejoint/><geom size="0.1" mass="1" contype="0" conaffinity="0"/></body>'
     )
@@ -229,7 +229,7 @@ def test_a_weld_holds_a_body_in_its_pose(tmp_path, relpose):
 
 
 def test_the_motion_is_mujoco_s(tmp_path):
-    """Of the same mechanism for 0.5 s under a torque: MuJoCo's constraint is soft, both are within 5 mrad."""
+    """Both move for 0.5 s under a torque. MuJoCo's constraint is soft, so the angles agree within 5 mrad."""
     mujoco = pytest.importorskip("mujoco")
     path = parallelogram(
         tmp_path,
@@ -247,7 +247,7 @@ def test_the_motion_is_mujoco_s(tmp_path):
 
 
 def test_other_points_than_the_plants_are_noticed(tmp_path):
-    """The equation that is solved to rounding is then not Drake's, and no derivative is decided by it."""
+    """The equation that is solved to rounding then is not Drake's, and the certificate stays undecided."""
     model = load(parallelogram(tmp_path))
     pair = model.file_facts.held_points[0]
     model.file_facts.held_points[0] = dataclasses.replace(pair, points=[pair.points[0], pair.points[1] + 1e-4])
@@ -257,7 +257,7 @@ def test_other_points_than_the_plants_are_noticed(tmp_path):
 
 
 def test_loops_are_closed_from_a_posture_nearby(tmp_path):
-    """With what is kept the others follow; nothing closes the bar where a crank is kept out of reach."""
+    """The other joints follow those in `keep`. An error is raised if `keep` leaves the bar out of reach."""
     model = load(parallelogram(tmp_path))
     x = dd.model.assembled(model, [0.5, 0.0, 0.0, 1.0, 2.0, 3.0], keep=["a_q"])
     np.testing.assert_allclose(x, [0.5, -0.5, 0.5, 1.0, 2.0, 3.0], atol=1e-7)
@@ -270,7 +270,7 @@ def test_loops_are_closed_from_a_posture_nearby(tmp_path):
 
 
 def test_what_floats_beside_a_loop_is_left_alone(tmp_path):
-    """Joints keep their limits and places in q, whose quaternion stands behind them here."""
+    """Joints keep their limits and their places in q, which also contains the quaternion of the box."""
     box = '<body name="box" pos="0 0 3"><freejoint/><geom size="0.1" mass="1"/></body>'
     path = parallelogram(tmp_path, more=box)
     path.write_text(path.read_text().replace('name="a"', 'name="a" range="-60 60"'))
@@ -288,7 +288,7 @@ def test_what_floats_beside_a_loop_is_left_alone(tmp_path):
 
 
 def test_points_at_the_origins_of_their_bodies_can_be_held(tmp_path):
-    """Whose distance from there is no length to compare a gap with."""
+    """The distance of such points from the bodies' origins is zero, so a gap cannot be compared with it."""
     sites = '<body name="end" pos="{} 0 {}"><site name="{}"/></body>'
     path = parallelogram(tmp_path, '<connect site1="p" site2="s"/>')
     text = path.read_text().replace(f'<site name="end" pos="{WIDTH} 0 0"/>', sites.format(WIDTH, 0, "p"))
@@ -341,7 +341,7 @@ def test_bodies_that_joints_fix_are_held_by_nothing(tmp_path):
 
 
 def test_an_open_loop_of_a_millimetre_is_refused(tmp_path):
-    """A four-bar with links of 0.3 and 0.4 mm, whose second crank is 0.5 rad off."""
+    """The links of the four-bar are 0.3 and 0.4 mm long, and its second crank is displaced by 0.5 rad."""
     path = parallelogram(tmp_path)
     text = path.read_text()
     for length in (f"{-L}", f"{-L / 2}", f"{WIDTH}", f"{WIDTH / 2}"):
@@ -368,7 +368,7 @@ def test_a_crank_is_moved_by_a_verified_plan(tmp_path, method):
 
 
 def finger(side, outward):
-    """A driver and a coupler on one side, a longer link and the finger's root on the other, pinned together."""
+    """Return a finger in MJCF: a driver and a coupler, and a longer link and the finger's root, to be connected."""
     turn = "" if outward > 0 else 'quat="0 0 0 1"'
     light = 'diaginertia="2e-6 2e-6 1e-6"'
     return (
@@ -419,18 +419,18 @@ LEG = (
     ],
 )
 def test_robots_with_loops_are_planned_by_default(tmp_path, text, goals):
-    """A gripper whose servo pulls a tendon of two fingers, and a leg whose knee a rod moves."""
+    """The robots are a gripper whose servo pulls a tendon of two fingers, and a leg whose knee is moved by a rod."""
     (tmp_path / "robot.xml").write_text(text)
     done = plan(tmp_path / "robot.xml", goals=goals, out=tmp_path / "out")
     assert done.success, done
     q = dict(zip(done.model.position_names, done.solution.xs[-1], strict=False))
     assert all(abs(q[f"{name}_{'x' if name == 'rail' else 'q'}"] - value) < 1e-5 for name, value in goals.items())
-    # The constraint gives way by 2 h^2 (0.1 / 2 pi)^2 F / m: of 5 N m at 0.03 m of a link of 0.03 kg by 1.1 mm.
+    # The constraint yields by 2 h^2 (0.1 / 2 pi)^2 F / m, which is 1.1 mm for 5 N m at 0.03 m of a link of 0.03 kg.
     assert max(gap(done.model, x[: done.model.nq])[0] for x in done.solution.xs) < 1.2e-3
 
 
 def test_a_servo_of_a_tendon_drives_the_joint_that_the_others_follow(tmp_path):
-    """ctrl of 255 is 0.8 rad; in MuJoCo the same command moves both fingers there."""
+    """A ctrl of 255 is 0.8 rad. In MuJoCo the same command moves both fingers to the same angle."""
     mujoco = pytest.importorskip("mujoco")
     (tmp_path / "robot.xml").write_text(GRIPPER)
     model = load(tmp_path / "robot.xml", time_step=0.002, mimic="reduce")
@@ -446,7 +446,7 @@ def test_a_servo_of_a_tendon_drives_the_joint_that_the_others_follow(tmp_path):
         mujoco.mj_step(other, data)
         x = dd.step(model, x, [0.5])
     left = model.position_names.index("left_q")
-    assert x[left] == pytest.approx(0.5, abs=5e-3)  # but for the springs
+    assert x[left] == pytest.approx(0.5, abs=5e-3)  # the springs cause the difference
     assert x[left] == pytest.approx(float(data.joint("left").qpos[0]), abs=5e-3)
     assert x[left] == pytest.approx(float(data.joint("right").qpos[0]), abs=5e-3)
 
@@ -456,7 +456,7 @@ def test_a_servo_of_a_tendon_drives_the_joint_that_the_others_follow(tmp_path):
     [((0.5, 0.5), True), ((0.5, -0.5), True), ((1.0, 1.0), False)],
 )
 def test_a_tendon_of_joints_that_do_not_follow_is_left_out(tmp_path, coefficients, coupled):
-    """Also one whose length does not change with them."""
+    """A tendon whose length does not change with its joints is left out too."""
     first, second = coefficients
     text = GRIPPER.replace('joint="right" coef="0.5"', f'joint="right" coef="{first}"')
     text = text.replace('joint="left" coef="0.5"', f'joint="left" coef="{second}"')
@@ -467,7 +467,7 @@ def test_a_tendon_of_joints_that_do_not_follow_is_left_out(tmp_path, coefficient
 
 
 def test_bodies_that_move_together_need_no_constraint(tmp_path):
-    """A weld of a body to what is rigid with it already: Drake's step would fail."""
+    """Drake's step would fail with a weld between two bodies that are already fixed to each other."""
     rim = '<body name="rim"><geom size="0.2"/></body>'
     more = f'<body name="plate" pos="0 1 1"><joint name="p"/><geom size="0.1"/>{rim}</body>'
     equality = f'<connect body1="bar" body2="second" anchor="{WIDTH} 0 0"/><weld body1="plate" body2="rim"/>'
@@ -478,7 +478,7 @@ def test_bodies_that_move_together_need_no_constraint(tmp_path):
 
 @pytest.mark.parametrize("kind", ["ball", "revolute", "fixed"])
 def test_how_far_a_loop_is_open_does_not_depend_on_the_unit_of_length(tmp_path, kind):
-    """The points that give the axes of a joint are 0.1 m away, also where the mechanism has half a millimetre."""
+    """The points that define a joint's axis are 0.1 m away, also if the mechanism is half a millimetre in size."""
     path, ratios = sdf(tmp_path, kind), []
     text = path.read_text()
     for scale in (1.0, 1e-3, 1e3):
@@ -491,7 +491,7 @@ def test_how_far_a_loop_is_open_does_not_depend_on_the_unit_of_length(tmp_path, 
 
 @pytest.mark.parametrize(("step", "success"), [(0.05, False), (0.0125, True)])
 def test_a_plan_whose_loop_comes_apart_is_not_verified(tmp_path, step, success):
-    """A step of h at the rate w leaves (w h)^2 / 2 of a crank open; a hundredth of the mechanism is allowed."""
+    """A step h at the rate w opens a gap of (w h)^2 / 2 crank lengths. A hundredth of the mechanism is allowed."""
     model = load(sdf(tmp_path), time_step=step, gravity=[0, 0, 0])
     problem = dd.Problem(
         model,

@@ -1,4 +1,4 @@
-"""Collision meshes of robot files as convex hulls or spheres: closed forms, what is told, and what is refused."""
+"""Tests of collision meshes of robot files as convex hulls or spheres: closed forms, warnings and errors."""
 
 import warnings
 
@@ -14,18 +14,18 @@ from drake_diff.model import triangles
 from drake_diff.model.triangles import MOST_CORNERS, MOST_SPHERES, fit_spheres, hull_of, read_mesh
 
 EDGES = np.array([0.2, 0.3, 0.5])
-ROUNDING = 1e-6  # the numbers of an STL have 32 bits, and pycollada keeps those of a DAE so
+ROUNDING = 1e-6  # the numbers of an STL have 32 bits, and pycollada stores those of a DAE with 32 bits
 
 
 def shapes():
-    """A library that takes long to import."""
+    """Return `trimesh.creation`, imported only on use because its import takes long."""
     from trimesh import creation
 
     return creation
 
 
 def box_as_dae(edges, metre, up):
-    """A box about the origin as COLLADA whose lengths are in units of `metre` [m]."""
+    """Return COLLADA text of a box about the origin, with lengths in units of `metre` [m]."""
     box = shapes().box(edges / metre)
     points, faces = box.vertices, box.faces
     return f"""<?xml version="1.0"?>
@@ -64,7 +64,7 @@ def load(path, meshes="convex", **options):
 
 
 def shapes_of(model):
-    """The collision shapes that are no ground, with their poses on the body."""
+    """Return the collision shapes except the ground, with their poses on the body."""
     inspector = model.double.inspector
     found = inspector.GetAllGeometryIds(Role.kProximity)
     return [(inspector.GetShape(g), inspector.GetPoseInFrame(g)) for g in found if "ground" not in inspector.GetName(g)]
@@ -100,7 +100,7 @@ def test_a_dae_has_its_unit_and_as_in_rviz_no_axis_that_is_up(tmp_path, metre, u
     assert CalcVolume(shape) == pytest.approx(np.prod(EDGES), rel=ROUNDING)
     mesh = read_mesh(tmp_path / "box.dae")
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), EDGES, rtol=ROUNDING)
-    np.testing.assert_allclose(mesh.colours, np.tile([1, 0.5, 0], (12, 1)), atol=1 / 255)  # trimesh keeps bytes
+    np.testing.assert_allclose(mesh.colours, np.tile([1, 0.5, 0], (12, 1)), atol=1 / 255)  # trimesh stores bytes
 
 
 @each_row(
@@ -127,7 +127,7 @@ def test_a_mesh_is_found_by_any_of_its_names(tmp_path, uri):
 def test_a_ball_becomes_one_sphere_of_its_size(tmp_path):
     ball = shapes().icosphere(subdivisions=3, radius=0.05)
     ball.export(tmp_path / "ball.stl")
-    inside = np.min(np.sum(ball.triangles_center * ball.face_normals, axis=1))  # the distance of the closest face
+    inside = np.min(np.sum(ball.triangles_center * ball.face_normals, axis=1))  # distance of the closest face
     model = load(saved(tmp_path, "r.urdf", urdf('<mesh filename="ball.stl"/>', origin="0 0 0.3")), "spheres")
     [(shape, pose)] = shapes_of(model)
     assert isinstance(shape, Sphere)
@@ -138,13 +138,13 @@ def test_a_ball_becomes_one_sphere_of_its_size(tmp_path):
 def test_a_box_becomes_eight_spheres_that_touch_its_faces():
     hull = hull_of(np.array(shapes().box(EDGES).vertices), "box")
     spheres = fit_spheres(hull, "box")
-    r = 0.1 * 0.5  # half of the largest sphere inside
+    r = 0.1 * 0.5  # half the radius of the largest sphere inside
     assert spheres.radius == pytest.approx(r, rel=1e-5)
     corners = {tuple(np.sign(centre)) for centre in spheres.centres}
     assert len(corners) == len(spheres.centres) == 8
     np.testing.assert_allclose(np.abs(spheres.centres), np.tile(EDGES / 2 - r, (8, 1)), rtol=1e-5)
-    # A plane square to a box's diagonal meets the corner; the sphere there is (sqrt(3) - 1) r behind. A thousandth:
-    # the gap is measured in 2000 directions, which are 3 degrees apart.
+    # In the direction of a box's corner, a plane meets the corner (sqrt(3) - 1) r before its sphere. The tolerance is
+    # a thousandth because the gap is measured in 2000 directions, which are 3 degrees apart.
     assert spheres.ground_gap == pytest.approx((np.sqrt(3) - 1) * r, rel=2e-3)
 
 
@@ -159,7 +159,7 @@ def test_spheres_are_inside_and_their_gaps_are_true():
         ways = random.standard_normal((500, 3))
         ways /= np.linalg.norm(ways, axis=1)[:, None]
         gaps = np.max(points @ ways.T, axis=0) - np.max(spheres.centres @ ways.T, axis=0) - spheres.radius
-        # Between two of the directions that are measured, 3 degrees apart, a gap changes by 3 % of the size.
+        # The measured directions are 3 degrees apart, and between two of them a gap changes by 3 % of the size.
         assert np.max(gaps) <= spheres.ground_gap + 0.03 * np.max(np.ptp(points, axis=0))
         apart = np.linalg.norm(hull.corners[:, None] - spheres.centres, axis=2).min(axis=1) - spheres.radius
         assert np.max(apart) <= spheres.open_gap + 1e-9
@@ -172,7 +172,7 @@ def test_a_foot_rests_at_its_height(tmp_path, treatment):
     path = saved(tmp_path, "r.urdf", urdf('<mesh filename="box.stl"/>'))
     model = load(path, treatment, ground=0.5)
     rollout = dd.rollout(model, [EDGES[2] / 2 + 0.01, 0.0], np.zeros((300, 0)))
-    # Drake makes a ground without a stiffness of its own so hard that things sink in by less than a millimetre.
+    # Drake gives a ground without a stiffness a default so high that bodies sink in by less than a millimetre.
     assert EDGES[2] / 2 - 1e-3 < rollout.xs[-1, 0] < EDGES[2] / 2
     assert abs(rollout.xs[-1, 1]) < 1e-6
 
@@ -195,7 +195,7 @@ def test_what_the_file_says_of_mass_stays():
     inertias = [[body.default_spatial_inertia().CopyToFullMatrix6() for body in bodies_of(m)] for m in models]
     np.testing.assert_array_equal(inertias[0], inertias[1])
     np.testing.assert_array_equal(inertias[0], inertias[2])
-    assert len(shapes_of(models[1])) - len(shapes_of(models[0])) == 9  # the links and the hand have a mesh each
+    assert len(shapes_of(models[1])) - len(shapes_of(models[0])) == 9  # the links and the hand have one mesh each
 
 
 def load_quietly(path, meshes):
@@ -217,8 +217,8 @@ def test_a_mesh_of_a_million_faces_keeps_a_thousand_corners(tmp_path):
     ball.export(tmp_path / "ball.stl")
     hull = triangles.hull_of_file(tmp_path / "ball.stl", (1.0, 1.0, 1.0))
     assert len(hull.corners) <= MOST_CORNERS
-    # A thousand points on a ball are about 0.12 rad apart: the cap over a triangle of that side has the height
-    # R (1 - cos(0.12 / sqrt(3))) = 0.0024 R, and twice as much where they are spread unevenly.
+    # A thousand points on a ball are about 0.12 rad apart. The cap over a triangle of that side has the height
+    # R (1 - cos(0.12 / sqrt(3))) = 0.0024 R, and twice this height where the points are spread unevenly.
     assert 0 < hull.lost < 0.005 * 0.05
     middle = np.linalg.norm(hull.corners, axis=1)
     np.testing.assert_allclose(middle, 0.05, rtol=ROUNDING)

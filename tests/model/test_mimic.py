@@ -1,4 +1,4 @@
-"""Joints that follow others, reduced and fixed: against closed forms, and Pinocchio's own reading of the same files."""
+"""Tests of mimic joints, reduced and fixed, against closed forms and Pinocchio's reading of the same files."""
 
 import re
 import warnings
@@ -19,7 +19,7 @@ from drake_diff.model.plant import joints as joints_of
 pytestmark = pytest.mark.solve
 
 H = 0.01
-ROUNDING = 1e-11  # of v' of size 1 to 10: sums of a few products, and a linear system of one to eight unknowns
+ROUNDING = 1e-11  # for v' of size 1 to 10, from sums of a few products and a linear system of one to eight unknowns
 LINK = (
     '<link name="{0}"><inertial><origin xyz="{2}"/><mass value="{1}"/>'
     '<inertia ixx="{3}" iyy="{3}" izz="{3}" ixy="0" ixz="0" iyz="0"/></inertial>{4}</link>'
@@ -59,7 +59,7 @@ def load(path, mimic="reduce", time_step=H, **options):
 
 
 def sliders(tmp_path, ratio=1.7, offset=0.3, *, damping=(0.0, 0.0), motors=("a",), limits=((-5, 5), (-5, 5))):
-    """Masses of 2 and 3 kg on rails along x."""
+    """Write masses of 2 and 3 kg on rails along x, where b mimics a."""
     return urdf(
         tmp_path,
         link("a_link", 2.0, 1.0),
@@ -84,7 +84,7 @@ def test_two_sliders_have_the_mass_of_both(tmp_path, ratio, offset):
     d = dd.differentiate_step(model, [0.1, 0.5], [6.0], parameters=("b_link.mass",))
     np.testing.assert_allclose(d.B.ravel(), [H * H / mass, H / mass], rtol=ROUNDING)
     by_mass = -H * 6.0 * ratio**2 / mass**2
-    np.testing.assert_allclose(d.C.ravel(), [H * by_mass, by_mass], rtol=1e-9)  # differences need no more
+    np.testing.assert_allclose(d.C.ravel(), [H * by_mass, by_mass], rtol=1e-9)  # finite differences are less accurate
 
 
 def test_damping_and_a_motor_of_the_follower_act_through_its_ratio(tmp_path):
@@ -93,12 +93,12 @@ def test_damping_and_a_motor_of_the_follower_act_through_its_ratio(tmp_path):
     v = (mass * 0.5 + H * (6.0 - 1.7 * 2.0)) / (mass + H * damping)  # damping is implicit in Drake's step
     np.testing.assert_allclose(dd.step(model, [0.1, 0.5], [6.0, -2.0]), [0.1 + H * v, v], rtol=ROUNDING)
     motion = dd.rollout(model, [0.1, 0.5], np.tile([6.0, -2.0], (100, 1)))
-    assert np.abs(motion.energy_error).max() < 1e-10  # [J] of 4: the balance is exact where the mass is constant
+    assert np.abs(motion.energy_error).max() < 1e-10  # [J] of 4 J; the balance is exact if the mass is constant
     assert motion.dissipation[-1] > 0.1
 
 
 def pantograph(tmp_path, ratio=-2.0, offset=0.4):
-    """A pendulum of length 1 with another at its end, whose joint turns `ratio` times as far: one nonlinear motion."""
+    """Write a double pendulum whose elbow turns `ratio` times as far as its shoulder. Its motion is nonlinear."""
     return urdf(
         tmp_path,
         link("upper", 1.2, 0.0, "0 0 -1"),
@@ -110,9 +110,9 @@ def pantograph(tmp_path, ratio=-2.0, offset=0.4):
 
 
 def acceleration_of_the_pantograph(q, v, u, ratio=-2.0, offset=0.4):
-    """By Lagrange's equation of one coordinate: M a + M' v^2 / 2 + V' = u, of point masses at the links' ends."""
+    """Return the acceleration of Lagrange's equation M a + M' v^2 / 2 + V' = u, for point masses at the links' ends."""
     m, n, long, short, g = 1.2, 0.8, 1.0, 0.7, 9.81
-    both, bend = 1 + ratio, ratio * q + offset  # the lower link turns (1 + ratio) q + offset
+    both, bend = 1 + ratio, ratio * q + offset  # the lower link turns by (1 + ratio) q + offset
     M = m * long**2 + n * (long**2 + both**2 * short**2 + 2 * both * long * short * np.cos(bend))
     by_q = -2 * n * both * long * short * ratio * np.sin(bend)
     weight = (m + n) * g * long * np.sin(q) + n * g * short * both * np.sin(both * q + offset)
@@ -128,7 +128,7 @@ def test_a_nonlinear_motion_is_that_of_lagranges_equation(tmp_path):
         d = dd.differentiate_step(model, [q, v], [u])
         step = 1e-6
         by_q = (acceleration_of_the_pantograph(q + step, v, u) - acceleration_of_the_pantograph(q - step, v, u)) / 2e-6
-        np.testing.assert_allclose(d.A[1, 0], H * by_q, atol=1e-9)  # rounding over the step of the difference
+        np.testing.assert_allclose(d.A[1, 0], H * by_q, atol=1e-9)  # rounding divided by the increment
 
 
 def test_a_chain_of_followers_has_one_coordinate(tmp_path):
@@ -150,7 +150,7 @@ def test_a_chain_of_followers_has_one_coordinate(tmp_path):
 
 
 def test_limits_are_those_of_all_joints(tmp_path):
-    """b = 2 a + 1 within [0, 2] keeps a within [-0.5, 0.5], and its speed below half."""
+    """b = 2 a + 1 within [0, 2] limits a to [-0.5, 0.5], and the speed of a to half the speed limit of b."""
     path = urdf(
         tmp_path,
         link("a_link", 1.0, 1.0),
@@ -182,7 +182,7 @@ OF_DRAKE = '<drake:mimic joint="a" multiplier="1.7" offset="0.3"/>'
     "inside, beside, world", [(OF_SDF, "", False), ("", OF_DRAKE, False), (OF_SDF, "", True), ("", OF_DRAKE, True)]
 )
 def test_both_elements_of_sdf_are_read(tmp_path, inside, beside, world):
-    """Drake reads its own alone, and says nothing of the other: q = 1.7 (a - 0.2) + 0.64. A model may be in a world."""
+    """Drake reads only drake:mimic and ignores mimic, q = 1.7 (a - 0.2) + 0.64. The model may be inside a world."""
     path, text = tmp_path / "m.sdf", SDF.format(inside=inside, beside=beside)
     if world:
         text = text.replace("<model", '<world name="w"><model', 1).replace("</model>", "</model></world>")
@@ -229,7 +229,7 @@ def test_what_cannot_be_reduced_is_refused(tmp_path, parts, words):
 
 @each_row("name", ["pinocchio", "casadi"])
 def test_an_engine_of_its_own_takes_the_same_step(tmp_path, name):
-    """Two followers and a free base: rounding is all that differs, in steps and in Jacobians."""
+    """With two followers and a free base, steps and Jacobians differ only by rounding."""
     pytest.importorskip({"casadi": "adam"}.get(name, name))
     path = urdf(
         tmp_path,
@@ -267,7 +267,7 @@ def test_other_engines_and_exports_say_why_not(tmp_path):
 
 
 def mimics_in(path):
-    """(follower, leader, ratio, offset) as another reader of the file finds them."""
+    """Return (follower, leader, ratio, offset) of each mimic joint, read without drake_diff."""
     found = []
     for joint in ElementTree.parse(path).getroot().findall("joint"):
         mimic = joint.find("mimic")
@@ -282,9 +282,9 @@ def mimics_in(path):
     ("tiago_pro.urdf", "base_footprint", 10), ("talos_full_v2.urdf", "base_link", 12),
 ])  # fmt: skip
 def test_the_step_of_a_robot_is_that_of_pinocchios_mass_matrix_projected(tmp_path, name, base, count):
-    """v' = v + h (E' (M + h D) E)^-1 E' (B u - bias - D v) with M and bias of Pinocchio's own reading of the file."""
+    """v' = v + h (E' (M + h D) E)^-1 E' (B u - bias - D v), where Pinocchio computes M and bias from the file."""
     pin = pytest.importorskip("pinocchio")
-    path, h = tmp_path / name, 1e-3  # a copy in which nothing touches and no joint is held by limits that are one point
+    path, h = tmp_path / name, 1e-3  # a copy without geometry and without limits that allow one position only
     text = re.sub(r"(?s)<(collision|visual)\b.*?</\1>", "", robot_file(name).read_text())
     path.write_text(re.sub(r"""(lower|upper)=(["'])-?[0.]+\2""", "", text) if count != 1 else text)
     model = load(path, time_step=h, weld_base=base)
@@ -306,7 +306,7 @@ def test_the_step_of_a_robot_is_that_of_pinocchios_mass_matrix_projected(tmp_pat
     for _ in range(3):
         middle, reach = (np.clip(lower, -4, 4) + np.clip(upper, -4, 4)) / 2, (np.clip(upper - lower, 0, 2)) / 4
         q, v = middle + reach * random.uniform(-1, 1, model.nq), 0.1 * random.standard_normal(model.nv)
-        v *= upper - lower > 1e-3  # joints whose limits leave them no room are at rest
+        v *= upper - lower > 1e-3  # joints with equal limits are at rest
         u = random.uniform(-1, 1, model.nu)
         at = pin.integrate(robot, pin.neutral(robot), E @ q + offset)
         M, D = pin.crba(robot, data, at), np.diag(robot.damping)
@@ -322,7 +322,7 @@ def test_the_step_of_a_robot_is_that_of_pinocchios_mass_matrix_projected(tmp_pat
     (("a", "b"), "fix", (1, 0)), (("a",), "reduce", None),
 ])  # fmt: skip
 def test_joints_that_are_fixed_by_name_are_left_out(tmp_path, names, mimic, sizes):
-    """`sizes` are nv and the number of constraints that Drake has; None where the file or what is left is refused."""
+    """`sizes` are nv and the number of Drake's constraints, or None if the model is refused."""
     path = urdf(
         tmp_path, link("a_link", 1.0, 1.0), link("b_link", 1.0, 1.0), link("c_link", 1.0, 1.0),
         joint("a", "prismatic", "world", "a_link", "1 0 0"),
@@ -343,7 +343,7 @@ def panda(mimic, time_step=0.02, **options):
 
 @pytest.mark.parametrize("name", ["panda.urdf", pytest.param("talos_full_v2.urdf", marks=pytest.mark.slow)])
 def test_steps_of_reduced_robots_have_the_derivative_of_their_own_equation(name):
-    """In flight, and on the ground in spheres: AutoDiffXd."""
+    """Compare with AutoDiffXd: Talos in flight and on the ground with spheres, and the Panda without contact."""
     ground = (
         {"ground": 0.8, "contact": "ground", "meshes": "spheres"} if name.startswith("talos") else {"contact": False}
     )
@@ -361,7 +361,7 @@ def test_steps_of_reduced_robots_have_the_derivative_of_their_own_equation(name)
 
 
 def test_a_wrong_way_back_from_the_whole_plant_is_refused(monkeypatch):
-    """By a hundred thousandth."""
+    """A relative error of 1e-5 in the Jacobians is found."""
     model = dd.load_model(robot_file("panda.urdf"), time_step=0.02, actuators="all", mimic="reduce", contact=False)
     right = ReducedStep.jacobians
 

@@ -1,4 +1,4 @@
-"""MJCF as MuJoCo means it: MuJoCo's own inverse dynamics is the referee of what is read of random files."""
+"""Tests of MJCF files against MuJoCo: the inverse dynamics of random files, masses, servos, meshes and contacts."""
 
 import math
 import warnings
@@ -17,7 +17,7 @@ from drake_diff.model.plant import actuators, bodies, joints
 
 INERTIAL = '<inertial pos="0 0 0.2" mass="2" diaginertia="0.1 0.1 0.1"/>'
 GEOM = '<geom size="0.1" mass="1"/>'
-AGREE = 1e-9  # relative: both sum up a chain of a few bodies in double precision
+AGREE = 1e-9  # relative tolerance: both sum over a chain of a few bodies in double precision
 
 
 def load(path, **options):
@@ -33,7 +33,7 @@ def write(folder, body, *, defaults="", more="", head='<mujoco model="m">'):
 
 
 def random_attributes(random):
-    """Of a joint, each there or not."""
+    """Return attributes of a joint with random values, each present with a probability of 1/2."""
     found = {
         "damping": random.uniform(0.1, 3),
         "stiffness": random.uniform(1, 30),
@@ -44,7 +44,7 @@ def random_attributes(random):
 
 
 def random_file(random):
-    """A chain of three to five bodies with nested default classes, some of which say nothing of joints or actuators."""
+    """Return a chain of 3 to 5 bodies with nested default classes, some of which have no joint or actuator defaults."""
     angle, count = random.choice(["degree", "radian"]), int(random.integers(3, 6))
     inner = "".join(
         f'<default class="c{i}">'
@@ -81,7 +81,7 @@ def random_file(random):
 
 
 def gap_to_mujoco(text, model, random):
-    """The largest relative gap of efforts at a random state, and of limits and gains of actuators."""
+    """Return the largest relative difference from MuJoCo in efforts at a random state and in limits and gains."""
     mujoco = pytest.importorskip("mujoco")
     other = mujoco.MjModel.from_xml_string(text)
     data, plant = mujoco.MjData(other), model.plant
@@ -100,7 +100,7 @@ def gap_to_mujoco(text, model, random):
     for actuator in actuators(plant):
         i = mujoco.mj_name2id(other, mujoco.mjtObj.mjOBJ_ACTUATOR, actuator.name())
         if i < 0:
-            continue  # added
+            continue  # an actuator that drake_diff added
         gear, gain = abs(other.actuator_gear[i, 0]), other.actuator_gainprm[i, 0]
         is_servo = other.actuator_biastype[i] != 0
         limits = [np.inf]
@@ -141,7 +141,7 @@ ARM = (
     ],
 )
 def test_a_joint_that_nothing_drives_has_its_armature(tmp_path, actuator):
-    """Drake has it on actuators alone; the ones that are added are no inputs."""
+    """Drake stores the armature in actuators only. The actuators that are added for it are not inputs."""
     path = write(tmp_path, ARM, more=f"<actuator>{actuator}</actuator>")
     model, other = load(path), load(path, actuators="all", inputs="effort")
     assert model.input_names == (("u",) if actuator else ())
@@ -199,7 +199,7 @@ def test_the_compiler_s_masses_are_mujoco_s(tmp_path, compiler, masses):
 
 
 def test_a_body_may_have_no_mass(tmp_path):
-    """Drake refuses an <inertial> of mass 0, as an end effector's frame has."""
+    """Drake rejects an <inertial> of mass 0, which frames of end effectors have."""
     body = HINGE.format("", '<body name="b" pos="0 0 1"><inertial pos="0 0 0" mass="0" diaginertia="0 0 0"/>{}</body>')
     path = write(tmp_path, body.format('<geom size="0.2"/>'))
     model = load(path)
@@ -210,7 +210,7 @@ def test_a_body_may_have_no_mass(tmp_path):
 @each_row(
     "inside, compiler",
     [
-        # Where a body has an <inertial>, its shapes have none, in frames too.
+        # If a body has an <inertial>, its shapes add no mass, in frames too.
         (f'{INERTIAL}<frame pos="0.3 0 0"><geom size="0.1"/></frame>', ""),
         (f'{INERTIAL}<geom size="0.1"/>', 'inertiafromgeom="true"'),
         (INERTIAL, 'inertiafromgeom="true"'),
@@ -219,7 +219,7 @@ def test_a_body_may_have_no_mass(tmp_path):
     ],
 )
 def test_what_moves_is_mujoco_s(tmp_path, inside, compiler):
-    """M^-1 of all is; the joint of the last body has no name."""
+    """Compare the mass matrix with the inverse of MuJoCo's M^-1. The joint of the last body has no name."""
     mujoco = pytest.importorskip("mujoco")
     body = f'<body name="b" pos="1 0 0">{inside}</body></body>'
     body = f'<body name="a"><joint name="j" axis="0 1 0" pos="0.1 0 0.3"/>{GEOM}{body}'
@@ -233,7 +233,7 @@ def test_what_moves_is_mujoco_s(tmp_path, inside, compiler):
 
 
 def test_gains_of_the_default_of_another_kind_are_told(tmp_path):
-    """MuJoCo has one default of all actuators."""
+    """MuJoCo has one default for all actuator kinds."""
     servo = '<actuator><general joint="j"/></actuator>'
     model = load(write(tmp_path, HINGE.format("", ""), defaults='<default><position kp="50"/></default>', more=servo))
     assert "has the gains of the default of position in MuJoCo" in str(model.notes)
@@ -260,7 +260,7 @@ def test_gravity_that_is_compensated_on_every_body_is_none(tmp_path, each, gravi
 
 
 def test_gravity_that_the_file_disables_is_none_but_beside_other_robots(tmp_path):
-    """Which have theirs: `audit` says so."""
+    """Other robots have their own gravity, and `audit` reports that the file disables gravity."""
     off = '<option><flag gravity="disable"/></option>'
     path = write(tmp_path, HINGE.format("", ""), defaults=off)
     assert load(path).contract.gravity == (0.0, 0.0, 0.0)
@@ -273,7 +273,7 @@ def test_gravity_that_the_file_disables_is_none_but_beside_other_robots(tmp_path
 
 
 def test_a_velocity_servo_is_a_motor_with_damping(tmp_path):
-    """gear kv (ctrl - gear v), which MuJoCo exerts; one with a limit of force is left out."""
+    """MuJoCo exerts gear kv (ctrl - gear v). A velocity servo with a force limit is left out."""
     mujoco = pytest.importorskip("mujoco")
     servo = '<velocity name="{}" joint="j" kv="{}" gear="-3" ctrlrange="-2 2"{}/>'
     more = f"<actuator>{servo.format('u', 5, '')}</actuator>"
@@ -294,14 +294,14 @@ def test_a_velocity_servo_is_a_motor_with_damping(tmp_path):
 
 @each_row("bias, left_out", [("0 -10 2", True), ("0 -10 -2", False), ("1 -10 -2", False), ("1 0 -2", True)])
 def test_a_general_actuator_that_is_no_servo_is_left_out(tmp_path, bias, left_out):
-    """A third term above 0 is a damping ratio only where the gain is the stiffness."""
+    """A third term above 0 is a damping ratio only if the gain is the stiffness."""
     servo = f'<actuator><general joint="j" gainprm="5" biastype="affine" biasprm="{bias}"/></actuator>'
     model = load(write(tmp_path, HINGE.format("", ""), more=servo))
     assert (model.nu == 0) == left_out
 
 
 def effort_range(path):
-    """What MuJoCo makes of the largest controls of the only joint's motor."""
+    """Return the minimum and maximum effort in MuJoCo of the motor of the only joint."""
     mujoco = pytest.importorskip("mujoco")
     other = mujoco.MjModel.from_xml_path(str(path))
     data, found = mujoco.MjData(other), []
@@ -345,7 +345,7 @@ def test_an_effort_is_limited_at_the_joint(tmp_path, attributes, actuator, limit
 
 
 def test_a_motor_that_only_pushes_is_planned_so(tmp_path):
-    """MuJoCo, which cuts controls at their range, goes where the plan goes: its step is Drake's, damping implicit."""
+    """MuJoCo clips controls at their range and follows the plan. Its step is Drake's, with implicit damping."""
     mujoco = pytest.importorskip("mujoco")
     body = '<body><joint name="j" axis="0 1 0" damping="0.1"/><geom size="0.02" pos="0 0 -0.5" mass="1"/></body>'
     actuator = '<actuator><motor joint="j" gear="4" ctrlrange="0 1"/></actuator>'
@@ -365,7 +365,7 @@ def test_a_motor_that_only_pushes_is_planned_so(tmp_path):
 
 @each_row("ending", ["stl", "obj"])
 def test_the_mass_of_a_mesh_that_is_not_convex_is_told_with_mujoco_s(tmp_path, ending):
-    """Two walls apart, one of them the larger: MuJoCo's default rule counts some of what is empty between them."""
+    """For two separate walls of different sizes, MuJoCo's default rule counts some of the empty space between them."""
     mujoco = pytest.importorskip("mujoco")
     walls = [((0.3, 0.05, 0.1), (0, 0, 0)), ((0.1, 0.05, 0.2), (0.05, 0.15, 0.1))]
     moved = trimesh.transformations.translation_matrix
@@ -382,11 +382,11 @@ def test_the_mass_of_a_mesh_that_is_not_convex_is_told_with_mujoco_s(tmp_path, e
         assert abs(theirs / ours - 1) > 0.1 if rows else theirs == pytest.approx(ours, rel=1e-6)
         assert not rows or f"a ({ours:.4g} kg, MuJoCo {theirs:.4g})" in notes[0]
         given = load(write(tmp_path, body.replace("density", "mass"), more=asset.format(attribute)))
-        assert ("a (mass as given" in str(given.notes)) == bool(rows)  # whose inertia is another
+        assert ("a (mass as given" in str(given.notes)) == bool(rows)  # the inertia differs
 
 
 def random_tree(random):
-    """Spheres in one place, on bodies with none to two joints, some of which have no name; masks, pairs, excludes."""
+    """Return MJCF of overlapping spheres on bodies with 0 to 2 joints, some unnamed, with masks, pairs and excludes."""
     names, opened = [], 0
 
     def mask():
@@ -413,7 +413,7 @@ def random_tree(random):
 
 
 def test_what_may_touch_is_what_touches_in_mujoco(tmp_path):
-    """All shapes overlap, so that MuJoCo has a contact of each pair that its filter lets touch."""
+    """All shapes overlap, so MuJoCo has a contact for each pair that its filter permits."""
     mujoco = pytest.importorskip("mujoco")
     counts = []
     for seed in range(40):
@@ -431,7 +431,7 @@ def test_what_may_touch_is_what_touches_in_mujoco(tmp_path):
 
 
 def test_a_leg_whose_hip_has_two_hinges_swings(tmp_path):
-    """The thigh overlaps the pelvis, which slides freely; MuJoCo has the same equation and a step of first order."""
+    """The thigh overlaps the pelvis, which slides freely. MuJoCo has the same equation and a first-order step."""
     mujoco = pytest.importorskip("mujoco")
     hip = '<joint name="abd" axis="1 0 0" damping="0.5"/><joint name="flex" axis="0 1 0" damping="0.5"/>'
     thigh = f'<body name="thigh">{hip}<geom type="capsule" fromto="0 0 -0.05 0 0 -0.35" size="0.04" mass="2"/></body>'
@@ -448,7 +448,7 @@ def test_a_leg_whose_hip_has_two_hinges_swings(tmp_path):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_several_joints_in_a_body_turn_where_the_body_is(tmp_path, seed):
-    """Drake puts the pose of such a body behind its first joint: mass matrix and bias are MuJoCo's, to rounding."""
+    """Drake applies such a body's pose after its first joint. Mass matrix and bias must equal MuJoCo's to rounding."""
     mujoco, random = pytest.importorskip("mujoco"), np.random.default_rng([13, seed])
 
     def numbers(size):
@@ -475,14 +475,14 @@ def test_several_joints_in_a_body_turn_where_the_body_is(tmp_path, seed):
 
 
 def test_two_motors_on_a_joint_are_refused(tmp_path):
-    """Drake's step drops the torque of the first, with a derivative of 0 that agrees with differences."""
+    """Drake's step ignores the first motor's torque, with a derivative of 0 that agrees with finite differences."""
     motors = '<actuator><motor name="big" joint="j" gear="2"/><motor name="small" joint="j" gear="3"/></actuator>'
     with pytest.raises(ModelError, match="one actuator on the joint j, got big, small"):
         load(write(tmp_path, HINGE.format("", ""), more=motors))
 
 
 def test_a_spring_pulls_to_its_rest_in_the_step(tmp_path):
-    """A slide of 2 kg on a spring, whose force Drake takes at the start of the step: m v' = m v - h k (q - rest)."""
+    """Drake evaluates the spring force of a slide of 2 kg at the start of the step: m v' = m v - h k (q - rest)."""
     spring = 'type="slide" axis="1 0 0" stiffness="8" springref="0.5"'
     model = load(write(tmp_path, f'<body><joint name="j" {spring}/><geom size="0.1" mass="2"/></body>'))
     h, q, v = model.time_step, 0.2, 0.3
@@ -497,7 +497,7 @@ def test_a_spring_pulls_to_its_rest_in_the_step(tmp_path):
 
 @each_row("spring", ['stiffness="nan"', 'stiffness="-1"', 'stiffness="inf"', 'stiffness="8" springref="nan"'])
 def test_a_spring_of_no_number_is_refused(tmp_path, spring):
-    """Drake ends the process on these."""
+    """Drake aborts the process for these springs."""
     body = f'<body><joint name="j" type="slide" axis="1 0 0" {spring}/><geom size="0.1" mass="2"/></body>'
     with pytest.raises(ModelError, match="j: expected a spring of finite stiffness"):
         load(write(tmp_path, body))
@@ -508,7 +508,7 @@ PYRAMID = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
 
 @each_row("ending", ["stl", "obj", "STL"])
 def test_a_mesh_gives_its_mass_whatever_its_format(tmp_path, ending):
-    """A pyramid of volume 1/6, scaled by 0.1, 0.2 and 0.3, of 1000 kg/m^3, has 1 kg; drawn as it is in the file."""
+    """A pyramid of volume 1/6, scaled by 0.1, 0.2, 0.3, has 1 kg at 1000 kg/m^3. It is drawn from the original file."""
     mesh = trimesh.Trimesh(PYRAMID, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
     (tmp_path / "shapes").mkdir()
     file = tmp_path / "shapes" / f"part.{ending}"
@@ -554,7 +554,7 @@ FINGERS = (
     ],
 )
 def test_coupled_joints_can_be_reduced(tmp_path, polynomial, start, ratio, offset):
-    """MuJoCo holds y - y0 = a0 + a1 (x - x0), with y0 and x0 the positions in the file's pose."""
+    """MuJoCo enforces y - y0 = a0 + a1 (x - x0), where y0 and x0 are the positions in the file's pose."""
     equality = f'<equality><joint joint1="right" joint2="left" polycoef="{polynomial}" {start}/></equality>'
     path = write(tmp_path, FINGERS, more=equality)
     whole, reduced = load(path), load(path, mimic="reduce")
@@ -568,7 +568,7 @@ def test_coupled_joints_can_be_reduced(tmp_path, polynomial, start, ratio, offse
 
 
 def test_directives_add_robots_with_their_slips_mended(tmp_path):
-    """A file that is added is read as one that is loaded: here an MJCF with a gear and an STL."""
+    """A file that directives add is read like a loaded file. The example is an MJCF with a gear and an STL."""
     trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "part.stl")
     more = '<asset><mesh file="part.stl"/></asset><actuator><motor joint="j" gear="3" ctrlrange="-2 2"/></actuator>'
     write(tmp_path, HINGE.format("", '<geom type="mesh" mesh="part"/>'), more=more)
@@ -581,13 +581,13 @@ def test_directives_add_robots_with_their_slips_mended(tmp_path):
     model = load(path, packages={"here": tmp_path})
     assert [a.effort_limit() for a in actuators(model.plant)] == [6.0, 6.0]
     assert "2 collision meshes skipped" in str(model.notes)
-    assert "drake_diff_" not in str(model.notes)  # the folder that is gone
+    assert "drake_diff_" not in str(model.notes)  # the temporary folder, which no longer exists
     hulls = load(path, packages={"here": tmp_path}, meshes="convex")
     assert [g.shape for g in hulls.contract.geometries].count("Convex") == 2
 
 
 def test_a_mesh_in_mujocos_own_format_is_read(tmp_path):
-    """The pyramid of 1/6 of volume again: 4 vertices, no normals, no texture, 4 faces."""
+    """The file contains the pyramid of volume 1/6: 4 vertices, no normals, no texture, 4 faces."""
     faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], dtype="<i4")
     data = np.array([4, 0, 0, 4], dtype="<i4").tobytes() + np.array(PYRAMID, dtype="<f4").tobytes() + faces.tobytes()
     (tmp_path / "part.msh").write_bytes(data)
@@ -600,7 +600,7 @@ def test_a_mesh_in_mujocos_own_format_is_read(tmp_path):
 
 
 def test_a_missing_mesh_is_named_where_it_should_be(tmp_path, monkeypatch):
-    """And no file of that name in the folder that Python happens to run in is taken."""
+    """A file of that name in the current working directory is not used."""
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     (tmp_path / "here" / "part.obj").write_text(
@@ -613,7 +613,7 @@ def test_a_missing_mesh_is_named_where_it_should_be(tmp_path, monkeypatch):
 
 
 def test_a_record_knows_every_file_that_the_robot_is_made_of(tmp_path):
-    """Of directives and of what a file includes too: a mesh that is changed later is another robot."""
+    """The files of directives and includes are listed too, because a mesh that is changed later changes the robot."""
     trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "part.stl")
     (tmp_path / "assets.xml").write_text('<mujoco><asset><mesh file="part.stl"/></asset></mujoco>')
     write(tmp_path, HINGE.format("", '<geom type="mesh" mesh="part"/>'), more='<include file="assets.xml"/>')
@@ -634,7 +634,7 @@ def test_joints_of_one_name_in_two_robots_have_inputs_of_their_own_names(tmp_pat
 
 
 def test_frames_are_bodies_without_a_joint(tmp_path):
-    """The same inertia as MuJoCo has of what is in frames, one in the other, and with a class of their own."""
+    """Shapes and bodies in nested frames, with a class of their own, have the same inertia as in MuJoCo."""
     inner = (
         '<frame pos="0 0 1" euler="30 0 0" childclass="c"><geom name="x" size="0.1" pos="1 0 0"/>'
         '<frame pos="1 0 0"><body name="end"><joint name="k" axis="1 0 1"/><geom size="0.2"/></body></frame></frame>'

@@ -1,4 +1,4 @@
-"""Models from files and diagrams: what is accepted, what is refused, and what the contract says."""
+"""Tests of models from files and diagrams: accepted inputs, errors, and the contract."""
 
 import json
 import math
@@ -25,7 +25,7 @@ NAMES = sorted(p.name for p in MODELS.iterdir())
 def test_every_model_loads_without_a_warning_and_steps_and_differentiates(load, name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", r"(?s).*12 actuators added")  # to the quadruped, whose file has none
+        warnings.filterwarnings("ignore", r"(?s).*12 actuators added")  # to the quadruped, whose file has no actuators
         model = load(name)
     d = dd.differentiate_step(model, model.default_state, np.zeros(model.nu))
     assert d.A.shape == (model.nx, model.nx)
@@ -127,13 +127,13 @@ def mjcf(joint="", geom='size="0.1"', more=""):
 
 LIMITED = '<limit lower="1" upper="-1" effort="1" velocity="1"/></joint>'
 BAD_FILES = {
-    # These two ended the process, one by reading what is not there, one when memory ended.
+    # These two ended the process, one by an invalid read, one when memory was exhausted.
     "transmission_empty.urdf": (
         urdf("</joint>", '</joint>\n<transmission>\n\n<type/><joint name="j"/><actuator name="m"/></transmission>'),
         r"transmission_empty.urdf:4: <type> of a <transmission> is empty: write SimpleTransmission in it",
     ),
     "circle.xml": (mjcf(more='<include file="circle.xml"/>'), r"it includes itself: circle.xml -> circle.xml"),
-    # What Drake would download is not asked for.
+    # Drake would download these packages.
     "drake_models.urdf": (
         shape('<mesh filename="package://drake_models/a.obj"/>'),
         r"unknown package 'drake_models'.*packages=\{'drake_models': folder\}\); drake_diff downloads nothing",
@@ -142,13 +142,13 @@ BAD_FILES = {
         "directives:\n- add_model:\n    name: x\n    file: package://drake_models/a.urdf\n",
         r"packages=\{'drake_models': folder\}\); drake_diff downloads nothing",
     ),
-    # These two are refused by a condition in Drake's C++, which pydrake raises as SystemExit: it ended the process.
+    # A condition in Drake's C++ rejects these two. pydrake raises it as SystemExit, which ended the process.
     "limits_crossed.urdf": (urdf("</joint>", LIMITED).replace("continuous", "revolute"), "limit"),
     "range_crossed.xml": (mjcf('range="1 -1"'), "limits"),
-    # These two Drake raises as ValueError, which came out raw.
+    # Drake raises ValueError for these two, which was formerly not converted.
     "axis_of_letters.urdf": (urdf("0 0 1", "0 x 0"), "3 values for attribute xyz got 0 x 0"),
     "axis.xml": (mjcf('axis="x y z"'), "3 values for attribute axis"),
-    # What Drake raises as RuntimeError, or Python's XML parser as ParseError.
+    # Drake raises RuntimeError for these, or Python's XML parser raises ParseError.
     "broken.urdf": ("<robot><link", "XML"),
     "broken.sdf": ("<sdf><model", "XML"),
     "broken.xml": ("<mujoco><", "XML"),
@@ -265,7 +265,7 @@ def test_diagrams_that_cannot_be_stepped_are_refused(options, words):
 
 
 def test_a_plant_in_a_nested_diagram_is_found_and_driven():
-    """The inner diagram exports the actuation; free outside it is ours, connected it is refused."""
+    """The inner diagram exports the actuation. If free in the outer diagram, it is an input, otherwise an error."""
     for connected in (False, True):
         inner = DiagramBuilder()
         config = MultibodyPlantConfig(time_step=0.01, use_sampled_output_ports=False)
@@ -299,7 +299,7 @@ def test_the_same_model_at_another_time_step(load):
 
 
 def test_each_set_of_changes_is_a_model_of_its_own(load):
-    """The cache was once keyed by the first word of a change alone."""
+    """The cache formerly used only the first word of a change as its key."""
     model = load("sphere_on_ground.sdf")
     both = model.changed(time_step=0.002, contact_approximation="lagged")
     one = model.changed(time_step=0.002)

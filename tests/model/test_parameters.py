@@ -1,4 +1,4 @@
-"""Derivatives by physical parameters: closed forms, names, values by mapping, refusals."""
+"""Tests of derivatives with respect to physical parameters: closed forms, names, values by mapping, errors."""
 
 import math
 
@@ -39,14 +39,14 @@ from drake_diff.model.parameters import (
 pytestmark = pytest.mark.solve
 
 G = 9.81
-SMOOTH = 1e-9  # autodiff and the chain rule, through one step that nothing iterates on
-CONTACT = 1e-6  # SAP solves a step to 1e-6, and its Jacobian and differences are as accurate
+SMOOTH = 1e-9  # for autodiff and the chain rule, through one step without iterations
+CONTACT = 1e-6  # SAP solves a step to 1e-6, and its Jacobian and finite differences are equally accurate
 
-# What `arm` and `ball` are built with. The arm: a carriage on a sprung rail, a sprung, PD-driven pole on it.
+# The values of `arm` and `ball`. The arm is a carriage on a sprung rail with a sprung, PD-driven pole.
 ARM = {
     "pole.mass": 1.3,
     "pole.center_of_mass": (0.05, 0.02, -0.4),
-    "pole.inertia": None,  # that of the unit inertia below
+    "pole.inertia": None,  # from the unit inertia below
     "carriage.mass": 2.0,
     "hinge.damping": 0.2,
     "hinge.offset": (0.1, 0.0, -0.2),
@@ -65,7 +65,7 @@ UNIT_INERTIA = (0.3, 0.31, 0.1)
 
 
 def arm(**changes):
-    """Built with the values, not set to them: `changes` are by parameter name."""
+    """Build the arm with the values in `changes`, by parameter name, instead of setting them afterwards."""
     value = {**ARM, **changes}
     made = Plant(0.01)
     plant = made.plant
@@ -148,7 +148,7 @@ BALL_CHANGES = {
 
 
 def ball(approximation="lagged", contact_model="point", **changes):
-    """A free ball that slides over the ground."""
+    """Return a model of a free ball that slides over the ground."""
     value = {**BALL, **changes}
     made = Plant(0.005, approximation, contact_model)
     made.plant.mutable_gravity_field().set_gravity_vector(np.array(value["model.gravity"]))
@@ -190,7 +190,7 @@ def test_a_pushed_block_by_its_mass(write_urdf, mass, h, u, count):
 
 
 def compound(*, mass=1.4, com=(0.0, 0.0, -0.5), central=0.2, b=0.3, h=0.01, gear=1.0, rotor=0.0, spring=None):
-    """A pendulum about +y whose inertia about its hinge is `central` + m |com|^2 where com has no y."""
+    """Return a pendulum about +y whose inertia about its hinge is `central` + m |com|^2 if com has no y component."""
     made = Plant(h)
     inertia = SpatialInertia.MakeFromCentralInertia(mass, np.array(com), RotationalInertia(central, central, central))
     pole = made.plant.AddRigidBody("pole", inertia)
@@ -205,7 +205,7 @@ def compound(*, mass=1.4, com=(0.0, 0.0, -0.5), central=0.2, b=0.3, h=0.01, gear
 
 
 def column(model, x, u, name):
-    """C[velocity rows] by one parameter, the position rows being h times it where dq/dt = v."""
+    """Return the velocity rows of C for one parameter. The position rows are h times these if dq/dt = v."""
     d = dd.differentiate_step(model, x, u, parameters=(name,))
     n = model.nv
     assert d.C[:n] == pytest.approx(model.time_step * d.C[n:], rel=1e-8, abs=1e-14)  # q+ = q + h v+
@@ -217,7 +217,7 @@ PENDULA = [(0.01, 0.7, -1.2, 0.3), (0.003, -2.5, 4.0, -1.7), (0.05, 3.0, 0.5, 2.
 
 @pytest.mark.parametrize(("h", "q", "w", "u"), PENDULA)
 def test_a_pendulum_by_its_center_of_mass(h, q, w, u):
-    """(I + h b) w+ = I w + h (u + m g (cx cos q + cz sin q)), the unit inertia about the hinge staying."""
+    """(I + h b) w+ = I w + h (u + m g (cx cos q + cz sin q)), with a constant unit inertia about the hinge."""
     mass, central, b, com = 1.4, 0.2, 0.3, np.array([0.1, 0.0, -0.5])
     inertia = central + mass * com @ com
     c, d = column(compound(com=com, h=h), [q, w], [u], "pole.center_of_mass")
@@ -229,7 +229,7 @@ def test_a_pendulum_by_its_center_of_mass(h, q, w, u):
 
 @pytest.mark.parametrize(("h", "q", "w", "u"), PENDULA)
 def test_a_pendulum_by_mass_inertia_damping_rotor_and_gear(h, q, w, u):
-    """(J + h b) w+ = J w + h t, J = I + (gear^2) rotor, t = u - m g l sin q: by J (w - w+) / (J + h b)."""
+    """(J + h b) w+ = J w + h t, J = I + gear^2 rotor, t = u - m g l sin q, and dw+/dJ = (w - w+) / (J + h b)."""
     mass, l, central, b, gear, rotor = 1.4, 0.5, 0.2, 0.3, 6.0, 0.01  # noqa: E741
     model = compound(mass=mass, com=(0, 0, -l), central=central, b=b, h=h, gear=gear, rotor=rotor)
     own = central + mass * l**2
@@ -246,7 +246,7 @@ def test_a_pendulum_by_mass_inertia_damping_rotor_and_gear(h, q, w, u):
         c, d = column(model, [q, w], [u], name)
         assert d.x_next[1] == pytest.approx(w_next, rel=SMOOTH)
         assert c[0] == pytest.approx([value], rel=SMOOTH)
-        assert d.B[1, 0] == pytest.approx(h / (whole + h * b), rel=SMOOTH)  # u is the joint's: no gear in it
+        assert d.B[1, 0] == pytest.approx(h / (whole + h * b), rel=SMOOTH)  # u is the joint's effort, without the gear
         assert d.sources == ("autodiff",)
     c, _ = column(model, [q, w], [u], "pole.inertia")
     assert c[0] == pytest.approx([0, by_inertia, 0, 0, 0, 0], rel=SMOOTH, abs=1e-14)
@@ -254,7 +254,7 @@ def test_a_pendulum_by_mass_inertia_damping_rotor_and_gear(h, q, w, u):
 
 @pytest.mark.parametrize(("h", "q", "w", "u"), PENDULA)
 def test_beside_an_inertia_the_mass_no_longer_moves_it(h, q, w, u):
-    """J = I_com + m l^2: with I_com a parameter of its own, by m l^2 (w - w+) / (J + h b) less the weight's part."""
+    """J = I_com + m l^2. With I_com as a parameter, dw+/dm is l^2 (w - w+) / (J + h b) minus the weight's part."""
     mass, l, central, b = 1.4, 0.5, 0.2, 0.3  # noqa: E741
     whole = central + mass * l**2 + h * b
     w_next = ((whole - h * b) * w + h * (u - mass * G * l * math.sin(q))) / whole
@@ -291,7 +291,7 @@ def test_a_block_by_its_spring(load, x, v, u, h):
 
 
 def rotation(q):
-    """Of the quaternion q = (w, x, y, z)."""
+    """Return the rotation matrix of the quaternion q = (w, x, y, z)."""
     w, v = q[0], np.array(q[1:])
     cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
@@ -302,7 +302,7 @@ def rotation(q):
 )
 @each_row("seed", range(3))
 def test_a_spinning_body_by_its_inertia(seed, central):
-    """Euler: w+ = w - h I^-1 (w x I w); by an entry E of I: h I^-1 (E I^-1 (w x I w) - w x E w), in the body."""
+    """In the body, w+ = w - h I^-1 (w x I w), and an entry E of I gives dw+ = h I^-1 (E I^-1 (w x I w) - w x E w)."""
     random, h = np.random.default_rng(seed), 0.01
     made = Plant(h)
     body_inertia = SpatialInertia.MakeFromCentralInertia(0.7, np.zeros(3), RotationalInertia(*central))
@@ -322,11 +322,11 @@ def test_a_spinning_body_by_its_inertia(seed, central):
         E = matrix(np.eye(6)[i])
         expected = R @ (h * inverse @ (E @ inverse @ gyroscopic - np.cross(w, E @ w)))
         assert d.C[7:10, i] == pytest.approx(expected, rel=1e-8, abs=1e-12)
-    assert d.C[10:] == pytest.approx(0, abs=1e-12)  # a free fall knows no inertia
+    assert d.C[10:] == pytest.approx(0, abs=1e-12)  # a free fall does not depend on the inertia
 
 
 def rod(mass, length):
-    """A uniform thin rod that hangs along -z."""
+    """Return the inertia of a uniform thin rod that hangs along -z."""
     com, across = np.array([0, 0, -length / 2]), mass * length**2 / 12
     return SpatialInertia.MakeFromCentralInertia(mass, com, RotationalInertia(across, across, 0.0))
 
@@ -334,7 +334,7 @@ def rod(mass, length):
 @each_row("p, d", [(20.0, 3.0), (400.0, 0.5), (3.0, 10.0)])
 @each_row("h, q, w, u", PENDULA)
 def test_a_pd_pendulum_by_its_gains(h, q, w, u, p, d):
-    """J w+ = I w + h (u - m g l sin q - p q), J = I + h d + h^2 p: by p -h (q + h w+) / J, by d -h w+ / J."""
+    """J w+ = I w + h (u - m g l sin q - p q), J = I + h d + h^2 p, dw+/dp = -h (q + h w+) / J, dw+/dd = -h w+ / J."""
     made = Plant(h)
     body = made.plant.AddRigidBody("pole", SpatialInertia(1.0, [0, 0, -0.5], UnitInertia(0.25, 0.25, 0.0)))
     hinge = made.plant.AddJoint(RevoluteJoint("hinge", made.plant.world_frame(), body.body_frame(), [0, 1, 0]))
@@ -343,14 +343,14 @@ def test_a_pd_pendulum_by_its_gains(h, q, w, u, p, d):
     whole = 0.25 + h * d + h**2 * p
     w_next = (0.25 * w + h * (u - G * 0.5 * math.sin(q) - p * q)) / whole
     result = dd.differentiate_step(model, [q, w], [u], parameters=("motor.kp", "motor.kd"))
-    assert result.x_next[1] == pytest.approx(w_next, rel=1e-7)  # solved by SAP
+    assert result.x_next[1] == pytest.approx(w_next, rel=1e-7)  # the tolerance of SAP
     assert result.C[1] == pytest.approx([-h * (q + h * w_next) / whole, -h * w_next / whole], rel=CONTACT)
     assert result.sources == ("finite_difference", "finite_difference")
 
 
 @pytest.mark.parametrize(("h", "q", "w", "u"), PENDULA)
 def test_a_pendulum_by_gravity_and_the_time_step(load, h, q, w, u):
-    """I (1 + h b / I) w+ = I w + h (u + m l (gz sin q - gx cos q)); by h, w+ and q+ = q + h w+."""
+    """I (1 + h b / I) w+ = I w + h (u + m l (gz sin q - gx cos q)) and q+ = q + h w+ depend on g and h."""
     inertia, b, l = 0.25, 0.1, 0.5  # noqa: E741
     torque, whole = u - G * l * math.sin(q), inertia + h * b
     w_next = (inertia * w + h * torque) / whole
@@ -360,7 +360,7 @@ def test_a_pendulum_by_gravity_and_the_time_step(load, h, q, w, u):
     d = dd.differentiate_step(model, [q, w], [u], parameters=("model.gravity", "model.time_step"))
     assert d.C[1, :3] == pytest.approx(by_gravity, rel=SMOOTH, abs=1e-14)
     assert d.C[0, :3] == pytest.approx(h * by_gravity, rel=SMOOTH, abs=1e-14)
-    assert d.C[:, 3] == pytest.approx([w_next + h * by_step, by_step], rel=1e-8)  # differences
+    assert d.C[:, 3] == pytest.approx([w_next + h * by_step, by_step], rel=1e-8)  # finite differences
 
 
 @pytest.mark.parametrize(("h", "count"), [(0.01, 100), (0.004, 37)])
@@ -385,7 +385,7 @@ def test_a_projectile_by_gravity_and_the_time_step(load, h, count):
 
 
 def railed_ball(h, approximation, ours, ground, *, mass=1.0, axes=("z",), radius=0.1):
-    """A ball on rails over the ground; `ours` and `ground` are the arguments of contact_properties."""
+    """Return a plant with a ball on rails over the ground. `ours` and `ground` are arguments of contact_properties."""
     made = Plant(h, approximation)
     made.ball("ball", mass, radius, contact_properties(**ours), *axes)
     made.ground(contact_properties(**ground))
@@ -401,13 +401,13 @@ PRESSED = [(0.005, 0.003, -0.2), (0.005, 0.0005, -1.0), (0.002, 0.002, 0.1)]
 @each_row("ours, ground", SIDES)
 @each_row("h, depth, v", PRESSED)
 def test_a_pressed_ball_by_stiffness_radius_and_mass(approximation, ours, ground, h, depth, v):
-    """An implicit spring: (m + h^2 k) v+ = m (v - g h) + h k depth with k = ours ground / (ours + ground)."""
+    """An implicit spring gives (m + h^2 k) v+ = m (v - g h) + h k depth, k = ours ground / (ours + ground)."""
     m = 1.3
     model = railed_ball(h, approximation, {"stiffness": ours}, {"stiffness": ground}, mass=m).model()
     k = ours * ground / (ours + ground)
     whole = m + h**2 * k
     v_next = (m * (v - G * h) + h * k * depth) / whole
-    assert depth > h * v_next  # it presses
+    assert depth > h * v_next  # the contact force is positive
     names = ("ball.stiffness", "world.stiffness", "ball.radius", "ball.mass", "model.gravity")
     d = dd.differentiate_step(model, [0.1 - depth, v], parameters=names)
     assert d.x_next[1] == pytest.approx(v_next, rel=1e-7)
@@ -423,11 +423,11 @@ def test_a_pressed_ball_by_stiffness_radius_and_mass(approximation, ours, ground
 @each_row("d_ball, d_ground", [(2.0, 2.0), (5.0, 1.0)])
 @each_row("h, depth, v", PRESSED)
 def test_a_pressed_ball_by_dissipation(approximation, d_ball, d_ground, h, depth, v):
-    """With Hunt and Crossley: v+ = v - g h + h k (depth - h v+) (1 - d v+), d = (kB dA + kA dB) / (kA + kB)."""
+    """Hunt and Crossley: v+ = v - g h + h k (depth - h v+) (1 - d v+), d = (kB dA + kA dB) / (kA + kB)."""
     k_ball, k_ground = 1e4, 3e4
     sides = {"stiffness": k_ball, "dissipation": d_ball}, {"stiffness": k_ground, "dissipation": d_ground}
     k, damping = k_ball * k_ground / (k_ball + k_ground), (k_ground * d_ball + k_ball * d_ground) / (k_ball + k_ground)
-    # a v+^2 + b v+ + c = 0 with a = -h^2 k d, the root that tends to the one without dissipation as d vanishes
+    # the root of a v+^2 + b v+ + c = 0, a = -h^2 k d, that tends to the root without dissipation as d vanishes
     a, b, c = -(h**2) * k * damping, 1 + h**2 * k + h * k * depth * damping, -(v - G * h + h * k * depth)
     v_next = -2 * c / (b + math.sqrt(b**2 - 4 * a * c))
     slope = 1 + h * k * (h * (1 - damping * v_next) + damping * (depth - h * v_next))
@@ -442,14 +442,14 @@ def test_a_pressed_ball_by_dissipation(approximation, d_ball, d_ground, h, depth
 @each_row("t_ball, t_ground", [(0.01, 0.01), (0.02, 0.001)])
 @each_row("h, depth, v", PRESSED)
 def test_a_pressed_ball_by_relaxation_time(t_ball, t_ground, h, depth, v):
-    """A damper k t beside the spring, m = 1: (1 + h k (h + t)) v+ = v - g h + h k depth, t the sum of both sides'."""
+    """With a damper k t and m = 1, (1 + h k (h + t)) v+ = v - g h + h k depth, where t is the sum of both times."""
     k = 5000.0
     sides = [{"stiffness": 2 * k, "relaxation_time": t} for t in (t_ball, t_ground)]
     model = railed_ball(h, "sap", *sides).model()
     time = t_ball + t_ground
     whole = 1 + h * k * (h + time)
     v_next = (v - G * h + h * k * depth) / whole
-    assert depth / (h + time) > v_next  # it presses
+    assert depth / (h + time) > v_next  # the contact force is positive
     names = ("ball.relaxation_time", "world.relaxation_time", "ball.stiffness")
     d = dd.differentiate_step(model, [0.1 - depth, v], parameters=names)
     assert d.x_next[1] == pytest.approx(v_next, rel=1e-7)
@@ -461,7 +461,7 @@ def test_a_pressed_ball_by_relaxation_time(t_ball, t_ground, h, depth, v):
 @each_row("mu_ball, mu_ground", [(0.5, 0.5), (0.8, 0.3)])
 @each_row("u, v0", [(0.0, 1.0), (2.0, 0.0), (4.9, 0.0), (6.0, 0.0), (-6.5, 0.3)])
 def test_lagged_friction_step_and_its_derivatives(u, v0, mu_ball, mu_ground):
-    """v+ = v0 + h u - mu g h v+ / r, r = sqrt(v+^2 + e^2), mu = 2 ab / (a + b): by v0 1/D, by mu -g h v+ / r / D."""
+    """v+ = v0 + h u - mu g h v+ / r, r = hypot(v+, e), mu = 2ab / (a + b), dv+/dv0 = 1/D, dv+/dmu = -g h v+ / r / D."""
     h, k, eps = 0.01, 1e4, 1e-4
     mu = 2 * mu_ball * mu_ground / (mu_ball + mu_ground)
     sides = [{"stiffness": 2 * k, "friction": f} for f in (mu_ball, mu_ground)]
@@ -479,20 +479,20 @@ def test_lagged_friction_step_and_its_derivatives(u, v0, mu_ball, mu_ground):
         assert found.B[1, 0] == pytest.approx(h * found.B[3, 0], rel=1e-9)
     by_mu = -G * h * v / r / stiff
     parts = 2 * np.array([mu_ground, mu_ball]) ** 2 / (mu_ball + mu_ground) ** 2
-    assert d.C[3] == pytest.approx(by_mu * parts, rel=1e-5)  # at the edge of stiction SAP's 1e-6 grows by 1/D
+    assert d.C[3] == pytest.approx(by_mu * parts, rel=1e-5)  # near stiction SAP's 1e-6 grows by 1/D
     assert d.C[1] == pytest.approx(h * by_mu * parts, rel=1e-5)
 
 
 @pytest.mark.parametrize(("count", "mu", "h"), [(20, 0.5, 0.01), (70, 0.3, 0.005)])
 def test_the_stopping_distance_by_friction(count, mu, h):
-    """n steps until v0 - n mu g h < mu g h, d = h (n v0 - mu g h n (n + 1) / 2): by mu -g h^2 n (n + 1) / 2."""
-    k, v0 = 1e4, (count + 0.5) * mu * G * h  # half a step's worth is left: far from the edge of one step more
+    """n steps until v0 - n mu g h < mu g h, d = h (n v0 - mu g h n (n + 1) / 2), dd/dmu = -g h^2 n (n + 1) / 2."""
+    k, v0 = 1e4, (count + 0.5) * mu * G * h  # half of a step's loss of speed remains, far from one more step
     sides = {"stiffness": 2 * k, "dissipation": 10.0, "friction": mu}
     model = railed_ball(h, "lagged", sides, sides, axes=("z", "x")).model()
     x0 = [0.1 - G / k, 0.0, 0.0, v0]
     names = ("ball.friction", "world.friction")
     g = dd.differentiate_rollout(model, x0, None, lambda x: x[1], num_steps=2 * count, parameters=names)
-    # What is left after n steps creeps to rest within the stiction tolerance: 2 / (100 n) of the derivative.
+    # The speed after n steps decays within the stiction tolerance, with an effect of 2 / (100 n) on the derivative.
     assert g.loss == pytest.approx(h * (count * v0 - mu * G * h * count * (count + 1) / 2), rel=1e-3)
     assert g.by_parameters.sum() == pytest.approx(-G * h**2 * count * (count + 1) / 2, rel=2e-3)
 
@@ -520,7 +520,7 @@ def test_the_listed_inertia_is_the_central_one():
 
 
 def test_a_frame_without_mass_has_no_inertia_to_list():
-    """As real robots have many; Drake raises SystemExit where such an inertia is set."""
+    """Real robots have many such frames. Drake raises SystemExit if such an inertia is set."""
     made = Plant(0.01)
     frame = made.plant.AddRigidBody("flange", SpatialInertia.Zero())
     body = made.plant.AddRigidBody("hand", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
@@ -536,7 +536,7 @@ def test_a_frame_without_mass_has_no_inertia_to_list():
 
 
 def two_balls(stiffnesses=(1e4, 1e4), frictions=(0.5, 0.5)):
-    """One body, two collision geometries on it."""
+    """Return a model of one body with two collision geometries."""
     made = Plant(0.005, "lagged")
     body = made.plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
     for i, side in enumerate(("tip", "heel")):
@@ -561,12 +561,12 @@ def test_a_whole_body_is_the_sum_of_its_geometries():
     x[6], x[10:] = 0.048, [0.4, -0.3, -0.1]
     together = dd.differentiate_step(model, x, parameters=("ball.friction",)).C
     apart = dd.differentiate_step(model, x, parameters=("ball/tip.friction", "ball/heel.friction")).C
-    assert together[:, 0] == pytest.approx(apart.sum(axis=1), rel=1e-6, abs=1e-9)  # differences of contact
+    assert together[:, 0] == pytest.approx(apart.sum(axis=1), rel=1e-6, abs=1e-9)  # finite differences of contact
     assert np.abs(apart).max(axis=0).min() > 1e-3
 
 
 def two_robots():
-    """Two model instances with a body `pole`, a joint `hinge`, an actuator `motor` and a geometry each."""
+    """Return two model instances with a body `pole`, a joint `hinge`, an actuator `motor` and a geometry each."""
     made = Plant(0.01)
     for i, name in enumerate(("left", "right")):
         instance = made.plant.AddModelInstance(name)
@@ -598,7 +598,7 @@ def test_elements_of_the_same_name_are_told_apart_by_their_model_instance():
 
 
 def test_bodies_with_a_slash_in_their_name_are_no_geometries_of_one_another():
-    """As in MJCF files whose names are `arm/link`."""
+    """MJCF files contain names such as `arm/link`."""
     made = Plant(0.01)
     for name in ("arm", "arm/link"):
         body = made.plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(1.0, 0.1))
@@ -611,7 +611,7 @@ def test_bodies_with_a_slash_in_their_name_are_no_geometries_of_one_another():
 
 
 def same_motion(model, values, built, x, us):
-    """Step, rollout and all derivatives of `model` at `values` are those of `built`, and `model` stays as it was."""
+    """Check that `model` at `values` has the steps, rollouts and derivatives of `built`, and that it is not changed."""
     before = dd.step(model, x, us[0])
     near = {"rel": 1e-9, "abs": 1e-10}  # contact is solved to its own tolerance by the same algorithm
     assert dd.step(model, x, us[0], parameters=values) == pytest.approx(dd.step(built, x, us[0]), **near)
@@ -620,9 +620,9 @@ def same_motion(model, values, built, x, us):
         assert getattr(ours, name) == pytest.approx(getattr(theirs, name), **near), name
     assert np.array_equal(dd.step(model, x, us[0]), before)
     if any(source_of(name) == "finite_difference" and value == 0 for name, value in values.items()):
-        return  # on the edge of what Drake takes: there is no derivative
+        return  # at the limit of the values that Drake accepts there is no derivative
     d, wanted = dd.differentiate_step(model, x, us[0], parameters=values), dd.differentiate_step(built, x, us[0])
-    assert pytest.approx(wanted.A, rel=1e-6, abs=1e-8) == d.A  # as far as SAP solves a step
+    assert pytest.approx(wanted.A, rel=1e-6, abs=1e-8) == d.A  # the tolerance of SAP
     assert pytest.approx(wanted.B, rel=1e-6, abs=1e-8) == d.B
 
     def loss(xs, us):
@@ -633,7 +633,7 @@ def same_motion(model, values, built, x, us):
     assert g.loss == pytest.approx(w.loss, rel=1e-9)
     assert g.by_x0 == pytest.approx(w.by_x0, rel=1e-6, abs=1e-7)
     assert g.by_us == pytest.approx(w.by_us, rel=1e-6, abs=1e-7)
-    assert g.by_parameters == pytest.approx(w.by_parameters, rel=1e-4, abs=1e-7)  # some are differences
+    assert g.by_parameters == pytest.approx(w.by_parameters, rel=1e-4, abs=1e-7)  # some are finite differences
     assert np.array_equal(dd.step(model, x, us[0]), before)
 
 
@@ -648,7 +648,7 @@ def test_an_arm_with_a_value_given_is_the_arm_built_with_it(name):
 @each_row("name", [name for name in BALL_CHANGES if "modulus" not in name])
 def test_a_ball_with_a_value_given_is_the_ball_built_with_it(name, approximation):
     model, built = ball(approximation), ball(approximation, **{name: BALL_CHANGES[name]})
-    if BALL_CHANGES[name] != 0:  # it must matter, where this approximation knows it at all
+    if BALL_CHANGES[name] != 0:  # the value must have an effect if this approximation uses it
         unused = {"sap": "dissipation", "lagged": "relaxation_time", "similar": "relaxation_time"}[approximation]
         differs = not np.allclose(dd.step(model, ball_state(model)), dd.step(built, ball_state(model)), atol=1e-6)
         assert differs == (not name.endswith(unused))
@@ -719,17 +719,17 @@ def test_the_model_is_the_same_to_the_bit_after_anything(make, changes):
 
 def test_results_do_not_depend_on_the_order_of_parameters():
     model, (x, u) = arm(), ARM_POINT
-    names = [name for name in ARM if name != "pole.inertia"]  # beside which others mean something else
+    names = [name for name in ARM if name != "pole.inertia"]  # with which other parameters have another meaning
     wanted = {}
     for name in names:
         wanted[name] = dd.differentiate_step(arm(), x, u, parameters=(name,), method="autodiff").C
     for name in reversed(names):
         assert np.array_equal(dd.differentiate_step(model, x, u, parameters=(name,), method="autodiff").C, wanted[name])
     together = dd.differentiate_step(model, x, u, parameters=names, method="autodiff").C
-    assert together == pytest.approx(np.hstack([wanted[n] for n in names]), rel=1e-7, abs=1e-9)  # differences of two
+    assert together == pytest.approx(np.hstack([wanted[n] for n in names]), rel=1e-7, abs=1e-9)  # finite differences
 
 
-# ------------------------------------------------------------------------------------------- certificates, refusals
+# --------------------------------------------------------------------------------------------- certificates, errors
 
 
 def arm_point(load):
@@ -777,7 +777,7 @@ def test_every_parameter_is_certified(load, make, method, names):
 
 
 def certifiable(model):
-    """All that differences can be taken by, geometries as a whole."""
+    """Return the parameters for which central differences exist, with all geometries of a body as one."""
     found = []
     for p in dd.list_parameters(model):
         inside = room_of_inertia(p.value) > 0 if p.kind.quantity == "inertia" else np.all(p.value > p.lower)
@@ -834,20 +834,20 @@ def test_zero_is_refused_where_both_sides_are_needed(load, name):
 @each_row("name", ["ball.stiffness", "world.stiffness", "ball.mass", "ball.radius"])
 @each_row("approximation", ["lagged", "sap", "similar"])
 def test_a_value_of_zero_is_an_error_or_a_motion_but_not_the_end_of_the_process(name, approximation):
-    """Drake raises SystemExit for a stiffness of zero under sap."""
+    """Drake raises SystemExit for a stiffness of zero with SAP."""
     model = ball(approximation)
     try:
         found = dd.step(model, ball_state(model), parameters={name: 0.0})
     except (InputError, SimulationError):
         return
-    assert found[12] == pytest.approx(-0.1 - G * model.time_step, abs=1e-12)  # it falls: nothing presses
+    assert found[12] == pytest.approx(-0.1 - G * model.time_step, abs=1e-12)  # it falls without a contact force
 
 
 # ----------------------------------------------------------------------------------------------------------- inertia
 
 
 def random_inertia(random, size=1.0):
-    """Of some points of mass: any such is physically possible."""
+    """Return the inertia of some point masses, which is always physically possible."""
     points = size * random.standard_normal((6, 3))
     moment = points.T @ points
     full = np.trace(moment) * np.eye(3) - moment
@@ -872,7 +872,7 @@ def test_the_derivative_of_log_cholesky_coordinates_agrees_with_differences(seed
 
 
 def test_a_cube_has_the_coordinates_of_its_second_moment():
-    """I = a 1 has S = a/2 1 = L L', L = sqrt(a/2) 1."""
+    """I = a 1 has the second moment S = a/2 1 = L L' with L = sqrt(a/2) 1."""
     for a in (1e-3, 1.0, 40.0):
         assert to_log_cholesky(np.array([a, a, a, 0, 0, 0])) == pytest.approx(
             [math.log(a / 2) / 2] * 3 + [0] * 3, abs=1e-14

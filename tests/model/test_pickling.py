@@ -1,4 +1,4 @@
-"""Models, problems, solutions and errors in other processes."""
+"""Tests of models, problems, solutions and errors in other processes."""
 
 import copy
 import inspect
@@ -17,7 +17,7 @@ from drake_diff.model.contact import SoftContact, softened
 
 pytestmark = pytest.mark.solve
 
-SECONDS = 120  # a pool that waits for ever fails here
+SECONDS = 120  # time limit of a pool that would wait forever
 GIVEN = {
     InputError: [
         InputError("x", got=3, expected="4"),
@@ -41,7 +41,7 @@ def raised(error):
 
 
 def stepped(model, problem, solution):
-    """What a worker makes of them, and the three of them sent back."""
+    """Return a step, a solution and a cost from a worker, and the three arguments."""
     x, u = np.full(model.nx, 0.1), np.full(model.nu, 0.2)
     again = dd.solve(problem, method="ilqr")
     return dd.step(model, x, u), again.xs, solution.cost, (model, problem, solution)
@@ -68,7 +68,7 @@ def test_every_error_pickles_and_copies(error):
 
 
 def test_every_error_comes_out_of_a_pool_and_goes_into_it(pool):
-    """An InputError that a worker raised made `map` wait for ever."""
+    """An InputError in a worker formerly made `map` wait forever."""
     for error in ERRORS:
         with pytest.raises(type(error)) as found:
             pool.apply_async(raised, (error,)).get(timeout=SECONDS)
@@ -76,7 +76,7 @@ def test_every_error_comes_out_of_a_pool_and_goes_into_it(pool):
 
 
 def swing(model, factor=2.0):
-    """With a function that closes over a number, which plain pickle refuses."""
+    """Return a problem with a function that closes over a number, which plain pickle rejects."""
     return dd.Problem(
         model,
         x0=[0, 0],

@@ -1,4 +1,4 @@
-"""What a file leaves out and `load_model` adds when asked: motors, a base, fixed joints, packages, a ground."""
+"""Tests of `load_model` options that complete a file: motors, a base, fixed joints, packages, a ground."""
 
 import math
 import warnings
@@ -27,7 +27,7 @@ def joint(name, parent, child, kind="revolute", limit='<limit effort="7" velocit
 
 
 def robot(*joints, links="base upper lower"):
-    """A two-link arm as a textbook writes it: no world, no transmission."""
+    """Return the URDF of a two-link arm as in a textbook, without a world and without transmissions."""
     parts = [f'<link name="{name}">{INERTIAL}{BALL if name == "lower" else ""}</link>' for name in links.split()]
     return f'<robot name="arm">{"".join(parts)}{"".join(joints)}</robot>'
 
@@ -45,7 +45,7 @@ def write(tmp_path):
 
 
 def load(path, **options):
-    """The model, and what was warned of."""
+    """Return the model and the warnings."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         model = dd.load_model(path, **{"time_step": 0.01, **options})
@@ -53,7 +53,7 @@ def load(path, **options):
 
 
 def test_a_textbook_arm_becomes_one_that_can_be_driven(write):
-    """The step of the repaired arm is that of the same arm written with a world and transmissions."""
+    """The step of the completed arm equals that of the same arm in a file with a world and transmissions."""
     model, told = load(write(), actuators="all", base="weld", ground=True)
     assert (model.nq, model.nu, model.input_names) == (2, 2, ("shoulder", "elbow"))
     assert [a.effort_limit for a in model.contract.actuators] == [7.0, 7.0]
@@ -147,7 +147,7 @@ def test_the_repairs_are_the_same_in_every_format(tmp_path, name, text):
     assert (passive.nq, passive.nu) == (8 * count, 0)
     model, _ = load(tmp_path / name, actuators="all", base="weld", packages=packages)
     assert (model.nq, model.nu) == (count, count)
-    expected = 7.0 if packages else math.inf  # of arm.urdf
+    expected = 7.0 if packages else math.inf  # from arm.urdf
     assert [a.effort_limit for a in model.contract.actuators] == [expected] * count
     fixed, _ = load(tmp_path / name, fix_joints=["left::j" if packages else "j"], packages=packages)
     assert fixed.nq == 8 * count - 1
@@ -162,7 +162,7 @@ def test_a_welded_base_stays_where_the_file_puts_it(tmp_path):
 
 
 def test_any_frame_can_be_the_base(write):
-    """Held at its foot the chain is turned around; the base moves as its joints do."""
+    """If the chain is welded at its last link, it is reversed, and the base moves with its joints."""
     model, _ = load(write(), base="lower")
     assert model.nq == 2
     context = model.plant.CreateDefaultContext()
@@ -176,7 +176,7 @@ def test_a_fixed_joint_is_held_where_it_is_by_default(write):
     assert "1 joints fixed: elbow at 0." in told
     bent = write(robot(SHOULDER, ELBOW.replace('lower="-2"', 'lower="0.5"')), "bent.urdf")
     assert "1 joints fixed: elbow at 0.5." in load(bent, base="weld", fix_joints=["elbow"])[1]
-    assert model.contract.bodies[0].mass == 1.0  # a pendulum of two bodies: m g l about the shoulder, at rest
+    assert model.contract.bodies[0].mass == 1.0  # a pendulum of two bodies: m g l about the shoulder at rest
     weight = model.double.plant.CalcGravityGeneralizedForces
     context = model.plant.CreateDefaultContext()
     model.plant.SetPositions(context, [0.3])

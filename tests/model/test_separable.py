@@ -1,4 +1,4 @@
-"""Shapes that overlap wherever the joints are: found, told by `audit`, and filtered where that is asked for."""
+"""Tests of shapes that overlap in every posture: their detection, the finding of `audit`, and the contact filter."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,8 @@ import drake_diff as dd
 from drake_diff.model.contact_geometry import inseparable_pairs
 from drake_diff.model.step import set_state
 
-# Three links in a row, hinged about z. On the last is a ball that always overlaps the first one's disc, a second that
-# meets it where the last hinge is turned by less than 0.2 rad or so, and a box flush with the disc's top.
+# Three links in series, hinged about z. On the last link are a ball that always overlaps the first link's disc, a
+# second ball that meets the post at small angles only, and in some tests a box flush with the disc's top.
 ROBOT = """
 <robot name="overlapping">
   <link name="root"/>
@@ -57,13 +57,13 @@ def test_what_overlaps_in_every_posture_and_nothing_else_is_found(load):
 
 
 def test_faces_that_slide_on_each_other_are_found_too(load):
-    """A tilt of 1e-10 rad lifts the box by 1e-11 m in half of the postures, as rounding may."""
+    """A tilt of 1e-10 rad lifts the box by 1e-11 m in half of the postures, as rounding can."""
     found = {}
     for tilt, height in ((1e-10, 0.2), (1e-10, 0.2001), (1e-3, 0.2)):
         model = load(FLUSH.format(height=height), tilt)
         found[tilt, height] = names(model, inseparable_pairs(model.plant, model.diagram))
     assert found[1e-10, 0.2] == {("disc", "inside"), ("disc", "flush")}
-    assert found[1e-10, 0.2001] == found[1e-3, 0.2] == {("disc", "inside")}  # 0.1 mm apart; now and then
+    assert found[1e-10, 0.2001] == found[1e-3, 0.2] == {("disc", "inside")}  # 0.1 mm apart; in some postures only
 
 
 def test_the_filter_is_asked_for_told_and_leaves_every_other_contact(load):
@@ -76,7 +76,7 @@ def test_the_filter_is_asked_for_told_and_leaves_every_other_contact(load):
     set_state(model.double, apart)
     assert not model.double.overlaps()
     set_state(model.double, touching)
-    assert model.double.overlaps()  # the arm and the post
+    assert model.double.overlaps()  # the arm overlaps the post
     set_state((other := load()).double, apart)
     assert other.double.overlaps()
     assert not [note for note in other.notes if "pass" in note]
@@ -89,8 +89,8 @@ def test_the_twin_in_autodiff_has_the_filter(load):
     model = load(contact="separable")
     x = np.array([2.0, 0.1, 0.3, -0.2])
     by_autodiff = dd.differentiate_step(model, x, method="autodiff").A
-    # the axes are one line through which both centres of mass lie, and no contact acts: an inertia that only gravity
-    # cannot turn keeps its speeds
+    # both axes and both centres of mass lie on one vertical line, and no contact acts: gravity has no moment about the
+    # axes, so the speeds are constant
     np.testing.assert_allclose(by_autodiff, [[1, 0, 0.01, 0], [0, 1, 0, 0.01], [0, 0, 1, 0], [0, 0, 0, 1]], atol=1e-12)
 
 

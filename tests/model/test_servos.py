@@ -1,4 +1,4 @@
-"""Commanded positions as inputs: the step by hand, servos of MJCF by MuJoCo's own forces, plans that MuJoCo follows."""
+"""Tests of commanded positions as inputs: closed-form steps, forces of MJCF servos, and plans that MuJoCo follows."""
 
 import pickle
 import warnings
@@ -34,7 +34,7 @@ def slide(folder, mass=2.0, limit=40.0, **options):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_step_is_that_of_the_closed_form_and_so_are_its_derivatives(tmp_path, seed):
-    """m (v' - v) = h clip(kp (u - q - h v') - kd v', -limit, limit), linear in v' where nothing is cut off."""
+    """m (v' - v) = h clip(kp (u - q - h v') - kd v', -limit, limit), which is linear in v' without clipping."""
     random = np.random.default_rng(seed)
     (mass, kp, kd), h = random.uniform((0.1, 1, 0), (9, 70, 9)), random.choice([0.002, 0.05])
     model = slide(tmp_path, mass, time_step=h, gains=(kp, kd))
@@ -45,7 +45,7 @@ def test_a_step_is_that_of_the_closed_form_and_so_are_its_derivatives(tmp_path, 
     total = mass + h * kd + h * h * kp
     v_next = (mass * v + h * kp * (u - q)) / total
     assert abs(kp * (u - q - h * v_next) - kd * v_next) < 40, "the case is one within the limit"
-    # 1e-12: one division in double precision, of numbers up to 300.
+    # 1e-12 covers one division in double precision, of numbers up to 300.
     np.testing.assert_allclose(dd.step(model, [q, v], [u]), [q + h * v_next, v_next], rtol=0, atol=1e-12)
     rows = np.array([[-h * kp, mass, h * kp]]) / total
     for method in ("auto", "autodiff", "implicit", "analytic"):
@@ -61,19 +61,19 @@ def test_a_step_is_that_of_the_closed_form_and_so_are_its_derivatives(tmp_path, 
 def test_commands_and_efforts_are_each_the_other_way_round(tmp_path):
     model, random = slide(tmp_path, gains=(50.0, 4.0)), np.random.default_rng(0)
     x, effort = random.uniform(-0.5, 0.5, 2), np.array([7.0])
-    v_next = np.array([x[1] + 0.01 * 7.0 / 2.0])  # m dv = h F, by hand
+    v_next = np.array([x[1] + 0.01 * 7.0 / 2.0])  # m dv = h F
     u = model.commands(x, v_next, effort)
     x_next = dd.step(model, x, u)
     np.testing.assert_allclose(x_next[1:], v_next, rtol=0, atol=1e-12)  # one step in double precision
     np.testing.assert_allclose(model.efforts(x_next, u), effort, rtol=0, atol=1e-11)
     assert model.neutral_input(x) == x[0]
     assert model.effort_limits == 40
-    for mode in ("damp", "stop"):  # a command of 0 would throw the cart to the middle
+    for mode in ("damp", "stop"):  # a command of 0 would move the cart to the middle
         assert dd.loop.Fallback(mode).command(model, x, u) == x[0]
 
 
 def test_a_certificate_sees_a_wrong_gain(tmp_path):
-    """One thousandth more of kp in the AutoDiffXd plant changes the slope by the command alone: q is the command."""
+    """A kp that is 0.1 % larger in the AutoDiffXd plant changes only derivatives, because q equals the command."""
     model = slide(tmp_path, gains=(50.0, 4.0))
     assert dd.certify(model, [0.3, 0.0], [0.3], method="autodiff").verdict == "agree"
     actuators(model.autodiff.plant)[0].set_controller_gains(PdControllerGains(p=50.05, d=4.0))
@@ -98,7 +98,7 @@ def test_bad_options_are_named(options, error, says):
 
 
 def test_a_joint_without_an_actuator_gets_one_of_its_name():
-    """The cart has a motor of 20 N, which keeps its name and limit; the pole has none."""
+    """The cart's motor of 20 N keeps its name and limit. The pole has no motor in the file."""
     model = load("models/cart_pole.urdf", inputs="position", gains={"slide": (50.0, 5.0), "hinge": (2.0, 0.1)})
     assert model.input_names == ("force", "hinge")
     assert model.effort_limits.tolist() == [20.0, np.inf]
@@ -110,7 +110,7 @@ def test_a_joint_without_an_actuator_gets_one_of_its_name():
 
 
 def test_servos_act_on_joints_that_follow_others(tmp_path):
-    """Two slides, q1 = -2 q0 + 0.3, a servo on each: the step of the one coordinate by hand."""
+    """For two slides with q1 = -2 q0 + 0.3 and a servo on each, the step of the one coordinate has a closed form."""
     path, (m0, m1), (kp, kd), h = tmp_path / "m.xml", (1.5, 0.4), ((30.0, 2.0), (50.0, 1.0)), 0.01
     slides = "".join(
         f'<body name="b{i}"><joint name="j{i}" type="slide" axis="1 0 0"/><geom size="0.1" mass="{m}" contype="0" '
@@ -121,7 +121,7 @@ def test_servos_act_on_joints_that_follow_others(tmp_path):
     tied = '<equality><joint joint1="j1" joint2="j0" polycoef="0.3 -2 0 0 0"/></equality>'
     path.write_text(f'<mujoco model="m"><worldbody>{slides}</worldbody>{tied}<actuator>{servos}</actuator></mujoco>')
     model, (q, v), u = load(path, mimic="reduce", time_step=h), (0.2, -0.4), np.array([0.1, -0.3])
-    r = np.array([1.0, -2.0])  # J of both joints
+    r = np.array([1.0, -2.0])  # Jacobian of both joints
     mass = m0 + 4 * m1
     total = mass + h * (h * np.array(kp) + kd) @ r**2
     v_next = (mass * v + h * (np.array(kp) * r) @ (u - r * q - [0.0, 0.3])) / total
@@ -148,7 +148,7 @@ LINK = (
 
 
 def random_servos(random):
-    """A chain of hinges and slides with servos in each way that MJCF has of writing them."""
+    """Return a chain of hinges and slides with servos in every notation of MJCF."""
     count, body, motors = int(random.integers(1, 5)), "", ""
     for i in range(count):
         low, high = sorted(random.uniform(-2, 2, 2))
@@ -176,7 +176,7 @@ def random_servos(random):
 
 @pytest.mark.parametrize("seed", range(12))
 def test_servos_of_mjcf_exert_what_they_do_in_mujoco(tmp_path, seed):
-    """MuJoCo's own `qfrc_actuator` under our command times the gear is our effort, with its ranges of controls."""
+    """The effort equals MuJoCo's `qfrc_actuator` for the command times the gear, and the input ranges are MuJoCo's."""
     random, compared = np.random.default_rng([11, seed]), 0
     for _ in range(4):
         path = tmp_path / "m.xml"
@@ -205,7 +205,7 @@ def test_servos_of_mjcf_exert_what_they_do_in_mujoco(tmp_path, seed):
             mujoco.mj_forward(theirs, data)
             ours = np.clip(model.efforts(x, u), -model.effort_limits, model.effort_limits)
             in_joints = data.qfrc_actuator[theirs.jnt_dofadr[theirs.actuator_trnid[number, 0]]]
-            # 1e-9: products of gears and gains in another order, and the mass matrix of a damping ratio.
+            # 1e-9 covers a different order of products of gears and gains, and the mass matrix of a damping ratio.
             np.testing.assert_allclose(ours, in_joints, rtol=1e-9, atol=1e-12)
             compared += 1
     assert compared == 20
@@ -237,7 +237,7 @@ def test_gains_of_one_joint_leave_the_damping_ratio_of_another(tmp_path):
     theirs = mujoco.MjModel.from_xml_path(str(path))
     model = load(path, inputs="position", gains={"j0": (7.0, 0.5)})
     assert model.servo_gains[0].tolist() == [7.0, 5.0]
-    # 1e-9: one mass matrix, by two programs
+    # 1e-9 covers the rounding of one mass matrix in two programs
     np.testing.assert_allclose(model.servo_gains[1], [0.5, -theirs.actuator_biasprm[1, 2]], rtol=1e-9)
 
 
@@ -251,8 +251,8 @@ def test_efforts_are_the_inputs_where_they_are_asked_for(tmp_path):
     assert load(path).contract.inputs[0].unit == "rad"
 
 
-# A desk arm with weak servos, an arm with a gripper whose fingers are tied, a hand of four fingers: shapes of SO-101,
-# Panda and Allegro, with their gains, limits and armatures.
+# A desk arm with weak servos, an arm with a gripper whose fingers are coupled, and a hand of four fingers. They are
+# similar to SO-101, Panda and Allegro and have their gains, limits and armatures.
 def chain(rows, prefix=""):
     opened = ""
     for i, (height, axis, low, high, mass, more) in enumerate(rows):
@@ -311,7 +311,7 @@ def hand():
     "robot", [desk_arm, *(pytest.param(r, marks=pytest.mark.long) for r in (arm_with_gripper, hand))]
 )
 def test_a_plan_for_servos_is_followed_in_mujoco(tmp_path, robot, monkeypatch):
-    """Its inputs, held as MuJoCo's `ctrl` over each step, lead to within 0.03 rad of its states all along."""
+    """With the plan's inputs as MuJoCo's `ctrl`, constant over each step, states stay within 0.03 rad of the plan."""
     path = tmp_path / "robot.xml"
     path.write_text(robot())
     check_followed(path, tmp_path, monkeypatch)
@@ -319,7 +319,7 @@ def test_a_plan_for_servos_is_followed_in_mujoco(tmp_path, robot, monkeypatch):
 
 @pytest.mark.long
 def test_a_plan_for_a_hand_of_mjx_is_followed_in_mujoco(tmp_path, monkeypatch):
-    """The Shadow Hand of MJX's own tests: 24 servos, with meshes."""
+    """The robot is the Shadow Hand of MJX's tests, with 24 servos and meshes."""
     path = Path(mujoco.__file__).parent / "mjx/test_data/shadow_hand/right_hand.xml"
     if not path.exists():
         pytest.skip("mujoco-mjx is not installed")
@@ -341,12 +341,12 @@ def check_followed(path, tmp_path, monkeypatch):
         for name, value in zip(model.input_names, u, strict=True):
             data.ctrl[mujoco.mj_name2id(theirs, mujoco.mjtObj.mjOBJ_ACTUATOR, name)] = value
         mujoco.mj_step(theirs, data, 20)
-        assert np.max(np.abs(data.qpos - after)) < 0.03  # [rad or m] what the issue of servos asks for
+        assert np.max(np.abs(data.qpos - after)) < 0.03  # [rad or m] the required accuracy
     assert np.max(np.ptp(positions, axis=0)) > 0.2, "it goes somewhere"
 
 
 def random_site(random, i):
-    """A site with an orientation in one of the ways that MJCF has."""
+    """Return a site with an orientation in a random notation of MJCF."""
     numbers = {
         name: " ".join(map(str, random.normal(size=size)))
         for name, size in (("quat", 4), ("euler", 3), ("axisangle", 4), ("xyaxes", 6), ("zaxis", 3))
@@ -358,7 +358,7 @@ def random_site(random, i):
 
 @pytest.mark.parametrize("seed", range(8))
 def test_motors_of_sites_push_as_they_do_in_mujoco(tmp_path, seed):
-    """Two hinged bodies with a thruster each, with a moment about its line: MuJoCo's `qfrc_actuator` is ours."""
+    """Two hinged bodies have a thruster each, with a moment about its line. Compare with MuJoCo's `qfrc_actuator`."""
     random, path = np.random.default_rng([12, seed]), tmp_path / "m.xml"
     bodies, motors = "", ""
     for i in range(2):
@@ -383,12 +383,12 @@ def test_motors_of_sites_push_as_they_do_in_mujoco(tmp_path, seed):
         mujoco.mj_forward(theirs, data)
         model.double.set_state(x)
         model.double.set_input(size * control)
-        # 1e-9: poses of two links in double precision
+        # 1e-9 covers the rounding of the poses of two links
         np.testing.assert_allclose(model.double.applied_force(), data.qfrc_actuator, rtol=1e-9, atol=1e-9)
 
 
 def test_a_motor_of_a_site_that_is_no_thruster_is_left_out_and_told(tmp_path):
-    """A moment alone, or beside the line of the force, is no BodyForce."""
+    """A moment without a force, or a moment that is not parallel to the force, is not a BodyForce."""
     path = tmp_path / "m.xml"
     motors = '<motor name="twist" site="s" gear="0 0 0 0 0 1"/><motor name="skew" site="s" gear="1 0 0 0 1 0"/>'
     body = LINK.format(i=0, joint='axis="0 1 0"', mass=1) + '<site name="s"/></body>'

@@ -1,4 +1,4 @@
-"""The force at a distance: its law, its balance of momentum and energy, and its derivative."""
+"""Tests of the contact force at a distance: its law, its momentum and energy balance, and its derivative."""
 
 import math
 
@@ -22,7 +22,7 @@ SOFT = dd.model.SoftContact(0.05, 200.0)
 
 @each_row("phi", [-3.0, -0.05, 0.0, 0.02, 0.4])
 def test_the_force_is_the_slope_of_the_energy(phi):
-    """At touching it is sigma k log 2; the differences are central, so off by d^2 c'' / 6 < 1e-6."""
+    """At zero distance the force is sigma k log 2. The central differences have an error of d^2 c'' / 6 < 1e-6."""
     d = 1e-5
     slope = (SOFT.energy(phi - d) - SOFT.energy(phi + d)) / (2 * d)
     assert slope == pytest.approx(SOFT.normal_force(phi), rel=1e-6)
@@ -30,7 +30,7 @@ def test_the_force_is_the_slope_of_the_energy(phi):
 
 
 def test_the_limits_are_a_spring_and_nothing():
-    """exp(-60) is below the rounding of 1; the energy at touching is sigma^2 k pi^2 / 12."""
+    """exp(-60) is below the rounding of 1. The energy at zero distance is sigma^2 k pi^2 / 12."""
     assert SOFT.normal_force(-3.0) == pytest.approx(200 * 3.0, rel=1e-14)
     assert SOFT.normal_force(3.0) == pytest.approx(0.05 * 200 * math.exp(-60), rel=1e-14)
     assert SOFT.normal_force(1e4) == 0.0
@@ -38,7 +38,7 @@ def test_the_limits_are_a_spring_and_nothing():
 
 
 def test_one_step_of_two_spheres_is_the_closed_form(load):
-    """Semi-implicit Euler: m v' = m v + h (u - c), (m + h d) v' = m v + h c, in the state before the step."""
+    """Semi-implicit Euler gives m v' = m v + h (u - c), (m + h d) v' = m v + h c, with c before the step."""
     soft, h = dd.model.softened(load("two_spheres.sdf", time_step=0.02), SOFT), 0.02
     c = 0.05 * 200 * math.log1p(math.exp(-0.1 / 0.05))
     v = np.array([0.5 + h * (3 - c) / 1, (0.5 * 0.2 + h * c) / (0.5 + h * 0.5)])
@@ -67,7 +67,7 @@ def test_steps_are_certified_apart_and_touching(load, x):
 
 
 def test_steps_are_certified_where_normals_and_arms_turn(load):
-    """A sphere beside a turning box; eight spheres of a tumbling block above the ground."""
+    """The models are a sphere near a turning box, and a tumbling block with eight spheres above the ground."""
     box = dd.model.softened(load("box_push.sdf"), SOFT)
     dd.certify(box, [0, 0, 0.3, -0.25, -0.1, 0.1, 0.2, 0.3, 0.4, 0.5], [1, 2]).require()
     block = dd.model.softened(load("sliding_block.sdf"), SOFT)
@@ -76,7 +76,7 @@ def test_steps_are_certified_where_normals_and_arms_turn(load):
 
 
 def test_a_force_without_its_derivative_is_refused(load, monkeypatch):
-    """The same law, cut off from AutoDiffXd: the certificate must see it."""
+    """The certificate disagrees if the same law returns no AutoDiffXd derivatives."""
     soft = dd.model.softened(load("two_spheres.sdf", time_step=0.02), SOFT)
     honest = dd.model.SoftContact.normal_force
     monkeypatch.setattr(
@@ -86,7 +86,7 @@ def test_a_force_without_its_derivative_is_refused(load, monkeypatch):
 
 
 def test_a_floating_ball_leaves_the_ground_along_its_height(load):
-    """q = (quaternion, x, y, z): distance z - 0.1, its slope and the way out those of z, mobility 1/m."""
+    """With q = (quaternion, x, y, z), the distance is z - 0.1, its gradient is along z, and the mobility is 1/m."""
     twin = load("sphere_on_ground.sdf").double
     set_state(twin, [1, 0, 0, 0, 0.3, -0.2, 0.5, *np.zeros(6)])
     (pair,) = separations(twin)
@@ -106,7 +106,7 @@ def test_what_cannot_be_softened_is_refused(load):
 
 
 def lowest(shape, R):
-    """The least height of a shape that is turned by R, of 10^5 points on its surface or its corners alone."""
+    """Return the least height of a shape rotated by R, from 10^5 points on its surface or from its corners."""
     rng = np.random.default_rng(0)
     n = rng.normal(size=(100_000, 3))
     n /= np.linalg.norm(n, axis=1, keepdims=True)
@@ -128,7 +128,7 @@ SHAPES = [Box(0.1, 0.2, 0.3), Ellipsoid(0.1, 0.2, 0.3), Capsule(0.1, 0.3), Cylin
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: type(shape).__name__)
 @pytest.mark.parametrize("ground_first", [True, False])
 def test_a_shape_is_as_far_from_the_ground_as_its_lowest_point(shape, ground_first):
-    """And the gradient is that of central differences: off by d^2 = 1e-10, with rounding 1e-11."""
+    """The gradient equals central differences, which have an error of d^2 = 1e-10 and rounding of 1e-11."""
     plant, properties = Plant(0.01), contact_properties(1e4)
     body = plant.plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
     if ground_first:
@@ -146,7 +146,7 @@ def test_a_shape_is_as_far_from_the_ground_as_its_lowest_point(shape, ground_fir
         return separation
 
     found = distance(q)
-    # 1e-4 of the 0.3 m: 10^5 points on a surface are a degree apart
+    # 1e-4 of the 0.3 m, because 10^5 points on a surface are a degree apart
     assert found.distance == pytest.approx(0.7 + lowest(shape, turn.ToRotationMatrix().matrix()), abs=1e-4)
     d = 1e-5
     slope = [(distance(q + d * e).distance - distance(q - d * e).distance) / (2 * d) for e in np.eye(7)]
@@ -154,6 +154,6 @@ def test_a_shape_is_as_far_from_the_ground_as_its_lowest_point(shape, ground_fir
 
 
 def tangent(gradient, q):
-    """Without what changes the quaternion's norm, which no motion does."""
+    """Return the gradient without the part that changes the quaternion's norm, which no motion changes."""
     along = np.concatenate([q[:4], np.zeros(3)])
     return gradient - along * (gradient @ along)

@@ -1,4 +1,4 @@
-"""One step against closed forms; to 1e-12 where it is smooth, to 1e-7 where SAP solves for contact."""
+"""Tests of one step against closed forms, to 1e-12 if it is smooth and to 1e-7 if SAP solves for contact."""
 
 import math
 
@@ -27,7 +27,7 @@ def test_projectile_follows_symplectic_euler(load, h, count):
 
 
 def pendulum_step(q, w, u, h, l=0.5, b=0.1, m=1.0):  # noqa: E741
-    """Joint damping implicit, gravity and input explicit."""
+    """Return the next state, A, B and det A of a pendulum with implicit damping and explicit gravity and input."""
     inertia = m * l**2
     s = 1 / (1 + h * b / inertia)
     w_next = s * (w + h * (-(G / l) * math.sin(q) + u / inertia))
@@ -48,7 +48,7 @@ def test_pendulum_step_and_jacobian(load, approximation, h, q, w, u):
 
 
 def test_double_pendulum_step_jacobian_and_energy(load):
-    """M (v+ - v) / h = u - bias - G, q+ = q + h v+ and its derivative.
+    """The step solves M (v+ - v) / h = u - bias - G and q+ = q + h v+.
 
     c = m2 l1 l2 / 2, bias = (-c sin q2 (2 w1 w2 + w2^2), c sin q2 w1^2), G1 = (m1 / 2 + m2) g l1 sin q1 + G2,
     G2 = m2 g l2 sin(q1 + q2) / 2.
@@ -76,7 +76,7 @@ ALL = ("pendulum.urdf", "cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml",
 
 @each_row("name", ALL)
 def test_upper_half_of_the_jacobian_follows_from_the_lower(load, name):
-    """Where dq/dt = v: A_top = [I 0] + h A_bottom, B_top = h B_bottom, det A = det dv+/dv."""
+    """If dq/dt = v, then A_top = [I 0] + h A_bottom, B_top = h B_bottom, det A = det dv+/dv."""
     model, random = load(name), np.random.default_rng(1)
     h, n = model.time_step, model.nv
     for _ in range(5):
@@ -87,7 +87,7 @@ def test_upper_half_of_the_jacobian_follows_from_the_lower(load, name):
 
 
 def ball_on_ground(h, k, approximation, relaxation_time=None, mass=1.0):
-    """A ball on a vertical rail; both sides of stiffness 2k, so that the pair has k."""
+    """Return a model of a ball on a vertical rail. Both sides have stiffness 2k, so the pair has stiffness k."""
     plant = Plant(h, approximation)
     plant.ball("ball", mass, 0.1, contact_properties(2 * k, relaxation_time=relaxation_time), "z")
     plant.ground(contact_properties(2 * k, relaxation_time=relaxation_time and 0.0))
@@ -101,7 +101,7 @@ CONTACTS = [(0.003, -0.2), (0.003, 0.4), (0.0005, -1.0)]
 @each_row("approximation", ["lagged", "similar"])
 @each_row("depth, v", CONTACTS)
 def test_point_contact_step_without_dissipation(h, k, approximation, depth, v):
-    """v+ = (v - g h + h k x / m) / (1 + h^2 k / m) while that presses, else free fall."""
+    """v+ = (v - g h + h k x / m) / (1 + h^2 k / m) if the contact force is positive, else free fall."""
     model = ball_on_ground(h, k, approximation)
     pressed = (v - G * h + h * k * depth) / (1 + h**2 * k)
     touches = k * depth - h * k * pressed > 0
@@ -114,7 +114,7 @@ def test_point_contact_step_without_dissipation(h, k, approximation, depth, v):
 @each_row("h, k, tau", [(0.005, 5000.0, 0.02), (0.005, 5000.0, 0.0), (0.002, 8000.0, 0.007)])
 @each_row("depth, v", CONTACTS)
 def test_sap_contact_step(h, k, tau, depth, v):
-    """Regularization R = 1 / (h k (h + tau)), bias x / (h + tau)."""
+    """SAP has the regularization R = 1 / (h k (h + tau)) and the bias x / (h + tau)."""
     model = ball_on_ground(h, k, "sap", relaxation_time=tau)
     bias, regularization = depth / (h + tau), 1 / (h * k * (h + tau))
     pressed = (v - G * h + bias / regularization) / (1 + 1 / regularization)
@@ -130,7 +130,7 @@ def test_sap_contact_step(h, k, tau, depth, v):
 @each_row("approximation", APPROXIMATIONS)
 @each_row("k_ball, k_ground", [(1e4, 1e4), (2000.0, 6000.0)])
 def test_static_penetration_is_weight_over_stiffness(approximation, k_ball, k_ground):
-    """It is m g / k, after 8 s of settling; stiffnesses combine as springs in series."""
+    """The penetration is m g / k after 8 s of settling. Stiffnesses combine as springs in series."""
     plant = Plant(0.01, approximation)
     plant.ball("ball", 1.0, 0.1, contact_properties(k_ball, dissipation=20.0, relaxation_time=0.1), "z")
     plant.ground(contact_properties(k_ground, dissipation=20.0, relaxation_time=0.1))
@@ -156,7 +156,7 @@ def test_bad_input_is_named(load, x, u, words):
 
 
 def test_a_state_that_is_not_finite_is_an_error_not_the_end_of_the_process(load):
-    """Drake itself raises SystemExit here."""
+    """Drake's own step raises SystemExit for this state."""
     from drake_diff.model.step import advance
 
     with pytest.raises(SimulationError, match="not finite"):
@@ -164,7 +164,7 @@ def test_a_state_that_is_not_finite_is_an_error_not_the_end_of_the_process(load)
 
 
 def test_all_that_is_simulated_in_a_block_is_counted_and_nothing_beside_it():
-    """A rollout of N steps takes N, and a step with its derivative by AutoDiffXd two; blocks may lie in each other."""
+    """A rollout of N steps counts N, and a step with its AutoDiffXd derivative counts two. Blocks may be nested."""
     model = dd.load_model(MODELS / "hopper.sdf", time_step=0.01)
     still = [0, 0.9, 0, 0.45, 0, 0, 0, 0]  # in the air
     with dd.model.count_steps() as around:

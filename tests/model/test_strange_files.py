@@ -1,4 +1,4 @@
-"""Broken robot files end in an error that names the file, never in a library's traceback or the end of the process."""
+"""Tests that broken robot files end in an error that names the file, not in a library's traceback or a crash."""
 
 import os
 import re
@@ -110,7 +110,7 @@ def test_a_command_survives_a_file_that_ends_drakes_process(command, ending, tmp
     with pytest.raises(SystemExit) as end:
         cli.main()
     told = capfd.readouterr().err
-    if ending == "obj" and not ends_a_process(path):  # of Drake 1.51, not of 1.58
+    if ending == "obj" and not ends_a_process(path):  # Drake 1.51 crashes, Drake 1.58 does not
         assert end.value.code == 0
         return
     assert end.value.code == 1

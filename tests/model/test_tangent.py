@@ -1,4 +1,4 @@
-"""The tangent space: plus and minus are inverse, and their derivatives are those of the closed forms."""
+"""Tests of the tangent space: plus and minus are inverse, and their derivatives agree with finite differences."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def test_q_and_minus_q_are_the_same_rotation(free_body):
 
 
 def test_the_tangent_follows_drakes_angular_velocity(free_body):
-    """One step with angular velocity w turns by h w, expressed in world, to first order in h."""
+    """One step with angular velocity w turns by h w, expressed in the world frame, to first order in h."""
     model, space, x = free_body
     turned = dd.step(model, x)
     assert space.minus(turned, x)[:3] == pytest.approx(0.01 * x[7:10], rel=1e-12)

@@ -1,4 +1,4 @@
-"""Threads: a model that several of them use has the numbers of one thread, or refuses by name."""
+"""Tests of threads: a model in several threads gives the numbers of one thread, or raises a named error."""
 
 import sys
 import threading
@@ -19,7 +19,7 @@ SOLVES = (("collocation", None), ("shooting", None), ("ilqr", None))
 
 @pytest.fixture(autouse=True)
 def switch_often():
-    """Between any two instructions, nearly: as it is, Python lets a thread run for 5 ms, some 200 steps."""
+    """Switch threads almost at every instruction. By default, Python lets a thread run for 5 ms, about 200 steps."""
     former = sys.getswitchinterval()
     sys.setswitchinterval(1e-5)
     yield
@@ -27,7 +27,7 @@ def switch_often():
 
 
 def together(*calls):
-    """What the calls return, each made in a thread of its own, all at once."""
+    """Return the results of the calls, which run at once in a thread each."""
     start = threading.Barrier(len(calls))
 
     def run(call):
@@ -39,12 +39,12 @@ def together(*calls):
 
 
 def elsewhere(call):
-    """What the call returns, made in another thread."""
+    """Return the result of the call, which runs in another thread."""
     return together(call)[0]
 
 
 def test_two_threads_step_and_differentiate_one_model_as_one_thread_does(load):
-    """Of 2 * 1,500 steps 10 were wrong, silently, when threads shared a context."""
+    """When threads shared a context, 10 of 2 * 1,500 steps were wrong without an error."""
     model, random = load("cart_pole.urdf"), np.random.default_rng(0)
     points = random.standard_normal((2, 1500, 5))
 
@@ -60,7 +60,7 @@ def test_two_threads_step_and_differentiate_one_model_as_one_thread_does(load):
     for found, right in zip(together(*(lambda of=of: run(of) for of in points)), alone, strict=True):
         for a, b in zip(found, right, strict=True):
             assert np.array_equal(a, b)
-    assert not np.array_equal(alone[0][0], alone[1][0])  # they would differ
+    assert not np.array_equal(alone[0][0], alone[1][0])  # the two threads have different results
 
 
 def test_threads_with_a_model_each_solve_as_one_thread_does():

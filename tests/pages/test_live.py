@@ -1,4 +1,4 @@
-"""The page of a search while it runs: what it is told, who may read it, and that nothing of what is found changes."""
+"""Tests of the live page of a search: its data, its access control, and that it does not change the solution."""
 
 import base64
 import http.client
@@ -39,7 +39,7 @@ EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 @pytest.fixture(autouse=True)
 def often(monkeypatch):
-    """Every iterate is drawn whose predecessor is, whatever part of the time that takes."""
+    """Draw each iterate as soon as the previous one is drawn, whatever part of the time this takes."""
     monkeypatch.setattr("drake_diff.optimize.live.PERIOD", 0.0)
     monkeypatch.setattr("drake_diff.optimize.live.PART", 1e9)
 
@@ -52,11 +52,11 @@ def swing():
 
 
 def pushed():
-    """A ball of 1 kg on the ground, pushed forward."""
+    """Return a problem in which a ball of 1 kg on the ground is pushed forward."""
     push = dd.model.BodyForce("push", "ball", direction=(1, 0, 0))
     model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.01, body_forces=[push])
     x0 = np.array(model.default_state)
-    x0[6] = 0.0995  # [m] of a radius of 0.1
+    x0[6] = 0.0995  # [m] with a radius of 0.1 m
     final = lambda x: 1e4 * (x[4] - 0.005) ** 2  # noqa: E731
     return dd.Problem(model, x0=x0, num_steps=3, running_cost=EFFORT, final_cost=final)
 
@@ -66,7 +66,7 @@ def port_of(address):
 
 
 def watched(problem, **options):
-    """The solution, the address of its page, and what that says at the end."""
+    """Return the solution, the address of its page, and the page's final data."""
     addresses = []
     solution = dd.solve(problem, view=addresses.append, **options)
     (address,) = addresses
@@ -85,12 +85,12 @@ def test_to_look_changes_not_a_bit_and_every_row_is_told(swing, method):
     assert (solution.status, solution.iterations) == (alone.status, alone.iterations)
     assert (news["state"], news["message"]) == (solution.status.value, solution.message)
     told = [[row.objective, row.primal_infeasibility] for row in rows]
-    np.testing.assert_allclose(news["rows"], told, rtol=1e-7)  # eight digits are told
+    np.testing.assert_allclose(news["rows"], told, rtol=1e-7)  # the page has eight digits
     assert news["starts"] == [i for i, row in enumerate(rows) if row.iteration == 0]  # iLQR first, then shooting
 
 
 def test_the_page_and_its_viewer_listen_to_this_machine_alone(swing):
-    """By what the kernel says of the two ports: 127.0.0.1, and nothing of IPv6."""
+    """According to the kernel, both ports listen on 127.0.0.1 and not on IPv6."""
     watched(swing, method="ilqr")
     page = live_page()
     ports = {port_of(page.address), port_of(page.viewer)}
@@ -105,7 +105,7 @@ def test_the_page_and_its_viewer_listen_to_this_machine_alone(swing):
 
 
 def test_a_strangers_name_for_this_machine_is_refused(swing):
-    """A page elsewhere can give its own name the address 127.0.0.1: its browser says which name it asked for."""
+    """A page of another site can map its own name to 127.0.0.1, but its browser sends this name as the host."""
     address = watched(swing, method="ilqr")[1].removeprefix("http://").rstrip("/")
     for host, status in (("evil.example", 403), (address, 200), ("", 403)):
         asking = http.client.HTTPConnection(address, timeout=10)
@@ -118,24 +118,24 @@ def test_a_strangers_name_for_this_machine_is_refused(swing):
 
 
 def test_a_browser_that_reads_nothing_holds_up_no_search(swing, monkeypatch):
-    """Drake waits until all browsers have what it sends: in a thread that nobody waits for."""
+    """Drake waits until all browsers have received its data, in a thread that does not block the search."""
     monkeypatch.setattr("drake_diff.pages.live.PATIENCE", 0.1)
     alone, page = dd.solve(swing, method="ilqr"), live_page()
     viewer = page.viewer.removeprefix("http://").rstrip("/")
     key = base64.b64encode(os.urandom(16)).decode()
     upgrade = f"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13"
     vertices = np.random.default_rng(0).normal(size=(300_000, 3))
-    large = Triangles(vertices, np.arange(300_000).reshape(-1, 3))  # more than a connection's buffers take
+    large = Triangles(vertices, np.arange(300_000).reshape(-1, 3))  # more than a connection's buffers can hold
     shape = Drawn("", large, RigidTransform(), Rgba(1, 0, 0, 1), np.zeros(3), 1.0)
     poses = {"ball": [RigidTransform()] * 2}
     scene = Scene((shape,), np.array([0.0, 1.0]), poses, (), contacts=((),), trail=np.zeros((2, 3)))
     with socket.create_connection(("127.0.0.1", port_of(page.viewer))) as hanging:
         hanging.sendall(f"GET / HTTP/1.1\r\nHost: {viewer}\r\n{upgrade}\r\n\r\n".encode())
-        hanging.recv(1)  # it is a browser now
+        hanging.recv(1)  # the connection now counts as a browser
         page.show(page.begin("large", []), scene, end=True)
         assert not page.wait(0.5)
         solution, _, news = watched(swing, method="ilqr")
-        assert page.is_busy  # still with the large one
+        assert page.is_busy  # with the large scene
     assert (solution.us.tobytes(), news["state"]) == (alone.us.tobytes(), "converged")
     assert page.wait(60)
 
@@ -198,7 +198,7 @@ def test_the_solid_robot_is_the_last_state_and_the_others_lie_between():
 
 
 def test_contact_forces_of_an_iterate_are_drawn_where_they_push():
-    """Of every iterate, where the page is waited for: those of the states that are seen, here of all."""
+    """The callback waits for the page, so every iterate is drawn, with the forces of all states that are shown."""
     page, scenes, rows = live_page(), [], []
     show = page.show
 
@@ -223,7 +223,7 @@ def test_contact_forces_of_an_iterate_are_drawn_where_they_push():
 
 
 def test_a_motion_that_cannot_be_drawn_ends_no_search():
-    """Drake refuses a quaternion of zeros, and no camera sees 1e300 m."""
+    """Drake rejects a quaternion of zeros, and no camera can show 1e300 m."""
     problem, page = pushed(), live_page()
     search = LiveSearch(problem, lambda address: page.wait(60))
     search.begin()
@@ -235,7 +235,7 @@ def test_a_motion_that_cannot_be_drawn_ends_no_search():
         assert page.wait(60)
         assert told in page.news(search.number, 0)["line"]
     search.row(Iteration(2, 0.0, 0.0, 0.0, 0.0, motions=(replace(motion, xs=np.tile(problem.x0, (4, 1))),)))
-    assert page.wait(60)  # it draws again
+    assert page.wait(60)  # the page draws again
 
 
 @pytest.mark.slow
@@ -274,7 +274,7 @@ def test_a_run_is_shown_until_ctrl_c(tmp_path):
 
 @pytest.fixture
 def connected(browser):
-    """The browser, which is offline in all other tests."""
+    """Yield the browser with a network connection, which it does not have in all other tests."""
     told = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
     browser.execute_cdp_cmd("Network.emulateNetworkConditions", {"offline": False, **told})
     yield browser
@@ -285,7 +285,7 @@ def connected(browser):
 @pytest.mark.slow
 @browsing
 def test_a_browser_shows_rows_names_as_text_and_the_end(swing, connected):
-    """In one tab that is open before the search ends: no script of a name runs, and the viewer is in its frame."""
+    """The tab is open before the search ends. No script in a name runs, and the viewer is in its frame."""
     from selenium.webdriver.support.ui import WebDriverWait
 
     browser = connected
@@ -305,5 +305,5 @@ def test_a_browser_shows_rows_names_as_text_and_the_end(swing, connected):
         browser.execute_script(f"{slider} (s.value = {part}, s.dispatchEvent(new Event('input')))")
         seen.append(view_of(browser))
     assert browser.execute_script("return document.getElementById('now').textContent") == "0.700 s"
-    assert (np.abs(seen[1] - seen[0]).max(axis=2) > 0.2).sum() > 100  # pixels: the robot is elsewhere
+    assert (np.abs(seen[1] - seen[0]).max(axis=2) > 0.2).sum() > 100  # pixels: the robot has moved
     assert errors(browser) == []

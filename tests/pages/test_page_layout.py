@@ -1,4 +1,4 @@
-"""Reports of robots with many joints, in a real browser where there is one: what is shown, what stays in view, CSV."""
+"""Tests of reports of robots with many joints, in a real browser if available: plots, layout and CSV."""
 
 import csv
 import io
@@ -33,14 +33,14 @@ EVIL = "</script><img src=x onerror=\"document.title = 'evil'\">"
 
 
 def by_hand(model, xs, us, **asked):
-    """A solution whose plan is given, as if a solver had found it."""
+    """Return a solution with a given plan, as if a solver had found it."""
     problem = dd.Problem(model, x0=xs[0], num_steps=len(us), final_cost=dd.QuadraticCost(Q=np.eye(model.nx)), **asked)
     return dd.Solution(problem, "shooting", "none", dd.Status.CONVERGED, "by hand", xs, us)
 
 
 @pytest.fixture(scope="module")
 def humanoid(tmp_path_factory):
-    """The report of a humanoid with 29 joints that falls for a moment, each motor at a part of its limit."""
+    """Save the report of a humanoid with 29 joints that falls, with each motor at a fraction of its limit."""
     model = example_robot("simple_humanoid.urdf", 0.005)
     x0 = state_in_range(model, np.random.default_rng(1))
     us = 0.2 * np.ones((40, model.nu))
@@ -53,7 +53,7 @@ def humanoid(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def two(tmp_path_factory):
-    """Two runs of a cart-pole, the second of which is longer, starts elsewhere and has a goal that is drawn."""
+    """Save two runs of a cart-pole. The second is longer, starts at another state and has a goal that is drawn."""
     folder = tmp_path_factory.mktemp("two")
     model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.02)
     goal = dd.FrameGoal("pole", position=[0.3, None, None], tolerance=0.02)
@@ -80,7 +80,7 @@ def press(browser, selector, word=""):
 
 
 def saved_by(browser, selector, word=""):
-    """The rows of the CSV that a click saves."""
+    """Return the rows of the CSV that a click saves."""
     browser.execute_script("URL.createObjectURL = (b) => { window.saved = b; return '#'; }")
     press(browser, selector, word)
     text = browser.execute_async_script("const done = arguments[0]; window.saved.text().then(done)")
@@ -94,12 +94,12 @@ def embedded(page):
 
 
 def test_a_report_of_thirty_joints_is_below_5_mb(humanoid):
-    """With ten certificates of its steps, and a megabyte for meshes, which test_shapes.py bounds."""
+    """The report may have ten certificates of its steps, and a megabyte of meshes, which test_shapes.py limits."""
     certificates = json.dumps(page_data(0.0, (), [certificate(58, 87)] * 10))
     assert (humanoid / "report.html").stat().st_size + len(certificates) < 4e6
     data = embedded(humanoid / "report.html")
     assert len([p for p in data["plots"] if p["group"] == "Inputs"]) == 29
-    assert len(data["xs"]) < 5  # the times stand once, not with each of 100 plots
+    assert len(data["xs"]) < 5  # the times are stored once, not with each of 100 plots
 
 
 @pytest.mark.slow
@@ -109,7 +109,7 @@ def test_a_group_of_plots_is_shown_at_a_time_under_one_legend(humanoid, browser)
     chosen = texts(browser, ".choices button[aria-pressed=true]")
     assert chosen == ["Positions 36"]
     assert len(texts(browser, ".plot")) == 36
-    assert texts(browser, ".legend") == ["motionlimitCSV"]  # no solver took part, and so there is no certificate
+    assert texts(browser, ".legend") == ["motionlimitCSV"]  # without a solver there is no certificate
     press(browser, ".choices button", "Inputs")
     assert texts(browser, ".choices button[aria-pressed=true]") == ["Inputs 29"]
     assert len(texts(browser, ".plot")) == 29
@@ -121,7 +121,7 @@ def test_a_group_of_plots_is_shown_at_a_time_under_one_legend(humanoid, browser)
     whole = browser.execute_script("return [...document.querySelectorAll('.plot h4')].map(h => h.title)")
     short = browser.execute_script("return [...document.querySelectorAll('.plot h4')].map(h => h.textContent)")
     assert all(name.startswith(part) and part for name, part in zip(whole, short, strict=True))
-    assert len(set(short[:36])) == 36  # what is left of the names tells them apart
+    assert len(set(short[:36])) == 36  # the shortened names are unique
     assert errors(browser) == []
 
 
@@ -145,7 +145,7 @@ def test_the_replay_stays_in_view_beside_its_plots(humanoid, browser, size):
 
 
 def open_all(browser):
-    """Every part and table of the page, and every group of plots."""
+    """Open every section and table of the page, and show every group of plots."""
     browser.execute_script("document.querySelectorAll('details').forEach(d => { d.open = true; })")
     browser.execute_script("const all = [...document.querySelectorAll('.choices button')].pop(); if (all) all.click()")
     wait_for_frame(browser)
@@ -173,7 +173,7 @@ def test_every_text_can_be_read_and_every_control_has_a_name(humanoid, browser, 
 @pytest.mark.slow
 @browsing
 def test_the_replay_is_moved_by_the_keyboard(two, browser):
-    """The arrow keys move it by a hundredth, the space bar plays and pauses, and types a space in a field."""
+    """The arrow keys move the replay by 1 %. The space bar plays and pauses, and types a space in a field."""
     from selenium.webdriver.common.action_chains import ActionChains
     from selenium.webdriver.common.keys import Keys
 
@@ -210,7 +210,7 @@ def test_two_runs_share_a_replay_and_plots(two, browser, tmp_path):
     press(browser, ".chooser button", "show short minus long")
     told = texts(browser, ".values")[1]
     move_slider(browser, 0.0)
-    assert texts(browser, ".values")[1].strip().endswith("-0.2")  # 0.3 less 0.5 rad
+    assert texts(browser, ".values")[1].strip().endswith("-0.2")  # 0.3 minus 0.5 rad
     assert told != texts(browser, ".values")[1]
     assert errors(browser) == []
 
@@ -218,7 +218,7 @@ def test_two_runs_share_a_replay_and_plots(two, browser, tmp_path):
 @pytest.mark.slow
 @browsing
 def test_goals_are_in_the_replay(two, browser):
-    """In the plane x = 0.3 m, through the world's origin in y and z: green pixels, which no other run has."""
+    """The goal is green, in the plane x = 0.3 m through the world's origin in y and z. The other run has no green."""
     green = {}
     for name in ("short", "long"):
         open_page(browser, two / name / "report.html")
@@ -257,7 +257,7 @@ def test_of_a_long_series_the_extremes_are_kept():
 
 
 def write_plots(path, data):
-    """A page with plots and no replay."""
+    """Write a page with plots and without a replay."""
     runs = [{"name": name, "verdict": "pass", "sentence": "It holds.", "duration_s": 1.0} for name in ("one", "other")]
     record = {
         "sentence": "Same.",
@@ -269,7 +269,7 @@ def write_plots(path, data):
 
 @pytest.fixture(scope="module")
 def hostile(tmp_path_factory):
-    """A page whose names would be markup, or formulas in a spreadsheet."""
+    """Write a page whose names would be markup, or formulas in a spreadsheet."""
     names = ("=1+1", "+cmd|' /C calc'!A0", "-2", "@SUM(A1)", "\t=1", EVIL, 'a"b,c')
     plots = [Plot(name, EVIL, [0.0, 1.0], [Line(name, [1.0, -2.0])], group=EVIL, note=EVIL) for name in names]
     path = tmp_path_factory.mktemp("hostile") / "report.html"
@@ -307,7 +307,7 @@ def test_the_entries_of_a_certificate_are_read_with_the_keyboard(browser, tmp_pa
     write_plots(page, data)
     page.write_text(page.read_text().replace('<div id="plots"', '<div id="maps"></div><div id="plots"'))
     open_page(browser, page)
-    assert texts(browser, ".map h3")[0].startswith("1: ")  # the one that does not agree comes first
+    assert texts(browser, ".map h3")[0].startswith("1: ")  # the certificate that disagrees comes first
     for _ in range(6):
         browser.execute_script(
             "document.querySelector('.map svg').dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowRight'}))"
@@ -317,7 +317,7 @@ def test_the_entries_of_a_certificate_are_read_with_the_keyboard(browser, tmp_pa
 
 
 def contrast(one, other):
-    """WCAG's contrast of two colours, of 21 at most."""
+    """Return WCAG's contrast ratio of two colours, which is at most 21."""
 
     def luminance(text):
         parts = [int(text[i : i + 2], 16) / 255 for i in (1, 3, 5)]
@@ -331,7 +331,7 @@ def contrast(one, other):
 @browsing
 @each_row("scheme", ["light", "dark"])
 def test_text_and_lines_stand_out_from_their_ground(hostile, browser, scheme):
-    """WCAG AA: 4.5 for text, 3 for lines and edges of controls."""
+    """WCAG AA requires a contrast of 4.5 for text, and of 3 for lines and edges of controls."""
     open_page(browser, hostile[0], scheme=scheme)
     names = ("ink", "soft", "good", "bad", "open", "card", "paper", "edge", "limit", *(f"s{i}" for i in range(6)))
     found = browser.execute_script(
@@ -345,4 +345,4 @@ def test_text_and_lines_stand_out_from_their_ground(hostile, browser, scheme):
             assert contrast(colours[name], colours[ground]) >= 4.5, (name, ground)
         for name in ("edge", "limit", *(f"s{i}" for i in range(6))):
             assert contrast(colours[name], colours[ground]) >= 3, (name, ground)
-    assert contrast("#ffffff", "#777777") == pytest.approx(4.48, abs=0.01)  # WCAG's own example of what fails
+    assert contrast("#ffffff", "#777777") == pytest.approx(4.48, abs=0.01)  # WCAG's example of a failure

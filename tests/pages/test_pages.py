@@ -1,4 +1,4 @@
-"""Pages from templates: whatever a name says, it is text; and no page says more than it was given."""
+"""Tests of pages from templates: names are only text, and scripts that are put into a page do not run."""
 
 import json
 import re
@@ -19,13 +19,13 @@ from drake_diff.trials import save_robustness
 
 PACKAGE = Path(dd.__file__).parent
 EVIL = "</script><script>document.title = 'evil'</script><img src=x onerror=\"document.title = 'evil'\">'"
-# What decides what is drawn where is not from a model or a file.
+# These fields select what is drawn, and do not come from a model or a file.
 OURS = ("control", "verdict", "own", "direction", "axis", "marks", "codes", "verdicts")
 NAMED = ("seconds_per_step", "seconds_per_jacobian", "effects")  # their keys are names
 
 
 def poisoned(value, key=""):
-    """`value` with EVIL at the end of every text in it."""
+    """Return `value` with EVIL appended to every text in it."""
     if isinstance(value, dict):
         return {k + EVIL if key in NAMED else k: v if k in OURS else poisoned(v, k) for k, v in value.items()}
     if isinstance(value, PageCheck):
@@ -46,7 +46,7 @@ def write_poisoned(path, template, *, record, data, view="", **facts):
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
-    """The path of each kind of page, with EVIL at the end of every text in its record and its plots."""
+    """Write each kind of page with EVIL appended to every text in its record and plots, and return the paths."""
     folder = tmp_path_factory.mktemp("pages")
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
     cost = dd.QuadraticCost(R=[[1.0]])
@@ -72,7 +72,7 @@ PAGES = ("report", "robustness", "comparison")
 
 
 def elements(page):
-    """Every element that a browser would make of `page`, the replay's own page apart."""
+    """Return every element that a browser would create from `page`, without those of the replay's own page."""
     from html.parser import HTMLParser
 
     found = []
@@ -83,7 +83,7 @@ def elements(page):
 
 
 def is_harmless(page):
-    """Two blocks of data, our two scripts, and no picture with a source or an event handler."""
+    """Return whether the page has two blocks of data, our two scripts, no picture source and no event handler."""
     found = elements(page)
     scripts = [attributes for tag, attributes in found if tag == "script"]
     pictures = [attributes for tag, attributes in found if tag == "img" and "src" in attributes]
@@ -95,11 +95,11 @@ def is_harmless(page):
 def test_no_text_becomes_an_element(pages, name):
     page = pages[name].read_text()
     assert is_harmless(page)
-    assert page.count("&lt;/script&gt;&lt;script&gt;document.title") > 20  # it is there, as text
+    assert page.count("&lt;/script&gt;&lt;script&gt;document.title") > 20  # EVIL is present as text
     for place in ("data", "record"):
         start = page.index(">", page.index(f'id="{place}"')) + 1
         read = json.loads(page[start : page.index("</script>", start)])
-        assert json.dumps(read).count(json.dumps(EVIL)[1:-1]) > 5  # the data are whole
+        assert json.dumps(read).count(json.dumps(EVIL)[1:-1]) > 5  # the data are complete
 
 
 def test_an_element_that_got_into_a_page_is_noticed(pages):
@@ -120,7 +120,7 @@ def test_a_hostile_name_is_read_and_not_run(pages, browser, name):
     ready = "return document.documentElement.dataset.ready === 'yes'"
     WebDriverWait(browser, 30).until(lambda b: b.execute_script(ready))
     assert errors(browser) == []
-    assert "evil" in browser.title  # as a part of it
+    assert "evil" in browser.title  # as a part of the title
     assert browser.title != "evil"
     assert EVIL in browser.execute_script("return document.body.innerText")
     assert browser.execute_script("return document.querySelectorAll('.plot canvas').length") > 0

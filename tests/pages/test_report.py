@@ -1,4 +1,4 @@
-"""What people look at: replay.html, report.html and the live view, in a real browser where there is one."""
+"""Tests of replay.html, report.html and the live view, in a real browser if available."""
 
 import dataclasses
 import shutil
@@ -43,7 +43,7 @@ def collocated(pendulum):
 
 @pytest.fixture(scope="module")
 def hostile(tmp_path_factory):
-    """A run whose body, and whose directory, are named to break out of a page."""
+    """Save a run whose body and directory have names that would break out of a page."""
     folder = tmp_path_factory.mktemp("hostile")
     escaped = HOSTILE.replace("<", "&lt;").replace(">", "&gt;")
     urdf = (
@@ -59,7 +59,7 @@ def hostile(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def runs(swing_up, thrown, collocated, tmp_path_factory):
-    """A directory of each kind of run, the failed ones too."""
+    """Save a run of each kind, including failed runs, and return the folder."""
     folder = tmp_path_factory.mktemp("runs")
     xs = np.array(swing_up.xs)
     xs[5:] = np.nan
@@ -83,7 +83,7 @@ def cursors(browser):
 
 
 def show_all(browser):
-    """Every group of plots, where the page shows one at a time."""
+    """Show every group of plots, if the page shows one group at a time."""
     browser.execute_script("const all = [...document.querySelectorAll('.choices button')].pop(); if (all) all.click()")
 
 
@@ -92,7 +92,7 @@ def show_all(browser):
     "name", slow_after(2, ["swing_up", "thrown", "collocated", "limited", "not_finite", "no_replay"])
 )
 def test_a_report_opens_without_a_network_and_without_an_error(runs, browser, tmp_path, name):
-    """On a laptop, and on a phone that turns dark while the page is open."""
+    """The screens are a laptop, and a phone that switches to dark mode while the page is open."""
     open_page(browser, runs / name / "report.html", size=(1440, 900))
     for size, scheme in (((1440, 900), "light"), ((390, 844), "dark")):
         set_screen(browser, size, scheme)
@@ -115,11 +115,11 @@ def test_the_slider_moves_the_view_and_the_cursors_together(runs, browser, tmp_p
         move_slider(browser, part)
         seen[part] = view_of(browser), np.array(cursors(browser))
         browser.save_screenshot(str(tmp_path / f"{part}.png"))
-    assert (np.abs(seen[0.7][0] - seen[0.1][0]).max(axis=2) > 0.2).sum() > 100  # pixels: the robot is elsewhere
+    assert (np.abs(seen[0.7][0] - seen[0.1][0]).max(axis=2) > 0.2).sum() > 100  # pixels: the robot has moved
     data = browser.execute_script("return JSON.parse(document.getElementById('data').textContent)")
     timed = np.array([plot["axis"] == "time" for plot in data["plots"]])
     assert timed.sum() >= 5
-    assert np.all((seen[0.7][1] - seen[0.1][1])[timed] > 50)  # pixels, of plots that are 150 wide at least
+    assert np.all((seen[0.7][1] - seen[0.1][1])[timed] > 50)  # pixels, in plots that are at least 150 wide
     assert errors(browser) == []
 
 
@@ -140,7 +140,7 @@ def test_the_replay_page_is_posed_before_play_and_moves(runs, browser, tmp_path)
 @pytest.mark.slow
 @browsing
 def test_an_arrow_is_as_long_as_its_force(runs, browser, thrown):
-    """At the end the ball rests: the force is its weight, 9.81 N, and the arrow's length that over the reference."""
+    """At the end the ball rests. Its force is the weight, 9.81 N, and the arrow's length is force over reference."""
     open_page(browser, runs / "thrown" / "replay.html")
     browser.execute_script("viewer.animator.play(); viewer.animator.pause(); viewer.animator.seek(0.2999)")
     find = "viewer.scene_tree.find(['drake', 'contacts', '0', 'shaft']).object.scale.z"
@@ -162,7 +162,7 @@ def test_hostile_names_do_no_harm_in_a_browser(hostile, browser):
 
 @browsing
 def test_a_script_that_was_put_into_the_page_is_not_run(runs, browser, tmp_path):
-    """The policy has to refuse something, or it says nothing."""
+    """The content security policy must block the script."""
     text = (runs / "swing_up" / "report.html").read_text()
     evil = "</header><script>document.title = 'evil'</script>"
     (tmp_path / "report.html").write_text(text.replace("</header>", evil, 1))
@@ -180,7 +180,7 @@ def test_plots_hold_what_was_measured(swing_up):
 
 
 def test_the_trail_is_that_of_the_frame_that_was_asked_for(swing_up):
-    """The bob's centre of mass is 0.5 m from the hinge and swings from below to above: 1 m of height."""
+    """The bob's centre of mass is 0.5 m from the hinge and swings from below to above, over 1 m of height."""
     model, times, xs = swing_up.problem.model, swing_up.times, swing_up.replay.xs
     assert np.ptp(scene_of(model, times, xs).trail[:, 2]) == pytest.approx(1.0, abs=1e-3)  # it ends 1e-8 from upright
     assert np.ptp(scene_of(model, times, xs, frame="world").trail) == 0.0
@@ -189,7 +189,7 @@ def test_the_trail_is_that_of_the_frame_that_was_asked_for(swing_up):
 
 
 def test_a_run_is_shown_from_its_directory_alone(hostile, tmp_path):
-    """The model's source is gone; what is shown comes out of the trace."""
+    """The model's source file is deleted, so the scene comes from the trace."""
     run = tmp_path / "run"
     shutil.copytree(hostile, run)
     source = hostile.parent / "evil.urdf"
@@ -212,7 +212,7 @@ def test_of_a_run_whose_model_cannot_be_rebuilt_its_page_is_named(tmp_path):
 
 
 def test_the_live_view_shows_the_plan_where_only_feedback_keeps_it(tmp_path):
-    """A pendulum held upright: without feedback it falls, which the verdict does not rest on."""
+    """A pendulum near upright falls without feedback, which has no effect on the verdict."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
     cost = dd.QuadraticCost(R=[[1.0]])
     problem = dd.Problem(model, x0=[np.pi - 0.2, 0], x_goal=[np.pi, 0], num_steps=150, running_cost=cost)

@@ -1,4 +1,4 @@
-"""What a picture of a motion shows: forces of inputs where they push, and a camera that has all of it in view."""
+"""Tests of the picture of a motion: input forces at their points of action, and a camera with everything in view."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ ROTORS = [
 
 
 def test_the_force_of_an_input_is_drawn_where_it_pushes(tmp_path):
-    """At p + R r along R d, of u newtons: from the formula of a body's pose."""
+    """The force of u newtons is drawn at p + R r along R d, from the formula of a body's pose."""
     model = dd.load_model(MODELS / "projectile.sdf", time_step=0.01, body_forces=ROTORS)
     rng = np.random.default_rng(5)
     xs, us = np.tile(model.default_state, (3, 1)), rng.uniform(1, 5, (2, 2))
@@ -39,7 +39,7 @@ def test_the_force_of_an_input_is_drawn_where_it_pushes(tmp_path):
 
 @pytest.mark.parametrize("seed", range(8))
 def test_all_of_a_motion_is_in_view_and_fills_the_picture(seed):
-    """By a pinhole camera, which knows of the balls alone: none beyond FILLED, and one at least at its edge."""
+    """In a pinhole camera that sees only the balls, no ball is beyond FILLED, and at least one is near its edge."""
     rng = np.random.default_rng(seed)
     size = 10.0 ** rng.uniform(-1, 2)
     steps = 20
@@ -65,7 +65,7 @@ def test_all_of_a_motion_is_in_view_and_fills_the_picture(seed):
 @pytest.mark.slow
 @browsing
 def test_the_ground_is_as_dark_as_the_screen(browser, tmp_path):
-    """A half space, which has no look of its own: below the middle of the picture there is nothing else."""
+    """The ground is a half space without an appearance of its own, which fills the picture below its middle."""
     ball = Drawn("b", Sphere(0.1), RigidTransform(), Rgba(1, 0, 0), np.zeros(3), 0.1)
     ground = Drawn("", HalfSpace(), RigidTransform(), Rgba(0.6, 0.6, 0.6), np.zeros(3), 0.0)
     path = np.array([[0, 0, 0.1], [0.5, 0, 0.1]])

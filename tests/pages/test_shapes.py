@@ -1,4 +1,4 @@
-"""What pages draw of a robot: its visual meshes with fewer faces, and a skeleton where there are none."""
+"""Tests of the shapes in pages: visual meshes with fewer faces, and a skeleton for links without shapes."""
 
 import warnings
 
@@ -21,7 +21,7 @@ INERTIA = '<inertial><mass value="1"/><inertia ixx=".1" iyy=".1" izz=".1" ixy="0
 
 
 def arm(visual="", material=""):
-    """A base, an upper arm of 0.6 m along z and a fore arm whose centre of mass is 0.3 m along x."""
+    """Return a URDF of a base, an upper arm of 0.6 m along z and a fore arm with its centre of mass 0.3 m along x."""
     return f"""<robot name="arm">{material}<link name="base"/>
 <link name="upper">{INERTIA}{visual}</link>
 <link name="fore">{INERTIA.replace("<mass", '<origin xyz="0.3 0 0"/><mass')}</link><link name="camera"/>
@@ -61,7 +61,7 @@ def test_links_without_shapes_are_bones_from_joint_to_joint(tmp_path):
     assert bone.shape.length() == pytest.approx(0.3)
     np.testing.assert_allclose(bone.pose.translation(), [0.15, 0, 0])
     assert not on(found, "camera")
-    size = np.linalg.norm([0.2, 0.6])  # of the box of all links' origins
+    size = np.linalg.norm([0.2, 0.6])  # size of the box of all links' origins
     assert bone.shape.radius() == pytest.approx(shapes.BONE_PART * size)
 
 
@@ -101,10 +101,10 @@ def test_fewer_faces_keep_the_shape():
     fewer = with_fewer_faces(meshes, 4000)
     assert 2000 < sum(len(mesh.faces) for mesh in fewer) <= 4000
     np.testing.assert_allclose(np.ptp(fewer[0].vertices, axis=0), 1, atol=1e-6)  # its corners stay sharp
-    # Flat faces stay flat, and only where they meet does a cell cut an edge: the volume changes by little.
+    # Flat faces stay flat. A cell cuts the box only at edges, so the volume changes little.
     assert trimesh.Trimesh(fewer[0].vertices, fewer[0].faces).volume == pytest.approx(1, abs=0.005)
     radii = np.linalg.norm(fewer[1].vertices, axis=1)
-    # The points lie closest to the planes of their faces: within the cap of a cell of 0.06 m on a ball of 0.5 m.
+    # The points are closest to the planes of their faces, within the cap of a cell of 0.06 m on a ball of 0.5 m.
     np.testing.assert_allclose(radii, 0.5, atol=0.06**2 / 2 / 0.5)
 
 
@@ -137,7 +137,7 @@ def test_a_humanoid_is_seen_in_a_page_of_bounded_size(tmp_path):
     found = scene(robot_file("talos_full_v2.urdf"))
     meshes = [drawn.shape for drawn in found.shapes if isinstance(drawn.shape, Triangles)]
     assert len(meshes) > 40
-    # The limit, and 16 x 16 cells on each of six sides for parts so small that they would lose their shape.
+    # Small parts may exceed the limit. They have 16 x 16 cells on each of six sides, to keep their shape.
     assert sum(len(mesh.faces) for mesh in meshes) < 2 * shapes.MOST_FACES
     low, high = found.box
     assert 1.5 < (high - low)[2] < 2.3  # TALOS is 1.75 m tall

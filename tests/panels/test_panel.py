@@ -1,4 +1,4 @@
-"""Panels: the same table to the byte whoever evaluates what, whatever dies, and however often it is taken up again."""
+"""Tests of panels: the table has the same bytes for any workers, killed processes and restarts."""
 
 import csv
 import json
@@ -85,7 +85,7 @@ level = [0.5, 1, 2, 4, 8]
 
 @pytest.fixture
 def write(tmp_path):
-    """A panel file beside the functions above."""
+    """Return a function that writes a panel file and the functions above."""
 
     def write_panel(function="fails", *, seeds=1, seconds=0.0, methods='["a"]', folder=tmp_path):
         (folder / "trials.py").write_text(FUNCTIONS)
@@ -113,7 +113,7 @@ def start(path, out, *words):
 
 
 def finished(out):
-    """The ids of the trials that have their record."""
+    """Return the ids of the trials that have a record."""
     return {path.stem for path in (out / "trials").glob("*.json")}
 
 
@@ -125,13 +125,13 @@ def wait_for(condition, seconds=60):
 
 
 def logged(path):
-    """(pid, trial) of every evaluation that began."""
+    """Return (pid, trial) of every evaluation that began."""
     log = path.parent / "log"
     return [line.split(" ", 1) for line in log.read_text().splitlines()] if log.exists() else []
 
 
 def lives(pid):
-    """Whether there is such a process, and not only its entry that nobody has asked for yet."""
+    """Return whether the process runs and is not a zombie."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
     except OSError:
@@ -147,7 +147,7 @@ def no_worker_lives(path):
 
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory):
-    """TRIALS trials and their table, evaluated by one worker without interruption."""
+    """Evaluate TRIALS trials with one worker without interruption, and return the panel's path."""
     folder = tmp_path_factory.mktemp("uninterrupted")
     (folder / "trials.py").write_text(FUNCTIONS)
     path = folder / "panel.toml"
@@ -178,14 +178,14 @@ def test_trials_killed_twice_at_random_give_the_same_bytes(uninterrupted):
     assert f"{TRIALS} trials, 0 errors" in output
     assert files(out) == files(uninterrupted.parent / "one")
     trials = [trial for _, trial in logged(uninterrupted)]
-    assert not {names[id] for id in done} & set(trials[begun:])  # what was finished is not evaluated again
+    assert not {names[id] for id in done} & set(trials[begun:])  # finished trials are not evaluated again
     assert set(trials) == set(names.values())
-    # Two workers start at most eight trials each before the rows of these are written.
+    # Two workers start at most eight trials each before the rows of these trials are written.
     assert len(trials) <= TRIALS + 2 * 16
 
 
 def test_any_number_of_workers_and_a_second_call_give_the_same_bytes(write, tmp_path):
-    """The second call evaluates nothing."""
+    """The second call evaluates no trial."""
     path = write("cheap", seeds=2)
     for workers in (1, 2):
         run_panel(path, out=tmp_path / str(workers), workers=workers)
@@ -206,7 +206,7 @@ def test_global_generators_start_from_the_trials_own_seed():
     assert other["numpy"] == np.random.RandomState(5).random_sample()
 
 
-# --- what dies --------------------------------------------------------------------------------------------------------
+# --- processes that die -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -242,7 +242,7 @@ def test_ctrl_c_keeps_what_is_finished_and_says_how_to_go_on(write, tmp_path):
     path, out = write("cheap", seeds=100, seconds=0.02), tmp_path / "out"
     process = start(path, out, "--workers", 2)
     wait_for(lambda: len(finished(out)) >= 3)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all processes at once
+    os.killpg(process.pid, signal.SIGINT)  # to all processes at once, like a terminal
     output = process.communicate(timeout=30)[0]
     assert process.returncode == 130
     assert "the same command goes on" in output
@@ -260,7 +260,7 @@ def test_a_record_that_is_missing_or_half_written_is_made_again(write, tmp_path)
     run_panel(path, out=out, workers=1)
     before, trial = files(out), min((out / "trials").iterdir())
     whole = trial.read_bytes()
-    trial.rename(f"{trial}.partial")  # as a process that is killed while it writes leaves it
+    trial.rename(f"{trial}.partial")  # as left by a process that is killed while writing
     begun = len(logged(path))
     run_panel(path, out=out, workers=1)
     assert len(logged(path)) == begun + 1
@@ -424,7 +424,7 @@ def test_a_panel_and_its_trials_are_records(write, tmp_path):
         path = done.directory / "trials" / f"{row['id']}.json"
         assert dd.load_record(path).trial.result == {k: v for k, v in row.items() if k in ("cost", "error", "threads")}
         assert dd.verify(path).verdict == "intact"
-    (tmp_path / "trials").mkdir()  # a directory of that name need not be of a panel
+    (tmp_path / "trials").mkdir()  # a directory of this name that is not part of a panel
     (tmp_path / "trials" / "record.json").write_text("{}")
     assert [line.verdict for line in list_runs(tmp_path)] == ["unreadable"]
     listed = CliRunner().invoke(app, ["list", str(done.directory)])
@@ -433,7 +433,7 @@ def test_a_panel_and_its_trials_are_records(write, tmp_path):
 
 
 def sealed_again(path, **changes):
-    """Whoever changes a record can take its hash again."""
+    """Change fields of a record and update its hash."""
     fields = json.loads(path.read_bytes())
     for name, value in changes.items():
         section = next((fields[s] for s in ("trial", "panel") if fields[s] and name in fields[s]), fields)
@@ -442,7 +442,7 @@ def sealed_again(path, **changes):
 
 
 def files_again(directory):
-    """And the hashes of all files in the panel's record."""
+    """Update the hashes of all files in the panel's record."""
     dd.load_record(directory).write(directory)
 
 
@@ -503,7 +503,7 @@ def cell(name, successes, trials, cost=None, errors=0):
 
 
 def test_the_ranking_is_by_what_is_sure_and_says_what_cannot_be_told_apart():
-    """2 of 2 is less sure than 95 of 100 (Wilson: at least 0.34 against 0.89), and is not told apart from it."""
+    """Wilson's lower bound is 0.34 for 2 of 2 and 0.89 for 95 of 100, but the two cannot be distinguished."""
     cells = [cell("few", 2, 2), cell("dear", 95, 100, 3.0), cell("bad", 10, 100), cell("cheap", 95, 100, 1.0)]
     by, rows = ranked({"cells": cells})
     assert by.startswith("the lower end")

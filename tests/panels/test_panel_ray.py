@@ -1,4 +1,4 @@
-"""The same panel as tasks of a real Ray cluster on this machine, of one node and of two."""
+"""Tests of panels as tasks of a real Ray cluster on this machine, of one node and of two nodes."""
 
 import contextlib
 import os
@@ -41,7 +41,7 @@ def dies(trial):
     return {"cost": trial["level"]}
 """
 PANEL = 'evaluate = "trials.py:{}"\nseeds = 50\n[fixed]\nseconds = {}\n[axes]\nlevel = [1, 2, 3, 4]\n'
-# In a process of its own: Ray can be made to listen on loopback only where nothing has imported it before.
+# This runs in a process of its own, because Ray can be restricted to loopback only before its first import.
 KILLED = """
 import os, signal, sys, time
 from drake_diff.panels import run_panel
@@ -60,7 +60,7 @@ if __name__ == "__main__":
 
 @pytest.fixture(autouse=True)
 def token(monkeypatch):
-    """A token for these clusters alone: without one Ray writes its own into the home directory."""
+    """Set a token for these clusters only. Without a token, Ray writes its own into the home directory."""
     monkeypatch.setenv("RAY_AUTH_MODE", "token")
     monkeypatch.setenv("RAY_AUTH_TOKEN", secrets.token_hex(32))
 
@@ -94,9 +94,9 @@ def test_a_cluster_of_which_a_worker_is_killed_gives_the_table_of_local_processe
     assert "of 2 workers one is killed" in done.stdout
     assert files(tmp_path / "ray") == files(tmp_path / "local")
     evaluated = [line.split(maxsplit=1) for line in (tmp_path / "log").read_text().splitlines()]
-    assert len({pid for pid, _ in evaluated}) == 3  # the two, and the one that took the place of the killed
+    assert len({pid for pid, _ in evaluated}) == 3  # two workers, and the replacement of the killed worker
     trials = [trial for _, trial in evaluated]
-    assert sorted(trials) == sorted([*set(trials), "2 10"])  # each once, and twice the one that was killed
+    assert sorted(trials) == sorted([*set(trials), "2 10"])  # each trial once, and the killed trial twice
     assert len(set(trials)) == 200
 
 
@@ -118,7 +118,7 @@ def test_a_cluster_that_is_not_there_is_refused(write, tmp_path):
 
 @pytest.fixture
 def start_node(monkeypatch):
-    """Starts a node of two cores on this machine; the first one is the head, at the address that is returned."""
+    """Return a function that starts a node of two cores; it returns the node and the address of the first, the head."""
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -139,7 +139,7 @@ def start_node(monkeypatch):
 
 
 def processes(node):
-    """All of a node, by their session; `-ww`: not cut at the columns of a terminal."""
+    """Return (pid, command) of the processes in a node's session; `-ww` prevents a cut at the terminal's width."""
     listed = subprocess.run(
         ["ps", "-ww", "-o", "pid=,args=", "-s", str(node.pid)], capture_output=True, text=True
     ).stdout
@@ -203,7 +203,7 @@ def in_log(folder):
 
 
 def test_a_node_that_is_killed_takes_no_trial_with_it(tmp_path, start_node):
-    """Of two nodes of a cluster: every trial ends once, those of the killed one too, and the table is the same."""
+    """After one of two nodes is killed, every trial ends once, also on the killed node, and the table is the same."""
     (tmp_path / "trials.py").write_text(NODES)
     (tmp_path / "panel.toml").write_text('evaluate = "trials.py:slow"\nseeds = 30\n[axes]\nlevel = [1, 2, 3, 4]\n')
     (_, address), (other, _) = start_node("head"), start_node("other")
@@ -211,7 +211,7 @@ def test_a_node_that_is_killed_takes_no_trial_with_it(tmp_path, start_node):
     command = [sys.executable, "-m", "drake_diff.cli.main", *words]
     done = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     wait_for(lambda: sum(node == "other" for node, *_ in in_log(tmp_path)) >= 10 or done.poll() is not None, 180)
-    done.send_signal(signal.SIGSTOP)  # so that the node ends trials whose rows nobody has fetched
+    done.send_signal(signal.SIGSTOP)  # so that the node ends trials whose rows are not fetched
     (tmp_path / "stopped").touch()
     time.sleep(3)
     kill(other)
@@ -221,7 +221,7 @@ def test_a_node_that_is_killed_takes_no_trial_with_it(tmp_path, start_node):
     log = in_log(tmp_path)
     started = [tuple(trial) for _, *trial in log]
     assert len(set(started)) == 120
-    # Only what the killed node still held, or was at, began again.
+    # Only trials that the killed node was evaluating, or whose rows it still stored, began again.
     again = {trial for trial in started if started.count(trial) > 1}
     assert again
     assert all(started.count(trial) == 2 for trial in again)

@@ -1,4 +1,4 @@
-"""Ways around obstacles: what is in the way is named, and what is found is clear by closed forms of two links."""
+"""Tests of paths around obstacles. Errors name the obstacle, and paths are clear by the closed form of two links."""
 
 from itertools import pairwise
 
@@ -34,14 +34,14 @@ SLIDE = """<robot name="slide"><link name="base"/><link name="block"><inertial><
 
 @pytest.fixture
 def arm(tmp_path):
-    """Two links of 0.5 m in the plane of x and z, hanging at 0, both of capsules."""
+    """Write an arm of two capsule links of 0.5 m in the x-z plane, which hangs down at 0."""
     path = tmp_path / "arm.urdf"
     path.write_text(ARM)
     return path
 
 
 def distance(qs, center):
-    """(K,) [m] of the two links' surfaces from a point, by their angles qs (K, 2): Pythagoras on two segments."""
+    """Return the distances (K,) [m] of the two links' surfaces from a point at the angles qs (K, 2)."""
     found = []
     for shoulder, elbow in qs:
         ends = [np.zeros(2)]
@@ -56,7 +56,7 @@ def distance(qs, center):
 
 
 def test_a_line_is_bent_around_a_disk_that_the_straight_one_meets(arm):
-    """From hanging to the right with the elbow straight, past a ball 0.95 m below at 0.4 rad: the elbow has to fold."""
+    """With the elbow straight the arm hits a ball at 0.95 m from the shoulder and 0.5 rad, so the elbow has to fold."""
     robot, angle = load_robot(arm, 0), 0.5
     center = -0.95 * np.array([np.sin(angle), 0, np.cos(angle)])
     ball = dd.SphereObstacle(center, 0.08)
@@ -71,7 +71,7 @@ def test_a_line_is_bent_around_a_disk_that_the_straight_one_meets(arm):
         fine = line.at(np.linspace(0, 1, 2000))
         assert fine[0] == pytest.approx(robot.q, abs=1e-12)
         assert fine[-1] == pytest.approx(target, abs=1e-12)
-        # the margin, less what a line may lose between the postures that are looked at: 0.04 rad of a metre, halved
+        # the margin, minus the possible loss between the postures that are checked: half of 0.04 rad at 1 m
         assert np.min(distance(fine, center)) >= 0.08 + 0.01 - 0.02
         assert np.max(np.abs(fine[:, 1])) > 0.3
 
@@ -102,7 +102,7 @@ def test_a_hand_goes_around_a_ball_and_the_plan_is_clear_by_the_closed_form(arm,
     assert done.success, done.lines
     times = np.linspace(0, done.solution.horizon, 1 + round(1000 * done.solution.horizon))
     qs = done.solution.transcribed.at(times)[0][:, :2]
-    assert np.min(distance(qs, center)) >= 0.08 + 0.01 - 0.001  # the margin, and what may be used of it between knots
+    assert np.min(distance(qs, center)) >= 0.08 + 0.01 - 0.001  # between knots, a part of the margin may be used
     assert "SphereObstacle" in done.lines[3]
 
 
@@ -125,7 +125,7 @@ def test_what_no_way_leads_around_is_named_before_it_is_solved(avoid, message, a
 
 @pytest.mark.slow
 def test_a_least_time_is_that_of_full_force_one_way_and_then_the_other(tmp_path):
-    """A slide of 2 kg, 4 N, from 0 to 0.5 m: T = 2 sqrt(d m / F), to what intervals and a tolerance cost."""
+    """A slide of 2 kg with 4 N moves 0.5 m in T = 2 sqrt(d m / F). Intervals and a tolerance add up to 2 %."""
     path = tmp_path / "slide.urdf"
     path.write_text(SLIDE.format(limits='effort="4" velocity="100"'))
     done = plan(path, goals={"slide": 0.5}, time="least", out=tmp_path / "out")

@@ -1,4 +1,4 @@
-"""`drake-diff plan`: from a file to a verified plan; what is wrong is one sentence and a status."""
+"""Tests of `drake-diff plan`, from a file to a verified plan. An error is one sentence and an exit status."""
 
 import sys
 
@@ -38,7 +38,7 @@ SLIDE = """<robot name="slide"><link name="base"/><link name="block"><inertial><
 
 @pytest.fixture
 def arm(tmp_path):
-    """A two-link arm as textbooks write it: no motor, and a base that floats in Drake."""
+    """Write a two-link arm as in textbooks, without motors, whose base floats in Drake."""
     path = tmp_path / "arm.urdf"
     path.write_text(ARM)
     return path
@@ -53,11 +53,11 @@ def test_a_textbook_arm_is_mended_planned_for_and_verified(arm, tmp_path):
     assert (tmp_path / "out" / "report.html").is_file()
     assert dd.verify(tmp_path / "out").holds
     end = read_trace(tmp_path / "out" / "trace.mcap").xs[-1]
-    assert end[:2] == pytest.approx([0.0, 0.5], abs=0.025)  # what a replay in other steps may be off: 5 % of its way
+    assert end[:2] == pytest.approx([0.0, 0.5], abs=0.025)  # 5 % of the way: the replay has other steps
 
 
 def test_the_inputs_of_a_smooth_guess_make_that_motion(arm):
-    """The recursion of Newton and Euler, stepped by Drake: to rounding of the state after 30 to 100 steps."""
+    """Inputs from the Newton-Euler recursion, stepped by Drake, give the guess to rounding after 30 to 100 steps."""
     robot = load_robot(arm, 0)
     guess = along(robot, PostureLine("line", np.array([robot.q, [0.7, -0.4]])))
     motion = dd.rollout(guess.model, guess.xs[0], guess.us)
@@ -73,7 +73,7 @@ def test_a_robot_that_is_not_fully_driven_goes_where_its_motors_can_bring_it(tmp
 
 @pytest.mark.slow
 def test_a_goal_that_cannot_be_reached_in_time_is_not_called_a_plan(tmp_path):
-    """At 0.05 m/s a slide moves 0.3 m in the longest motion that is tried, and it is asked for 0.9."""
+    """At 0.05 m/s a slide moves 0.3 m in the longest motion that is tried, and the goal is 0.9 m."""
     (tmp_path / "slide.urdf").write_text(SLIDE)
     done = drake_diff("plan", "slide.urdf", "--goal", "slide=0.9", "--out", "out", cwd=tmp_path)
     assert done.returncode == 1, done.stdout + done.stderr
@@ -81,7 +81,7 @@ def test_a_goal_that_cannot_be_reached_in_time_is_not_called_a_plan(tmp_path):
 
 
 def test_a_hand_goes_where_it_is_asked_to(arm, tmp_path):
-    """Two links of 0.5 m; the elbow is the only frame with a link before it, on a circle of 0.5 m."""
+    """The links are 0.5 m long. The frame of the lower link is at the elbow, on a circle of 0.5 m."""
     done = plan(arm, goals={"lower": [-0.3, 0.0, -0.4]}, out=tmp_path / "out")
     assert done.success, done.lines
     shoulder = done.solution.xs[-1][0]
@@ -129,7 +129,7 @@ def test_bad_words_are_one_sentence_and_status_2(words, message, arm, tmp_path, 
 
 
 def test_what_nothing_drives_is_refused(tmp_path):
-    """A ball joint takes no motor, and what hangs on it does not float."""
+    """A ball joint cannot have a motor, and a body on a joint does not float."""
     path = tmp_path / "ball.sdf"
     path.write_text(
         '<sdf version="1.9"><model name="ball"><link name="ball"/><joint name="hangs" type="ball">'
@@ -141,7 +141,7 @@ def test_what_nothing_drives_is_refused(tmp_path):
 
 @pytest.mark.slow
 def test_a_panda_brings_its_hand_to_a_place(tmp_path):
-    """The hand's place by Drake's own kinematics of the last state, which no part of the search computed."""
+    """Drake's forward kinematics of the last state gives the hand's position, independently of the search."""
     done = plan(example_files()["panda"], goals={"panda_hand": [0.4, 0.3, 0.5]}, out=tmp_path / "out")
     assert done.success, done.lines
     plant = done.solution.problem.model.plant

@@ -1,4 +1,4 @@
-"""Bodies that float and that nothing drives, such as a drone's base in a URDF, fly by thrusters that `plan` adds."""
+"""Tests of floating bodies without actuators, such as a drone's base in a URDF, to which `plan` adds thrusters."""
 
 import numpy as np
 import pytest
@@ -21,21 +21,21 @@ BOX = """<sdf version="1.9"><model name="scene">
 
 @pytest.fixture
 def box(tmp_path):
-    """A box of 3 kg whose centre of mass is not its origin, and that begins half in the ground."""
+    """Write a box of 3 kg that starts half in the ground, and whose centre of mass is not its origin."""
     path = tmp_path / "box.sdf"
     path.write_text(BOX)
     return path
 
 
 def test_thrusters_push_and_turn_a_body_in_every_direction(box):
-    """The wrench of each about the centre of mass by hand: r x f, in the body's frame."""
+    """The wrench of each thruster about the centre of mass is r x f and f, in the body's frame."""
     model = load_robot(box, 0).model
     wrenches = []
     for thruster in model.body_forces:
         force = np.array(thruster.direction)
         wrenches.append(np.append(np.cross(np.array(thruster.point) - [0.1, 0.02, 0.0], force), force))
         assert thruster.upper == -thruster.lower == pytest.approx(1.5 * 3 * 9.81, rel=2e-3)  # three digits
-    assert np.linalg.svd(np.array(wrenches), compute_uv=False)[-1] > 0.1  # the arm is 0.15 m
+    assert np.linalg.svd(np.array(wrenches), compute_uv=False)[-1] > 0.1  # the lever arm is 0.15 m
     assert np.sum(wrenches, axis=0) == pytest.approx([0, 0, 0, 2, 2, 2], abs=1e-12)
 
 
@@ -72,7 +72,7 @@ def test_what_floats_without_a_mass_is_refused(tmp_path):
 @pytest.mark.slow
 @pytest.mark.long
 def test_a_quadrotor_of_mjcf_flies_by_its_own_rotors(tmp_path):
-    """Four motors of sites, which push upward alone: it tilts on its way, and hovers at the end."""
+    """Four motors at sites push only upward, so the quadrotor tilts on its way, and it hovers at the end."""
     rotors = {"a": (0.14, 0.18, 0.02), "b": (0.14, -0.18, -0.02), "c": (-0.14, -0.18, 0.02), "d": (-0.14, 0.18, -0.02)}
     sites = "".join(f'<site name="{name}" pos="{x} {y} 0.05"/>' for name, (x, y, _) in rotors.items())
     motors = "".join(
@@ -90,5 +90,5 @@ def test_a_quadrotor_of_mjcf_flies_by_its_own_rotors(tmp_path):
     assert us.min() >= 0
     assert us.max() <= 13
     assert np.linalg.norm(xs[-1, 4:7] - [1.5, 0.0, 1.2]) < 5e-3
-    assert np.abs(xs[:, 1:4]).max() > 0.02  # it tilts
+    assert np.abs(xs[:, 1:4]).max() > 0.02  # the quadrotor tilts
     assert us[-1].sum() == pytest.approx(1.3 * 9.81, rel=0.3)

@@ -1,4 +1,4 @@
-"""What a stranger's file may hold that a plan has to mend: weak motors, shapes that always overlap, slow joints."""
+"""Tests of models that `plan` has to correct: weak motors, shapes that always overlap, slow joints."""
 
 import dataclasses
 
@@ -38,20 +38,20 @@ def robot(tmp_path, *parts):
 
 
 def outstretched(tmp_path, effort):
-    """An arm of 1 kg that points along x at 0, 0.25 m out: it needs 2.45 N m there, and sin(q) of that elsewhere."""
+    """Write an arm of 1 kg at 0.25 m along x, which needs a torque of 2.45 N m at 0, and cos(q) of this at q."""
     limit = f'lower="-1.6" upper="1.6" effort="{effort}" velocity="3"'
     return robot(tmp_path, link("arm", at="0.25 0 0"), joint("shoulder", "world", "arm", limit=limit))
 
 
 def test_a_plan_starts_where_the_motors_hold_the_robot(tmp_path):
     found = load_robot(outstretched(tmp_path, 1.0), 0)
-    assert abs(np.cos(found.q[0])) * G * 0.25 <= 0.63  # the gravity torque, by hand, of the limit of 1 N m
+    assert abs(np.cos(found.q[0])) * G * 0.25 <= 0.63  # the gravity torque relative to the limit of 1 N m
     assert "motors hold" in " ".join(found.repairs)
     assert plan(outstretched(tmp_path, 1.0), out=tmp_path / "out").success
 
 
 def test_a_joint_that_no_posture_relieves_is_fixed_and_told(tmp_path):
-    """A vertical slide carries 9.81 N wherever it is, and its motor has 5 N."""
+    """The weight on a vertical slide is the same in every posture, and it is more than the motor's 5 N."""
     slide = joint(
         "slide",
         "world",
@@ -67,7 +67,7 @@ def test_a_joint_that_no_posture_relieves_is_fixed_and_told(tmp_path):
 
 
 def test_only_shapes_that_overlap_in_every_posture_are_not_looked_at(tmp_path):
-    """The hand is inside the collar for good, two links before it; the forearm meets the post only where it is bent."""
+    """The hand is always inside the collar, two links before it. The forearm meets the post at some angles only."""
     ball = '<sphere radius="0.05"/>'
     limit = 'lower="-3" upper="3" effort="50" velocity="3"'
     path = robot(
@@ -86,7 +86,7 @@ def test_only_shapes_that_overlap_in_every_posture_are_not_looked_at(tmp_path):
     found = load_robot(path, 0)
     assert found.always == {("collar/skin", "hand/skin")}
     assert found.shapes is not None
-    assert found.overlap(np.zeros(found.model.nq)) == 0  # though the hand is in the collar
+    assert found.overlap(np.zeros(found.model.nq)) == 0  # although the hand is in the collar
     angle = np.arctan2(-0.3, 0.5)  # the forearm's ball is 0.6 m from the shoulder, the post's 0.583 m
     bent = np.zeros(found.model.nq)
     bent[found.model.position_names.index("shoulder_q")] = angle
@@ -115,7 +115,7 @@ FOLLOWER = '<mimic joint="lead" multiplier="{ratio}" offset="0"/>'
 
 
 def test_a_joint_that_its_followers_hold_is_fixed(tmp_path):
-    """It may go from 0 to 1, its follower too and the other way: nothing but 0 is left."""
+    """The joint has the limits [0, 1], and so has its follower, which turns the other way. Only 0 is possible."""
     limit = 'lower="0" upper="1" effort="50" velocity="3"'
     path = robot(
         tmp_path,
@@ -151,7 +151,7 @@ def test_a_robot_of_joints_without_a_way_to_go_is_refused(tmp_path):
 
 
 def test_a_plan_whose_record_would_not_hold_is_none(tmp_path, monkeypatch):
-    """The first attempt is said to miss a metric: the next one is tried, and both are told."""
+    """The first attempt is made to fail a metric. The next one is tried then, and both are reported."""
     from drake_diff.planning import planner
     from drake_diff.runs.measurement import measure
 
@@ -173,7 +173,7 @@ def test_a_plan_whose_record_would_not_hold_is_none(tmp_path, monkeypatch):
 
 
 def test_a_cart_in_its_rails_goes_without_contact(tmp_path):
-    """The cart is inside the rail for good, which would brake it, and touches nothing else on its way."""
+    """The cart is always inside the rail, which would brake it, and touches nothing else on its way."""
     pole = joint("hinge", "cart", "pole", limit='lower="-9" upper="9" effort="0" velocity="20"')
     motor = (
         '<transmission><type>transmission_interface/SimpleTransmission</type><joint name="slide"><hardwareInterface>'
@@ -201,7 +201,7 @@ LIMIT_OF_THE_SLIDE = 'lower="-1" upper="1" effort="20" velocity="5"'
 
 
 def test_a_robot_that_can_go_nowhere_is_refused_and_not_planned_for(tmp_path):
-    """Two balls that overlap but for 0.01 rad about the start: a plan that stays there would be none."""
+    """The balls overlap except within 0.01 rad of the start. A plan that stays at the start is not accepted."""
     ball = '<sphere radius="0.25"/>'
     posts = [
         part

@@ -1,6 +1,6 @@
-"""`tests/benchmarks/acceptance.py`: `compare` fails where something is lost, `stable` drops what two runs differ in.
+"""Tests of `tests/benchmarks/acceptance.py`: `compare` fails on lost results, `stable` drops results that differ.
 
-As a subprocess: nothing in tests/ imports from tests/benchmarks/.
+The program is a subprocess, because nothing in tests/ imports from tests/benchmarks/.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""The gate's count of the project: each limit fails when a tree is above it."""
+"""Tests of `.ci/budget.py`: a count above its limit is a failure."""
 
 import pytest
 from helpers.models import script

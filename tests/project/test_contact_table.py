@@ -1,4 +1,4 @@
-"""The contact table of examples/studies: its closed forms, and every engine against them."""
+"""Tests of the contact table of examples/studies: its closed forms, and every engine against them."""
 
 import re
 from math import cos, log, radians, sin, sqrt
@@ -58,7 +58,7 @@ def test_the_restitution_of_hunt_and_crossley_solves_its_equation(d, height):
 
 
 def test_without_gravity_in_contact_the_law_of_hunt_and_crossley_has_its_restitution():
-    """The stiffer, the less gravity does while it touches: g / (v omega) is 3e-5."""
+    """The effect of gravity during a stiff contact is small: g / (v omega) is 3e-5."""
     case = Case("z", 1e-3, 200, stiffness=1e9, dissipation=0.3, height=0.05)
     assert TABLE.bounce_by_law("drake:lagged", case).value == pytest.approx(
         TABLE.rigid_answer("damped bounce", case).value, rel=1e-3
@@ -67,7 +67,7 @@ def test_without_gravity_in_contact_the_law_of_hunt_and_crossley_has_its_restitu
 
 @pytest.mark.slow
 def test_values_are_those_by_hand_and_by_drake_alone(found):
-    """Stop and slide as Drake alone gave them, stepped without this package; rest m g / k and roll by formula."""
+    """Stop and slide are from Drake without this package. Rest is m g / k, and roll is from a formula."""
     stop = {
         "drake": (0.0967120, 0.1926076),
         "drake:similar": (0.0967701, 0.1951943),
@@ -79,7 +79,7 @@ def test_values_are_those_by_hand_and_by_drake_alone(found):
         assert found["slide", engine].value == pytest.approx(value, abs=6e-6)  # five digits
     for engine in ENGINES:
         assert found["rest", engine].value == pytest.approx(G / 1e4, rel=1e-5)
-        r_e = 0.1 - G * cos(radians(20)) / 2e5  # it rolls on the point half way down the overlap
+        r_e = 0.1 - G * cos(radians(20)) / 2e5  # the ball rolls on the point at half of the overlap
         rolls = G * sin(radians(20)) / (1 + 0.4 * (0.1 / r_e) ** 2)
         assert found["roll", engine].value == pytest.approx(rolls, rel=1e-5)
         assert found["roll", engine].gradient == pytest.approx(1 / (1 + 0.4 * (0.1 / r_e) ** 2), rel=1e-5)
@@ -87,7 +87,7 @@ def test_values_are_those_by_hand_and_by_drake_alone(found):
 
 @pytest.mark.slow
 def test_friction_that_slides_is_mu_times_the_normal_force_in_every_engine():
-    """Summed over the steps: v_x + mu v_z = v_0 + g (sin a - mu cos a) t, whatever the normal force does."""
+    """The sum over the steps is v_x + mu v_z = v_0 + g (sin a - mu cos a) t, for any normal force."""
     needs("mujoco")
     case = CASES["slide"]
     for engine in ENGINES:
@@ -97,7 +97,7 @@ def test_friction_that_slides_is_mu_times_the_normal_force_in_every_engine():
 
 @pytest.mark.slow
 def test_a_bounce_has_the_height_of_the_engines_law_and_a_gradient_that_misses_the_jump(found):
-    """A damper's force jumps at touch; a product of step Jacobians has not even the sign of its law's derivative."""
+    """A damper's force jumps at first contact. The product of step Jacobians has the opposite sign."""
     for engine in ENGINES:
         for name, tolerance in (("bounce", 5e-3), ("damped bounce", 1e-2)):  # h sqrt(k / m) is 0.02
             law = TABLE.bounce_by_law(engine, CASES[name])
@@ -127,7 +127,7 @@ DOCUMENTED = {
     "rebound height": ("damped bounce", "value"),
     "derivative of the height": ("damped bounce", "gradient"),
 }
-SMALLEST_TOLD = 1e-6  # of the rigid answer: what is nearer to it is left by solvers, and differs between versions
+SMALLEST_TOLD = 1e-6  # of the rigid answer: smaller differences come from solvers, and vary between versions
 
 
 @pytest.mark.slow
@@ -151,7 +151,7 @@ def test_the_table_in_the_documents_is_this_table(found):
 
 
 def test_the_rebound_is_read_at_any_step_of_the_flight():
-    """z + v^2 / (2 g) - h v / 2 is kept by semi-implicit Euler: an apex in steps, known from each of them."""
+    """Semi-implicit Euler conserves z + v^2 / (2 g) - h v / 2, so the apex is known at each step."""
     case, h = CASES["bounce"], CASES["bounce"].time_step
     z, v, heights = 0.1, 0.8, []
     for _ in range(100):
@@ -163,6 +163,6 @@ def test_the_rebound_is_read_at_any_step_of_the_flight():
 
 
 def last_digit(told):
-    """What one unit of the last digit of a number's text is worth."""
+    """Return the value of one unit of the last digit in a number's text."""
     mantissa, _, exponent = re.match(r"[-+]?([.\d]+)(e?)([-+]?\d*)", told).groups()
     return 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))

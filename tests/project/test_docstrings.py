@@ -1,4 +1,4 @@
-"""Every public function and class says what it takes and gives, and its example runs."""
+"""Tests that public functions and classes document their arguments and results, and that their examples run."""
 
 import doctest
 import importlib
@@ -21,7 +21,7 @@ OF_QUANTITIES = ["center_of_mass", "contact_force", "frame_position", "frame_rot
 
 
 def public():
-    """Each public function and class once, by its full name."""
+    """Return each public function and class once, by its full name."""
     found = {f"dd.{name}": getattr(dd, name) for name in dd.__all__}
     found |= {f"dd.quantities.{name}": getattr(quantities, name) for name in OF_QUANTITIES}
     for room in ROOMS:
@@ -36,11 +36,11 @@ def public():
 
 PUBLIC = public()
 FUNCTIONS = {name: value for name, value in PUBLIC.items() if inspect.isfunction(value)}
-EXAMPLES = {*FUNCTIONS, *(name for name in PUBLIC if name.startswith("dd."))}  # of what a user calls or makes
+EXAMPLES = {*FUNCTIONS, *(name for name in PUBLIC if name.startswith("dd."))}  # these need an example
 
 
 def described(text):
-    """The names that open an entry of a docstring's Args, where one entry may be of several."""
+    """Return the argument names in a docstring's Args, where one entry may have several names."""
     section = re.split(r"^\w+:$", text.partition("\nArgs:\n")[2], flags=re.MULTILINE)[0]
     entries = re.findall(r"^ {4}([*\w]+(?:, [*\w]+)*):", section, flags=re.MULTILINE)
     return {name.lstrip("*") for entry in entries for name in entry.split(", ")}

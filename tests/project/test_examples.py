@@ -1,4 +1,4 @@
-"""The examples do what their texts say."""
+"""Tests that the examples do what their texts say."""
 
 import dataclasses
 import importlib.util
@@ -32,19 +32,19 @@ def solved(module, problem=None):
 
 
 def test_the_cart_pole_swings_up_near_the_continuous_optimum():
-    """From u = 0 it leads to the local optimum whose cost without time steps is 58.8077 N^2 s (Hermite-Simpson at 50
-    and 100 intervals agree on it); another of 57.9448 is known. Semi-implicit Euler is first order: 1% at h = 0.02 s.
+    """From u = 0 the solution is the local optimum with cost 58.8077 N^2 s in continuous time (Hermite-Simpson at 50
+    and 100 intervals). Another optimum has 57.9448. Semi-implicit Euler is of first order: 1 % at h = 0.02 s.
     """
     module = example("cart_pole_swing_up")
     solution = solved(module)
     assert solution.cost == pytest.approx(58.8077, rel=0.01)
-    assert np.abs(solution.replay.xs[-1] - [1, np.pi, 0, 0]).max() < 1e-8  # the simulator itself arrives
+    assert np.abs(solution.replay.xs[-1] - [1, np.pi, 0, 0]).max() < 1e-8  # in the simulation
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("vx", slow_after(1, [3.7, 0.3]))  # short of the target and beyond
+@pytest.mark.parametrize("vx", slow_after(1, [3.7, 0.3]))  # beyond the target and short of it
 def test_the_projectiles_three_gradients_agree(vx):
-    """By hand d loss / d vx = (x_T - 6) * 3.0 with x_T = 3 vx."""
+    """The closed form is d loss / d vx = (x_T - 6) * 3.0 with x_T = 3 vx."""
     module = example("projectile_hits_target")
     model = dd.load_model(module.MODEL, time_step=module.TIME_STEP)
     by_hand = (3 * vx - 6) * 3.0
@@ -84,7 +84,7 @@ def test_the_sphere_rolls_to_where_it_is_sent():
 
 @pytest.mark.slow
 def test_the_ball_is_pushed_from_a_guess_that_never_touches_it():
-    """The goal is hard: 1e-8 of the solver, 1e-5 the package's measure, here on the true plant's own rollout."""
+    """The goal is a hard constraint: 1e-8 for the solver, 1e-5 for the package, on the plant's own rollout."""
     module = example("push_without_touching")
     solution = solved(module)
     assert solution.replay.xs[-1][module.BALL] == pytest.approx(module.GOAL, abs=1e-7)
@@ -118,7 +118,7 @@ def test_the_hidden_parameters_are_found():
 
 @pytest.mark.slow
 def test_the_cart_pole_stands_again_after_pushes_and_how_fast_is_told():
-    """What it takes depends on the machine: only what is said of it is checked, on latencies that are given."""
+    """The latency depends on the machine, so only the message is checked, with given latencies."""
     module = example("mpc_under_pushes")
     controller, problem, loop, steps = module.cart_pole()
     run = module.run((controller, problem, loop, steps))
@@ -142,7 +142,7 @@ def test_the_panda_arrives_although_it_is_pushed(tmp_path):
         case = module.panda(module.panda_file(tmp_path))
     run, problem = module.run(case), case[1]
     change = np.abs(np.diff(run.motion.xs[:, 7:], axis=0)).max(axis=1)
-    assert change[20] > 10 * change[19]  # at 0.4 s it is hit
+    assert change[20] > 10 * change[19]  # it is pushed at 0.4 s
     assert np.abs(problem.goal_error(run.motion.xs[-1])).max() < 1e-3
     assert np.all(np.abs(run.commands) <= problem.bounds.u_upper)
 
@@ -150,7 +150,7 @@ def test_the_panda_arrives_although_it_is_pushed(tmp_path):
 @pytest.mark.slow
 @pytest.mark.long
 def test_a_quadrotor_flies_through_its_gates_and_its_record_holds(tmp_path):
-    """The plan passes each gate as the replays do, in finer steps too; verify builds the rotors again."""
+    """The plan and its replays pass each gate, also in finer steps, and verify builds the rotors again."""
     module = example("quadrotor_gates")
     solution = solved(module)
     for knot, gate in module.GATES.items():
@@ -173,7 +173,7 @@ def test_a_quadrotor_flies_through_its_gates_and_its_record_holds(tmp_path):
 
 @pytest.mark.slow
 def test_the_acrobot_stands_and_its_elbow_keeps_its_limit():
-    """The plan itself; on the plant it is followed under feedback, in the shortest steps within 5 % of a turn."""
+    """Check the plan. On the plant, with feedback and the shortest steps, its end is within 5 % of a turn."""
     module = example("acrobot_swing_up")
     solution = solved(module)
     assert solution.xs[-1] == pytest.approx(module.UPRIGHT, abs=1e-6)
@@ -185,13 +185,13 @@ def test_the_acrobot_stands_and_its_elbow_keeps_its_limit():
 
 @pytest.mark.slow
 def test_the_load_of_the_crane_sways_no_more_than_it_may():
-    """In every open-loop replay too; without the limit it sways more, and the same way costs less."""
+    """All replays keep the limit too. Without the limit the load sways more, and the motion costs less."""
     module = example("crane_without_sway")
     solution, free = dd.solve(module.problem()), dd.solve(module.problem(np.pi))
     assert solution.success, solution.message
     assert free.success, free.message
     for replay in solution.replays:
-        assert np.abs(replay.motion.xs[:, 1]).max() < module.SWAY + 2e-3  # [rad] what steps of 20 ms are off
+        assert np.abs(replay.motion.xs[:, 1]).max() < module.SWAY + 2e-3  # [rad] the error of steps of 20 ms
         assert replay.motion.xs[-1] == pytest.approx([1, 0, 0, 0], abs=0.01)
     assert np.abs(free.xs[:, 1]).max() > 1.5 * module.SWAY
     assert free.cost < solution.cost
@@ -200,7 +200,7 @@ def test_the_load_of_the_crane_sways_no_more_than_it_may():
 @pytest.mark.slow
 @pytest.mark.long
 def test_the_hand_of_the_panda_reaches_its_target_around_the_ball():
-    """By Drake's own kinematics: where the hand is in the end, and where the links' frames are on the way."""
+    """Drake's forward kinematics gives the hand's final position and the links' frames along the path."""
     module = example("panda_around_a_ball")
     solution = solved(module)
     model = solution.problem.model
@@ -221,7 +221,7 @@ def test_the_pushed_cart_pole_stands_again():
     problem = module.problem()
     solution = solved(module, problem)
     stands = solution.xs[module.UP :] - [1, np.pi, 0, 0]
-    assert np.abs(stands).max() < 0.05  # [m, rad, m/s, rad/s] it falls a little and comes back, for no force at all
+    assert np.abs(stands).max() < 0.05  # [m, rad, m/s, rad/s] it falls slightly and returns, without any force
     controller = dd.loop.MPC(problem, horizon=30, plan=solution)
     push = dd.loop.Push("pole", [0.3, 0, 0], 1.0)
     run = dd.loop.closed_loop(problem.model, controller, problem.x0, problem.num_steps, dd.loop.Loop(pushes=[push]))
@@ -235,7 +235,7 @@ def test_the_ball_bounces_into_its_target(capsys):
     module.main()
     text = capsys.readouterr().out
     assert text.startswith("converged")
-    assert "on the ground from 0.60 to 0.62 s" in text  # once
+    assert "on the ground from 0.60 to 0.62 s" in text  # only once
 
 
 @pytest.mark.slow
@@ -251,7 +251,7 @@ def test_the_hopper_flies_and_stands_half_a_metre_on():
 
 @pytest.mark.slow
 def test_two_fingers_hold_the_box_up_by_its_sides():
-    """At the end nothing is under it, and what carries it are two forces at its sides, within their friction cones."""
+    """At the end the box is carried only by two forces at its sides, within their friction cones."""
     module = example("grasp_and_lift")
     solution = solved(module)
     for found in solution.replay.contacts[-5:]:
@@ -259,13 +259,13 @@ def test_two_fingers_hold_the_box_up_by_its_sides():
         for contact in found:
             across = abs(contact.normal[0])
             assert across > 0.99
-            assert np.linalg.norm(contact.force[1:]) < 0.85 * abs(contact.force[0])  # 0.8, and what it leans
+            assert np.linalg.norm(contact.force[1:]) < 0.85 * abs(contact.force[0])  # friction of 0.8, plus the tilt
     assert solution.replay.xs[-1][1] == pytest.approx(module.HEIGHT, abs=0.01)  # the goal's tolerance
 
 
 @pytest.mark.slow
 def test_the_ball_flies_out_of_the_cup_into_its_target():
-    """After the cup it touches nothing and flies a parabola, in Drake's steps z = z_0 + v t - g t (t + h) / 2."""
+    """After the cup the ball has no contact and flies a parabola, in Drake's steps z = z_0 + v t - g t (t + h) / 2."""
     module = example("throw_into_target")
     solution = solved(module)
     xs, h = solution.replay.xs, module.TIME_STEP
@@ -276,14 +276,14 @@ def test_the_ball_flies_out_of_the_cup_into_its_target():
     place, velocity = xs[flies][3:5], xs[flies][9:11]
     parabola = place + np.outer(t, velocity) - np.outer(t * (t + h) / 2, [0, module.GRAVITY])
     assert np.allclose(xs[flies:, 3:5], parabola, atol=1e-9)
-    assert np.linalg.norm(place - module.TARGET) > 0.5  # beyond the arm's reach from where it lets go
+    assert np.linalg.norm(place - module.TARGET) > 0.5  # beyond the arm's reach from the release point
 
 
 @pytest.mark.slow
 @pytest.mark.long
 @each_row("name, way", [("quadruped_jump", 0.06), ("quadruped_trot", 0.12)])
 def test_the_quadruped_goes_as_its_schedule_says_and_its_record_holds(name, way, tmp_path):
-    """Where a foot is said to stand it is on the ground, where not over it, by Drake's own kinematics."""
+    """By Drake's own kinematics, a foot is on the ground if the schedule says so, and above the ground if not."""
     module = example(name)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
@@ -297,7 +297,7 @@ def test_the_quadruped_goes_as_its_schedule_says_and_its_record_holds(name, way,
         model.plant.SetPositions(context, solution.xs[knot - steps // 2, : model.nq])
         for foot in module.FEET:
             body = model.plant.GetBodyByName(foot)
-            height = model.plant.EvalBodyPoseInWorld(context, body).translation()[2] - 0.025  # its radius
+            height = model.plant.EvalBodyPoseInWorld(context, body).translation()[2] - 0.025  # the foot's radius
             assert (height < 1e-6) == (foot in standing)
     dd.save(solution, tmp_path / name)
     assert dd.verify(tmp_path / name, time_limit=600).verdict == "holds"
@@ -306,10 +306,10 @@ def test_the_quadruped_goes_as_its_schedule_says_and_its_record_holds(name, way,
 @pytest.mark.slow
 @pytest.mark.long
 def test_the_leg_that_is_designed_jumps_by_a_design_inside_its_bounds():
-    """Found with its torques: no length and no stiffness is at a bound, and every replay of its torques is a jump."""
+    """The design and its torques are found together. No length or stiffness is at a bound, and every replay jumps."""
     module = example("jumping_leg")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ModelWarning)  # the linkage is told
+        warnings.simplefilter("ignore", ModelWarning)  # about the linkage
         problem = module.problem()
     solution = solved(module, problem)
     lower, upper = problem.bounds_of_parameters()
@@ -317,16 +317,16 @@ def test_the_leg_that_is_designed_jumps_by_a_design_inside_its_bounds():
     inside = (solution.parameters - lower)[moves] / (upper - lower)[moves]
     assert np.all((inside > 0.1) & (inside < 0.9))
     replays = [replay for replay in solution.replays if replay.control == "open loop"]
-    assert all(replay.holds and replay.motion.xs[-1][0] > 0.5 for replay in replays)  # [m] half of what is out of reach
+    assert all(replay.holds and replay.motion.xs[-1][0] > 0.5 for replay in replays)  # [m] half of the 1 m out of reach
 
 
 @pytest.mark.slow
 @pytest.mark.long
 def test_the_policy_lands_and_rests_at_its_height_and_its_plan_can_be_verified(tmp_path):
-    """From heights that it was not trained on too; what is saved is its own motion, to the last input."""
+    """The policy also lands from heights outside its training. The saved plan is its own motion, to the last input."""
     module = example("landing_policy")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", GradientWarning)  # a height of the fall at which a touch begins at a knot
+        warnings.simplefilter("ignore", GradientWarning)  # at one height, a contact begins at a knot
         weights = module.train(16)
     for height in module.DROPS + module.UNSEEN:
         assert module.fall(dd.rollout, weights, height).xs[-1][0] == pytest.approx(module.HEIGHT, abs=0.03)
@@ -334,8 +334,8 @@ def test_the_policy_lands_and_rests_at_its_height_and_its_plan_can_be_verified(t
     assert solution.success, solution.message
     own = module.fall(dd.rollout, weights, module.DROPS[0])
     assert solution.us == pytest.approx(own.us, abs=1e-6)
-    assert not own.contacts[0]  # it falls
-    assert own.contacts[-1]  # and stands
+    assert not own.contacts[0]  # in the air
+    assert own.contacts[-1]  # on the ground
     dd.save(solution, tmp_path / "run")
     assert dd.verify(tmp_path / "run").verdict == "holds"
 
@@ -343,14 +343,14 @@ def test_the_policy_lands_and_rests_at_its_height_and_its_plan_can_be_verified(t
 @pytest.mark.slow
 @pytest.mark.long
 def test_the_tossed_cube_has_its_published_size_and_is_predicted_better_than_by_hand(tmp_path, monkeypatch, capsys):
-    """Half of 104.8 mm to 1 %, as a caliper would say, from tosses whose fall says how long the cameras' metre is."""
+    """Half of the width of 104.8 mm is found to 1 %, from tosses whose free fall gives the scale of the cameras."""
     monkeypatch.chdir(tmp_path)
     module = example("tossed_cube")
     module.main()
     text = capsys.readouterr().out
     assert float(re.search(r"Half its width is ([\d.]+) mm", text)[1]) == pytest.approx(52.4, rel=0.01)
     metre = float(re.search(r"a recorded metre is ([\d.]+) m", text)[1])
-    assert metre == pytest.approx(52.4 / 51.24, abs=0.01)  # by the height of its centre where it lies still
+    assert metre == pytest.approx(52.4 / 51.24, abs=0.01)  # from the height of its centre at rest
     by_hand, identified = (float(e) for e in re.findall(r"Tosses not used, .*?: ([\d.]+) %", text))
     assert identified < by_hand
     record = dd.load_record(tmp_path / "artifacts" / "tossed_cube" / "impacts")

@@ -1,4 +1,4 @@
-"""The gallery: its page, its scripts and pictures, and the command that runs, verifies and draws each example."""
+"""Tests of the gallery: its page, scripts and pictures, and the command that runs, verifies and draws an example."""
 
 import importlib.util
 

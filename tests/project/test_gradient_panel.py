@@ -1,4 +1,4 @@
-"""The gradient panel of examples/studies: first and zeroth order against closed forms and theory."""
+"""Tests of the gradient panel of examples/studies: first and zeroth order against closed forms and theory."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ PANEL = script("examples/studies/gradient_panel.py")
     ),
 )
 def test_the_wall_has_the_bias_of_its_jumps(theta, value, gradient, bias):
-    """F and dF/dx by SciPy's `quad`, split at the jumps; the bias is minus each jump times the density there."""
+    """F and dF/dx are from SciPy's `quad`, split at the jumps. The bias is minus each jump times the density at it."""
     case = PANEL.wall(sigmas=(0.05,), start=theta)
     F, slope, _ = PANEL.truth_of(case, case.start, 0.05)
     assert (F, slope[0]) == pytest.approx((value, gradient), rel=1e-8)
@@ -54,21 +54,21 @@ def test_a_doubled_derivative_is_biased_and_the_derivative_itself_is_not():
 
 @pytest.mark.slow
 def test_the_smoothed_push_is_that_of_coulombs_law():
-    """A second engine: Coulomb's x = max(0, u - mu m g) h^2 N (N + 1) / 2 m, smoothed by quadrature."""
+    """Coulomb's x = max(0, u - mu m g) h^2 N (N + 1) / 2 m, smoothed by quadrature, is independent of Drake."""
     case, h, steps, sigma = PANEL.push(), 0.02, 20, 2.0
-    nodes, weights = np.polynomial.hermite_e.hermegauss(200)  # a kink is smoothed to 1e-3 by so many nodes
+    nodes, weights = np.polynomial.hermite_e.hermegauss(200)  # with so many nodes, a kink is smoothed to 1e-3
     reach = h**2 * steps * (steps + 1) / 2
     loss = 10 * (np.maximum(0, 2 + sigma * nodes - 4.905) * reach - 0.3) ** 2
     gradient = weights @ (loss * nodes) / weights.sum() / sigma
     value, slope, error = PANEL.truth_of(case, case.start, sigma, 400)
     assert value == pytest.approx(weights @ loss / weights.sum(), abs=0.1)  # 5 standard errors
     assert abs(slope[0] - gradient) < 5 * error[0] + 2e-3  # Drake's friction creeps by 1e-4 m
-    assert abs(case.derivative(case.start)[0]) < 1e-3 * abs(gradient)  # below friction there is nothing to follow
+    assert abs(case.derivative(case.start)[0]) < 1e-3 * abs(gradient)  # below the friction limit, the gradient vanishes
 
 
 @pytest.mark.slow
 def test_on_stiff_ground_the_jumps_of_the_step_turn_the_sign_of_first_order():
-    """The truth by the trapezoid rule over 401 heights, which needs neither derivatives nor samples."""
+    """The reference is the trapezoid rule over 401 heights, which needs neither derivatives nor samples."""
     case, sigma = PANEL.bounce(1e5), 0.01
     w = np.linspace(-5, 5, 401) * sigma
     f = np.array([case.f(case.start + a) for a in w])
@@ -98,7 +98,7 @@ def test_stiffness_and_a_long_chaotic_horizon_make_first_order_vary_and_zeroth_h
 
 @each_row("name", PANEL.CASES)
 def test_the_derivative_of_every_case_is_that_of_its_loss(name):
-    """Away from jumps, by central differences; of the stiff contact, which SAP solves to 1e-6, in flight."""
+    """Compare with central differences away from jumps; for stiff contact, which SAP solves to 1e-6, in flight."""
     case = PANEL.CASES[name]()
     x = {"bounce_k1e3": [0.33], "bounce_k1e5": [0.35], "push": [7.0], "wall": [0.8]}.get(name, case.start + 0.01)
     for i, entry in enumerate(case.derivative(np.array(x))):

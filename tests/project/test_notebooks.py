@@ -1,4 +1,4 @@
-"""The notebooks of the course run from their first cell to their last, and are kept without what they print."""
+"""Tests that the notebooks of the course run from the first cell to the last, and are stored without output."""
 
 import json
 import shutil
@@ -28,7 +28,7 @@ def test_a_notebook_is_kept_without_its_output(path):
 
 
 def run(path, folder):
-    """What nbmake says of a copy of the notebook."""
+    """Run nbmake on a copy of the notebook and return the process."""
     shutil.copy(path, folder)
     command = [sys.executable, "-m", "pytest", "--nbmake", "--nbmake-timeout=600", "-p", "no:cacheprovider", path.name]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=900)

@@ -1,4 +1,4 @@
-"""The README's code prints what the README says, and what the documents name is there."""
+"""Tests that the README's code prints the README's output, and that files and numbers in documents are right."""
 
 import importlib
 import math
@@ -39,12 +39,12 @@ def test_every_file_that_a_document_names_is_there(path):
     named = re.findall(r"(?:examples|models|tests|docs)(?:/\w+)*/\w+\.\w+", text)
     linked = [link for link in re.findall(r"\]\(([^)#]+)\)", text) if "://" not in link]
     assert not [name for name in named if not (ROOT / name).is_file()]
-    made = re.compile(r"reference/|changelog|contributing")  # pages of the site that are written when it is built
+    made = re.compile(r"reference/|changelog|contributing")  # pages that are written when the site is built
     assert not [link for link in linked if not ((path.parent / link).is_file() or made.match(link))]
 
 
 def bouncing_ball(made):
-    """Without loss or gravity. What touches, its first state, and of what the derivative is."""
+    """Add a ball without loss or gravity; return contact properties, initial state and the derivative's index."""
     skin = contact_properties(2e4, 0.0, 0.5, 0.0)
     made.plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
     made.ball("ball", 1.0, 0.1, skin, "z")
@@ -52,7 +52,7 @@ def bouncing_ball(made):
 
 
 def tossed_cube(made):
-    """Its corners are small balls."""
+    """Add a cube with small balls at its corners; return the same as `bouncing_ball`."""
     skin = contact_properties(4e3, 0.5, 0.5, 0.0)
     made.plant.mutable_gravity_field().set_gravity_vector([0, 0, -2])
     cube = made.plant.AddRigidBody("cube", SpatialInertia.SolidBoxWithMass(0.1, 0.1, 0.1, 0.1))
@@ -70,7 +70,7 @@ def motion(build, time_step):
 
 
 def slope_by_differences(build):
-    """By Drake's error-controlled integration of the continuous plant, extrapolated."""
+    """Return the extrapolated slope of Drake's error-controlled integration of the continuous plant."""
     made, x0, of = motion(build, 0.0)
     made.plant.Finalize()
     end, last = error_controlled_end(made.plant, made.builder.Build(), 1.0), np.eye(len(x0))[-1]
@@ -100,7 +100,7 @@ def test_the_table_of_a_bounce_and_a_toss():
         assert row == [f"{value:.4g}" for value in values]
 
 
-# Of each document the numbers that are a constant of the package, as "module:name"; of 5 % also as a part.
+# The numbers in each document that are constants of the package, as "module:name". 5 % may be 5 or 0.05.
 SAP = "drake_diff.model.contract:SAP_RELATIVE_TOLERANCE"
 CONSTANTS = {
     "docs/index.md": {"60": "drake_diff.runs.verify:WAITED"},

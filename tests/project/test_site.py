@@ -1,4 +1,4 @@
-"""The code of the documentation site runs and prints what stands below it. `.ci/run` builds the site."""
+"""Tests that the code of the documentation site runs and prints the text below it. `.ci/run` builds the site."""
 
 import re
 import runpy
@@ -15,7 +15,7 @@ DOCS = ROOT / "docs"
 BLOCK = re.compile(
     r"^(?:```python\n(.*?)^```\n(?:\n```text\n(.*?)^```\n)?|<!-- python\n(.*?)^-->\n)", re.MULTILINE | re.DOTALL
 )
-LONG = ("contact_plans.md", "identification.md", "loop.md", "methods.md")  # they solve more than a pendulum
+LONG = ("contact_plans.md", "identification.md", "loop.md", "methods.md")  # these solve more than a pendulum
 PAGES = [
     pytest.param(path, marks=[pytest.mark.slow] if path.name in LONG else [], id=str(path.relative_to(DOCS)))
     for path in sorted(DOCS.rglob("*.md"))
@@ -30,7 +30,7 @@ def script(name):
 
 @pytest.mark.parametrize("page", PAGES)
 def test_the_code_of_a_page_runs_and_prints_what_stands_below_it(page, tmp_path, monkeypatch, capsys):
-    """All blocks of a page in one go, in a folder with the models of the package and a recording."""
+    """Run all blocks of a page in sequence, in a folder with the models of the package."""
     for model in [*(ROOT / "models").iterdir(), ROOT / "drake_diff/model/robots/panda.urdf"]:
         shutil.copy(model, tmp_path)
     monkeypatch.chdir(tmp_path)
@@ -42,7 +42,7 @@ def test_the_code_of_a_page_runs_and_prints_what_stands_below_it(page, tmp_path,
 
 
 def test_a_link_that_leads_nowhere_and_what_would_be_fetched_are_found(tmp_path):
-    """A site of two pages: one link holds, and each of the others is told."""
+    """In a site of two pages, valid links pass, and each of the other links is reported."""
     links = script("links")
     (tmp_path / "a.html").write_text('<a href="sub/b.html#here">b</a> <a href="https://drake.mit.edu">Drake</a>')
     (tmp_path / "sub").mkdir()
@@ -77,7 +77,7 @@ def test_the_pictures_of_contact_models_are_those_that_the_command_draws(tmp_pat
     shown = re.findall(r"\(pictures/(\w+)\.svg\)", (DOCS / "contact_models.md").read_text())
     assert shown == list(pictures.PICTURES)
     assert all((DOCS / f"pictures/{name}.svg").is_file() for name in shown)
-    pictures.draw("contact_shapes", tmp_path)  # the one that simulates nothing
+    pictures.draw("contact_shapes", tmp_path)  # this picture needs no simulation
     assert (tmp_path / "contact_shapes.svg").read_text().startswith("<?xml")
 
 

@@ -1,4 +1,4 @@
-"""How the tests are laid out: what several modules share is in `helpers` or, as fixtures, in conftest.py."""
+"""Tests of the layout of the tests: shared code is in `helpers`, and shared fixtures are in conftest.py."""
 
 import ast
 from pathlib import Path
@@ -13,7 +13,7 @@ PROGRAMS = {path.stem for path in BENCHMARKS.glob("*.py")} - {"__main__"} | {"be
 
 
 def imported(text):
-    """The parts of the names of all that is imported, inside of functions too."""
+    """Return the parts of the names of all imports, also inside functions."""
     names = []
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
