@@ -1,4 +1,4 @@
-"""The audit names what cannot be differentiated, or will be differentiated wrongly, before anything runs."""
+"""The audit names the parts of a model that cannot be differentiated, or not correctly, before a run starts."""
 
 import resource
 import warnings
@@ -37,14 +37,14 @@ def codes(findings, *severities):
 
 
 def only(findings, code):
-    """The one finding with that code."""
+    """Return the finding with the code `code`, and check that it is the only one."""
     found = [f for f in findings if f.code == code]
     assert len(found) == 1, [str(f) for f in findings]
     return found[0]
 
 
 def given(hydroelastic=None):
-    """Contact properties with nothing left to defaults."""
+    """Return contact properties that set every value explicitly."""
     properties = contact_properties(1e4, 1.0, 0.5, 0.01)
     if hydroelastic == "compliant":
         AddCompliantHydroelasticProperties(0.02, 1e7, properties)
@@ -54,7 +54,7 @@ def given(hydroelastic=None):
 
 
 def pair(upper, lower, height, *, compliance=(None, None), contact_model="point", tilt=(0, 0, 0), ground=(0, 0, 0)):
-    """A free body of shape `upper` at `height`, turned by `tilt` (roll, pitch, yaw); `lower` fixed, its top z = 0."""
+    """Build a free body `upper` at `height`, turned by `tilt` (roll, pitch, yaw), over a fixed `lower`, top z = 0."""
     plant = Plant(0.01, "sap", contact_model)
     body = plant.plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
     below = 0.0 if isinstance(lower, HalfSpace) else -0.1
@@ -69,7 +69,7 @@ def pair(upper, lower, height, *, compliance=(None, None), contact_model="point"
 
 
 def block(limit=np.inf, gains=None, start=0.0):
-    """1 kg on a vertical actuated rail; the weight is 9.81 N."""
+    """Build a block of 1 kg (a weight of 9.81 N) on a vertical actuated rail."""
     plant = Plant(0.01)
     body = plant.plant.AddRigidBody("block", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
     joint = add_slide(plant.plant, "lift", plant.plant.world_frame(), body, "z")
@@ -80,7 +80,7 @@ def block(limit=np.inf, gains=None, start=0.0):
     return plant
 
 
-# `ground=0.7` gives friction, not how soft it is; an ankle and a hip follow a knee, for `mimic="reduce"`
+# `ground=0.7` sets the friction but no compliance. In the jumper, the ankle and the hip are mimic joints of the knee.
 FOUND = {"quadruped.urdf": {"default_decides"}, "jumper.sdf": {"mimic_joint"}}
 
 
@@ -104,7 +104,7 @@ def test_a_bad_point_is_refused(load):
 
 
 def test_a_chain_of_many_links_is_audited_within_a_limit_of_memory():
-    """With AutoDiffXd a step of it takes 2.4 GB."""
+    """A step of this chain with AutoDiffXd takes 2.4 GB."""
     plant = Plant(0.01)
     parent = plant.plant.world_frame()
     for i in range(400):
@@ -149,7 +149,7 @@ BOX, CYLINDER, BALL, TABLE, DISC = (
 
 
 def over(upper, lower, height, *, beside=0.0, **options):
-    """As `pair`, moved along x by `beside`."""
+    """Build the model of `pair` with the upper body moved along x by `beside`."""
     model, x = pair(upper, lower, height, **options)
     x[4] = beside
     return model, x
@@ -161,7 +161,7 @@ def not_placed():
     return model, x
 
 
-# What is audited; the code, its severity (None where there is no such finding), and words of it.
+# The model and state to audit, the code, the severity (None if no finding is expected), and a part of the message.
 CASES = {
     "box flat on box": (lambda: over(BOX, TABLE, 0.0995, **HYDROELASTIC), "aligned_faces", "error", "wrong number"),
     "... 0.3 m above": (lambda: over(BOX, TABLE, 0.4, **HYDROELASTIC), "aligned_faces", "warning", "0.3 m apart"),
@@ -232,7 +232,7 @@ def test_pairs_that_autodiff_takes_and_what_collides_with_nothing_have_no_findin
 
 
 def test_a_box_above_a_tilted_half_space_is_refused_without_touching():
-    """20 cm of air below the box; the half space's bounding box is infinite as soon as it is tilted."""
+    """The box is 20 cm above the half space, whose bounding box is infinite as soon as it is tilted."""
     model, x = pair(Box(0.2, 0.2, 0.2), HalfSpace(), 0.3, ground=(0.2, 0, 0))
     found = only(audit(model, x), "pair_refused")
     assert (found.severity, found.subject) == ("error", "body - world")
@@ -299,7 +299,7 @@ def test_a_pair_that_the_table_takes_but_drake_refuses_is_still_found(monkeypatc
     assert "Penetration queries between shapes 'Box' and 'Box'" in found.message
 
 
-# 2. and 3. What drake_diff takes care of
+# 2. and 3. Properties that drake_diff handles itself
 
 
 def test_pd_gains_whose_target_the_diagram_feeds_are_told():
@@ -327,7 +327,7 @@ def test_an_identity_frame_is_told_and_another_is_not():
 
 
 def test_nearly_aligned_faces_are_a_warning():
-    """Measured: a box at 1e-3 rad on a rigid half space is not certified."""
+    """Measurement shows that a box tilted by 1e-3 rad on a rigid half space is not certified."""
     compliance = {"compliance": ("compliant", "rigid"), "contact_model": "hydroelastic_with_fallback"}
     model, x = pair(Box(0.2, 0.2, 0.2), HalfSpace(), 0.0965, tilt=(1e-3, 0, 0.4), **compliance)
     found = only(audit(model, x), "aligned_faces")
@@ -337,7 +337,7 @@ def test_nearly_aligned_faces_are_a_warning():
 
 
 def slope_by_height_is_right(model, x):
-    """d vz / d z by AutoDiffXd and by steps of 1e-4 m, which tell it to 1 %: Drake's solver stops at 1e-6 m/s."""
+    """Compare d vz / d z from AutoDiffXd with differences over 1e-4 m (1 % accurate: the solver stops at 1e-6 m/s)."""
     dx = 1e-4 * np.eye(model.nx)[6]
     slope = (dd.step(model, x + dx) - dd.step(model, x - dx))[-1] / 2e-4
     return dd.differentiate_step(model, x, method="autodiff").A[-1, 6] == pytest.approx(slope, rel=2e-2)
@@ -346,7 +346,7 @@ def slope_by_height_is_right(model, x):
 @pytest.mark.slow
 @pytest.mark.parametrize("lower", [Cylinder(0.2, 0.2), Box(1, 1, 0.2)])
 def test_a_sphere_over_a_flat_mesh_is_aligned_only_in_its_planes_of_symmetry(lower):
-    """The meshes' edges lie on each other there: certify says the same."""
+    """In these planes the edges of the two meshes coincide. `certify` confirms that the step is not smooth."""
     model, x = pair(Sphere(0.1), lower, 0.095, **HYDROELASTIC)
     assert only(audit(model, x), "aligned_faces").severity == "error"
     assert dd.certify(model, x, method="autodiff").verdict == "discontinuous"
@@ -415,7 +415,7 @@ def test_a_diagram_without_an_autodiff_form_is_an_error():
     assert "cannot be converted to AutoDiffXd" in found.message
 
 
-# 8. Numbers that nobody chose
+# 8. Contact parameters left at their defaults
 
 
 def ball_over_ground(properties, **options):
@@ -448,7 +448,7 @@ def test_a_modulus_from_the_scene_graphs_config_is_named():
     assert "defaults apply: hydroelastic_modulus 1e+07 Pa" in found.message
 
 
-# 9. and 10. Constraints, limits, touch
+# 9. and 10. Constraints and limits
 
 
 def test_constraints_and_locked_joints_are_told():

@@ -1,4 +1,4 @@
-"""The audit names what a user trips over in a robot file and what mends it, and is silent where all is well."""
+"""The audit names common faults of robot files with a remedy, and reports nothing for a correct file."""
 
 import re
 import warnings
@@ -76,7 +76,7 @@ GRASP = (
 
 
 def audited(tmp_path, text, **options):
-    """What the audit of that file says, by its codes."""
+    """Return the audit findings of the model file with the content `text`, keyed by their codes."""
     from trimesh import creation  # takes long to import
 
     name = {"<r": "m.urdf", "<s": "m.sdf", "<m": "m.xml"}[text[:2]]
@@ -146,7 +146,7 @@ FILES = {
     "switched_off": MJCF.format('<option><flag contact="disable"/></option>', "", ""),
     "never_apart": sdf(""),
 }
-# The code, the severity, the file and options in which it is found, words of it, and what mends it.
+# The code, the severity, the file, the options, a pattern of the message, and the options that remove the finding.
 TRAPS = [
     ("no_actuator", "warning", "no_actuator", {}, "hinge.*no actuator for any of the 1 joints", {"actuators": "all"}),
     ("massless_root", "error", "massless_root", {}, r"base\): it floats and has no mass", {"base": "weld"}),
@@ -278,7 +278,7 @@ def test_a_trap_is_named_and_its_remedy_mends_it(tmp_path, code, severity, text,
         (FREE, {"ground": 0.5}),
         (FREE, {"base": "weld"}),
         (FREE, {"gravity": [0, 0, 0]}),
-        (sdf("", "", "<limit><effort>0</effort></limit>"), {}),  # passive, as SDF says it
+        (sdf("", "", "<limit><effort>0</effort></limit>"), {}),  # in SDF an effort limit of 0 marks a passive joint
         (GRASP, {"actuators": "all", "contact_geometry": "differences"}),
         (
             '<mujoco><worldbody><geom type="plane" size="9 9 1"/><body><freejoint/><geom size="0.1" mass="1"/>'
@@ -296,7 +296,7 @@ def test_a_right_model_has_no_trap(tmp_path, text, options):
 
 
 def test_a_block_falls_out_of_corner_spheres_and_stays_between_boxes(tmp_path):
-    """What the finding corners_miss warns of: fingers press 20 N on a block of 1 kg, friction 0.5 on two faces."""
+    """Two fingers press with 20 N on a block of 1 kg with friction 0.5: the failure that `corners_miss` warns of."""
     (tmp_path / "m.urdf").write_text(GRASP)
     heights = {}
     for route in ("differences", "corner_spheres"):

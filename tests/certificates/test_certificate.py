@@ -1,4 +1,4 @@
-"""The certificate: agrees where the derivative is right, and in no other case."""
+"""The certificate agrees if the derivative is right, and in no other case."""
 
 import dataclasses
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.solve
 
 
 def smooth(n, seed=0):
-    """A smooth function R^n -> R^n and its Jacobian."""
+    """Return a smooth function R^n -> R^n and its Jacobian."""
     random = np.random.default_rng(seed)
     M = random.standard_normal((n, n)) / np.sqrt(n)
     return lambda x: np.sin(M @ x) + 0.1 * x**2, lambda x: np.cos(M @ x)[:, None] * M + np.diag(0.2 * x)
@@ -46,7 +46,7 @@ def test_a_right_jacobian_agrees_and_one_entry_1_percent_off_is_caught(n):
 
 @pytest.mark.parametrize("minus", [np.subtract, lambda a, b: a - b])
 def test_a_sweep_of_a_parabola_in_closed_form(minus):
-    """f = [3 x + x^2, y]: forward quotients 3 + h and 1, backward 3 - h and 1."""
+    """The forward quotients of f = [3 x + x^2, y] are 3 + h and 1, the backward quotients 3 - h and 1."""
     sweep = sweep_of(lambda d: np.stack([3 * d[:, 0] + d[:, 0] ** 2, d[:, 1]], axis=1), 2, (0.5, 0.25), minus=minus)
     assert sweep.centre == pytest.approx([0, 0], abs=0)
     assert sweep.forward == pytest.approx(np.array([[[3.5, 0], [0, 1]], [[3.25, 0], [0, 1]]]), abs=1e-15)
@@ -112,11 +112,11 @@ def step_beside(distance):
         *[(step_beside(d), 1.0, "agree") for d in (1e-6, 1e-4, 1e-2)],
         *[(step_beside(d), 1.0, "discontinuous") for d in (2e-8, 1e-7)],
         *[(step_beside(d), 1.01, "disagree") for d in (1e-6, 1e-4, 1e-2)],
-        # friction that turns round within 1e-7, as a smooth curve does: beyond it the slope is 1
+        # smoothed friction that changes its sign within 1e-7: at larger distances the slope is 1
         (lambda v: v + np.tanh(v / 1e-7), 1 + 1e7, "discontinuous"),
         (lambda v: v + np.tanh(v / 1e-7) + 1e3, 1 + 1e7, "discontinuous"),
         (lambda v: v + np.tanh(v / 1e-7), -1.0, "undecided"),
-        # contact that begins within the width, of a stiffness of 1e4: a kink, which is no jump
+        # contact with a stiffness of 1e4 that begins within the step sizes: a kink, but no jump
         (lambda z: z + 1e4 * np.maximum(z - 1e-5, 0), 1.0, "agree"),
         (lambda z: z + 1e4 * np.maximum(z - 3e-8, 0), 1.0, "undecided"),
     ],
@@ -126,7 +126,7 @@ def test_a_derivative_that_is_right_over_the_smallest_widths_alone_is_discontinu
 
 
 def test_a_derivative_that_jumps_beside_the_point_is_caught():
-    """Zero at the point only, like Drake's on a cylinder's axis: differences agree by symmetry."""
+    """The derivative is 0 at the point only, like Drake's on a cylinder's axis, where differences are 0 by symmetry."""
     assert verdict(lambda x: x**2, lambda x: np.array([[0.0 if x[0] == 0 else 6.5]])) == "discontinuous"
 
 
@@ -136,7 +136,7 @@ def test_pure_noise_is_not_passed():
 
 
 def test_what_a_value_at_rest_does_not_depend_on_is_known_and_one_wrong_entry_is_seen():
-    """cos(x0) at 0 has no slope at all: beside it x1 counts, which changes nothing to the last bit."""
+    """cos(x0) has the slope 0 at 0 and does not depend on x1: the values are identical to the last bit."""
 
     def f(x):
         return np.array([np.cos(x[0]), x[1]])
@@ -153,7 +153,7 @@ def test_what_a_value_at_rest_does_not_depend_on_is_known_and_one_wrong_entry_is
 
 
 def test_a_large_offset_that_hides_the_derivative_is_undecided():
-    """Next to 1e15 the rounding of the value is 0.1: no step resolves a slope of 1."""
+    """A value near 1e15 has a rounding error of 0.1, so that no step size resolves a slope of 1."""
     certificate = certify_jacobian(lambda x: 1e15 + x, [0.0], [[1.0]])
     assert certificate.verdict == "undecided"
     with pytest.raises(CertificateError, match="undecided"):
@@ -161,7 +161,7 @@ def test_a_large_offset_that_hides_the_derivative_is_undecided():
 
 
 def test_what_a_solver_leaves_unsolved_is_no_jump():
-    """A value rounded to 1e-8 looks like steps; with the solver's tolerance known, the slope is seen."""
+    """A value rounded to 1e-8 looks like a staircase, but the slope is found if the solver's tolerance is given."""
     rounded = lambda x: np.round(np.sin(x) * 1e8) / 1e8  # noqa: E731
     assert verdict(rounded, float(np.cos(0.3)), x=0.3, solver_tolerance=1e-6) == "agree"
     assert verdict(rounded, 1.01 * float(np.cos(0.3)), x=0.3, solver_tolerance=1e-6) != "agree"
@@ -207,7 +207,7 @@ def test_a_ball_in_contact_is_certified_at_random_states(load, approximation):
     for _ in range(8):
         x = random_state(model, random, size=0.5)
         x[6] = 0.1 - random.uniform(0.0005, 0.002)
-        x[12] *= 0.1  # leaving at 1 m/s, 1 / dissipation, lagged contact is between touching and not
+        x[12] *= 0.1  # lagged contact breaks at a separation speed of 1 / dissipation, 1 m/s, and is not smooth
         dd.certify(model, x).require()
 
 
@@ -249,7 +249,7 @@ def test_a_rollout_that_starts_at_touchdown_is_refused(load):
 
 @each_row("unit", [1e-6, 1.0, 1e6])
 def test_jitter_is_told_in_every_unit(unit):
-    """One entry that is another number beside the point; one that is too, below a millionth of its row's largest."""
+    """Two entries differ at a distance of 1e-9, but the last is below a millionth of the row's largest entry."""
     a, beside = unit * np.array([[1.0, 1.0, 1e-8]]), unit * np.array([[1.0, 1.5, 3e-8]])
     found = judge(look_around(lambda d: d @ a.T, 3), a, beside)
     assert found.reasons == {(0, 1): f"at a distance of 1e-9 from the point the derivative is {1.5 * unit:.6g}"}
@@ -275,10 +275,10 @@ def test_stairs_are_discontinuous_whatever_is_claimed_and_the_jumps_are_told(nam
 
 
 def test_a_difference_of_nearly_equal_numbers_is_no_staircase():
-    """Two thrusts at their limit turn nothing: what rounding moves them by is more than the rounding of the turn."""
+    """The moments of two equal thrusts cancel: rounding the thrusts has more effect than rounding their difference."""
     slope = np.zeros((2, 8))
     slope[0, 0], slope[1, 6], slope[1, 7] = 1, 50, -50
-    for seed in (*range(10), 51, 293):  # the last two were called staircases once
+    for seed in (*range(10), 51, 293):  # the last two were once reported as staircases
         random = np.random.default_rng(seed)
         x = random.standard_normal(8)
         x[6:] = 5.54382 + random.standard_normal(2) * 10 ** random.uniform(-8, -6)
@@ -305,7 +305,7 @@ def test_the_reason_of_a_discontinuity_is_told_with_numbers(f, reason):
 
 @each_row("f", [lambda v: np.abs(v) ** 1.5, lambda v: v**2, lambda v: v - v * np.abs(v)])
 def test_drag_at_rest_has_a_slope_and_is_certified(f):
-    """One-sided quotients part as the root of their step, or as it: there is no corner."""
+    """The gap between one-sided quotients shrinks like the step or its square root, so that there is no corner."""
     slope = float(f(1e-12) - f(-1e-12)) / 2e-12
     assert verdict(f, slope) == "agree"
     assert verdict(f, slope + 1e-3) == "disagree"
@@ -320,7 +320,7 @@ def test_a_function_is_judged_alike_in_every_unit(scale):
 
 
 def test_the_scatter_of_the_values_says_how_small_an_error_would_be_noticed():
-    """Values that scatter by e leave the slope open by about e over the widest step, 1e-2."""
+    """A scatter e of the values makes the slope uncertain by about e / 1e-2, where 1e-2 is the largest step."""
     powers = []
     for scatter in (1e-12, 1e-9, 1e-7, 1e-4):
         f = lambda x, e=scatter: np.sin(x) + e * np.sin(1e12 * x)  # noqa: E731
@@ -336,7 +336,7 @@ def test_the_scatter_of_the_values_says_how_small_an_error_would_be_noticed():
 
 
 def sliding(approximation, gains=None):
-    """A ball of 1 kg on slides along x and z that slides on ground of 1e6 N/m, pushed along both."""
+    """Build a ball of 1 kg on actuated prismatic joints along x and z that slides on ground of 1e6 N/m."""
     plant = Plant(0.001, approximation)
     plant.ball("ball", 1.0, 0.1, contact_properties(2e6, 0.1, 0.5, 0.01), "x", "z")
     plant.ground(contact_properties(2e6, 0.1, 0.5, 0.01))
@@ -353,7 +353,7 @@ def sliding(approximation, gains=None):
     [("lagged", None), ("sap", None), ("similar", None), ("sap", (10.0, 1.0)), ("lagged", (1e3, 10.0))],
 )
 def test_no_wrong_derivative_by_the_inputs_of_a_sliding_ball_is_passed(approximation, gains):
-    """1 mN for 1 ms moves the ball by 1e-6 m/s, about where Drake's solver stops."""
+    """A force of 1 mN for 1 ms changes the velocity by 1e-6 m/s, which is about the tolerance of Drake's solver."""
     model = sliding(approximation, gains)
     x, u = [0.0, 0.1 - 1e-5, 1.0, 0.01], [0.3, -0.2]
     d = dd.differentiate_step(model, x, u)
@@ -398,7 +398,7 @@ def test_1_percent_near_a_joint_limit_and_under_pd_control_is_found_and_named(na
 
 
 def test_steps_that_are_not_known_to_rounding_are_said_to_be_drakes_own_and_hide_less(monkeypatch):
-    """Nothing is known to be better than the solver's tolerance then, and what it would hide is undecided."""
+    """Without refined steps, errors that the tolerance of Drake's solver would hide are undecided."""
 
     def refused(model, vector, xs, us, values, held=None):
         n = len(xs)
@@ -422,14 +422,14 @@ def test_differences_that_are_certified_by_differences_are_said_to_share_the_met
 
 @pytest.mark.slow
 def test_motors_in_the_air_are_not_called_discontinuous():
-    """A third of these states was, by differences of 1e-12 between values that are all rounding."""
+    """A third of these states was once called discontinuous because of differences of 1e-12 between rounding errors."""
     model, random = example_robot("solo12.urdf"), np.random.default_rng(0)
     for _ in range(6):
         dd.certify(model, state_in_range(model, random), random.standard_normal(model.nu)).require()
 
 
 def test_a_motor_of_a_small_limit_is_probed_within_it(tmp_path):
-    """A mass of 20 mg that is pushed by 1e-10 N at most: dv' / du is h / m."""
+    """For a mass m of 20 mg with an effort limit of 1e-10 N, dv' / du is h / m."""
     (tmp_path / "slide.urdf").write_text(
         '<robot name="slide"><link name="rail"/><link name="block"><inertial><mass value="2e-5"/><inertia ixx="1e-12" '
         'iyy="1e-12" izz="1e-12" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="slide" type="prismatic">'
@@ -445,7 +445,7 @@ def test_a_motor_of_a_small_limit_is_probed_within_it(tmp_path):
 
 
 def test_a_product_that_is_zero_in_both_factors_is_smooth():
-    """As the rate of a quaternion at rest: beside the point its derivative is another number, of mixed derivatives."""
+    """As for the rate of a quaternion at rest, mixed second derivatives change the derivative near the point."""
     jacobian = lambda z: np.array([[z[1], z[0], 0.0], [0.0, 0.0, 3.0]])  # noqa: E731
     certificate = certify_jacobian(lambda z: np.array([z[0] * z[1], 3 * z[2]]), np.zeros(3), jacobian)
     certificate.require()
@@ -455,7 +455,7 @@ def test_a_product_that_is_zero_in_both_factors_is_smooth():
 
 
 def test_a_row_of_rounding_alone_is_zero():
-    """A moment that cancels leaves 1e-50 of a force of 10; a row a millionth of a millionth as large still counts."""
+    """A moment that cancels leaves 1e-50 next to a force of 10 and is ignored. A row of 1e-12 is still compared."""
     for size, verdict_of_zero in ((1e-50, "agree"), (1e-12, "disagree")):
         f = lambda x, size=size: np.array([10 * x[0], size * np.sin(x[1])])  # noqa: E731
         zero = np.array([[10.0, 0.0], [0.0, 0.0]])
@@ -464,7 +464,7 @@ def test_a_row_of_rounding_alone_is_zero():
 
 @each_row("unit", [1e-6, 1.0, 1e6])
 def test_a_derivative_that_is_the_rounding_of_terms_that_cancel_is_zero(unit):
-    """Two opposite thrusters of the same force, 3.3, and a derivative that adds both terms: 3e-15 beside 0."""
+    """The moments of two thrusters with the force 3.3 cancel: a derivative that adds both terms is 3e-15 and not 0."""
     f = lambda z: unit * np.array([np.sin(z[0]) * (z[1] - z[2]) / 10, z[0], z[1] + z[2]])  # noqa: E731
     for stated, expected in ((3e-15, "agree"), (3e-12, "disagree")):
         jacobian = unit * np.array([[stated, 0, 0], [1, 0, 0], [0, 1, 1]])
@@ -473,7 +473,7 @@ def test_a_derivative_that_is_the_rounding_of_terms_that_cancel_is_zero(unit):
 
 @pytest.mark.slow
 def test_the_exactly_optimal_slew_of_a_satellite_is_verified(tmp_path):
-    """By 90 degrees in 4 s: the least integral of the squares of two forces at 0.5 m is 24 I^2 angle^2 / T^3."""
+    """For 90 degrees in 4 s, two forces with lever arms of 0.5 m cost 24 I^2 angle^2 / T^3 (integral of squares)."""
     (tmp_path / "sat.sdf").write_text(
         '<sdf version="1.9"><model name="sat"><link name="bus"><inertial><mass>10</mass><inertia><ixx>0.4</ixx>'
         "<iyy>0.7</iyy><izz>0.9</izz></inertia></inertial></link></model></sdf>"
@@ -495,7 +495,7 @@ def test_the_exactly_optimal_slew_of_a_satellite_is_verified(tmp_path):
 
 
 def test_what_does_not_agree_at_a_joint_limit_says_so(tmp_path):
-    """A pendulum that rests exactly at its lower limit: pushed one way it moves, the other way it does not."""
+    """A pendulum that rests exactly at its lower joint limit can be pushed in one direction only."""
     (tmp_path / "arm.urdf").write_text(
         '<robot name="arm"><link name="rod"><inertial><origin xyz="0 0 -1"/><mass value="1"/>'
         '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="hinge" '
@@ -511,7 +511,7 @@ def test_what_does_not_agree_at_a_joint_limit_says_so(tmp_path):
 
 
 def test_a_derivative_that_jumps_where_terms_cancel_is_caught():
-    """The same with steps of 1e-5, which are no rounding."""
+    """Steps of 1e-5 in a difference of nearly equal numbers are too large to be rounding."""
     x = np.array([4.3, 4.3 + 1e-7])
 
     def steps(z):

@@ -1,4 +1,4 @@
-"""A look along a few random directions: what it passes is right, and what is wrong, or no slope, is left in doubt."""
+"""The check along a few random directions accepts right derivatives, and doubts wrong or undefined ones."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ WEIGHT = RANDOM.standard_normal((5, 8)) * 10.0 ** RANDOM.uniform(-3, 3, (5, 1)) 
 
 
 def bent(x):
-    """(K, 5) of (K, 8), whose Jacobian at 0 is WEIGHT; entries differ by nine orders of magnitude."""
+    """Map (K, 8) to (K, 5). The Jacobian at 0 is WEIGHT, whose entries differ by nine orders of magnitude."""
     return np.sin(x) @ WEIGHT.T + np.cos(x[:, :1] * x[:, 1:2])
 
 
@@ -40,7 +40,7 @@ def test_what_would_have_been_noticed_is_noticed():
     taken = look.taken(bent(look.displacements))
     assert np.all(taken.noticeable <= 0.01 * taken.size)
     random, seen = np.random.default_rng(5), 0
-    for _ in range(200):  # errors of all entries together, the size of each what matters
+    for _ in range(200):  # errors in all entries at once, each just significant
         error = 0.0101 * taken.size * random.choice([-1.0, 1.0], WEIGHT.shape)
         seen += replace(taken, derivative=WEIGHT + error).doubt() != ""
     assert seen == 200
@@ -51,7 +51,7 @@ def test_the_difference_of_one_wrong_entry_has_the_slopes_that_were_measured():
     wrong[2, 3] *= 2
     look = LookAt(wrong)
     taken = look.taken(bent(look.displacements))
-    # 1e-9 of the largest slope: the differences' own error
+    # the differences have an error of 1e-9 of the largest slope
     assert taken.difference @ look.directions.T == pytest.approx(WEIGHT @ look.directions.T, abs=1e-9 * 1e3)
 
 
@@ -59,17 +59,17 @@ def test_the_difference_of_one_wrong_entry_has_the_slopes_that_were_measured():
     "f, slope",
     [
         (lambda x: np.abs(x), 0.0),  # a corner
-        (lambda x: x + 0.02 * np.abs(x), 1.0),  # a small one
+        (lambda x: x + 0.02 * np.abs(x), 1.0),  # a small corner
         (lambda x: x + 1e-9 * (x > 0), 1.0),  # a jump
-        (lambda x: np.floor(x / 1e-7) * 1e-7, 1.0),  # stairs, by the slope over many
-        (lambda x: np.floor(x / 1e-7 + 0.5) * 1e-7, 0.0),  # by the slope of one
-        (lambda x: x + 1e-6 * np.floor(x / 1e-5 + 0.5), 1.0),  # the slope of stairs that rise more
-        (lambda x: np.floor(x / 1e-3 + 0.5) * 1e-3, 0.0),  # wide ones
-        (lambda x: x + np.maximum(x - 1e-6, 0.0), 1.0),  # a corner a millionth beside the point
+        (lambda x: np.floor(x / 1e-7) * 1e-7, 1.0),  # a staircase, with its average slope
+        (lambda x: np.floor(x / 1e-7 + 0.5) * 1e-7, 0.0),  # a staircase, with the slope of one stair
+        (lambda x: x + 1e-6 * np.floor(x / 1e-5 + 0.5), 1.0),  # a staircase that rises more than its stairs
+        (lambda x: np.floor(x / 1e-3 + 0.5) * 1e-3, 0.0),  # wide stairs
+        (lambda x: x + np.maximum(x - 1e-6, 0.0), 1.0),  # a corner at a distance of 1e-6
         (
             lambda x: 1e-3 * x + np.maximum(np.abs(x) - 1e-4, 0) * np.sign(x),
             1e-3,
-        ),  # flat beside far more, to both sides
+        ),  # a small slope between larger slopes on both sides
     ],
 )
 def test_what_has_no_slope_at_the_point_is_in_doubt(f, slope):
@@ -87,7 +87,7 @@ def test_a_column_of_zeros_is_zero():
 def test_a_wide_bend_and_a_far_corner_are_no_doubt():
     assert doubt(lambda x: x + 100 * x**2, [[1.0]]) == ""
     assert doubt(lambda x: x + np.maximum(x - 1e-3, 0.0), [[1.0]]) == ""  # a contact that begins farther away
-    assert doubt(lambda x: np.hstack([x[:, 1:] ** 2, x]), [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]) == ""  # a bowl
+    assert doubt(lambda x: np.hstack([x[:, 1:] ** 2, x]), [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]) == ""  # a parabola
 
 
 @pytest.mark.solve
@@ -134,10 +134,10 @@ def test_many_steps_agree_as_each_does():
         (lambda t: np.sin(t), False),
         (lambda t: t + np.maximum(t - 1e-3, 0.0), False),  # a contact that begins farther away
         (lambda t: t + (t > 2e-6), False),  # one jump is no staircase
-        (lambda t: t + np.maximum(t - 4e-8, 0.0), True),  # between the point and the first place on the line
-        (lambda t: t + np.maximum(-t - 3e-7, 0.0), True),  # to one side
+        (lambda t: t + np.maximum(t - 4e-8, 0.0), True),  # between the point and the first value on the line
+        (lambda t: t + np.maximum(-t - 3e-7, 0.0), True),  # a corner on one side
         (lambda t: t + 1e-9 * (t > 0), True),
-        (lambda t: np.floor(t / 1e-5 + 0.5) * 1e-5, True),  # longer stairs than the widths of a nearer look
+        (lambda t: np.floor(t / 1e-5 + 0.5) * 1e-5, True),  # stairs longer than the widths of the second look
         (lambda t: t + 1e-6 * np.floor(t / 1e-5 + 0.5), True),
     ],
 )
@@ -169,6 +169,6 @@ def test_a_ball_that_has_just_touched_passes_nearer_to_the_point_where_every_ent
     x = model.default_state
     x[:4], x[4:] = [1, 0, 0, 0], [0.75, 0.25, 0.1 - 1.57e-6, -1.65, 0.25, 1.22, -0.3, -0.8, 0]
     (found,) = certify_steps(model, x[None], np.zeros((1, 0)))
-    assert found.around is None  # no look at every entry was needed
+    assert found.around is None  # it was not necessary to compare every entry
     assert "beyond which something changes" in found.told
     assert found.verdict == certify_inside(model, x, np.zeros(0)).verdict == "agree"

@@ -1,4 +1,4 @@
-"""Gradients that equal differences and are wrong about the physics, and those that are right: h, h/2, h/4."""
+"""Refinement with h, h/2 and h/4 separates physically right gradients from those that only match differences."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.solve
 
 @pytest.fixture
 def bouncer(tmp_path):
-    """A ball on a vertical slide over a floor, without gravity and without dissipation."""
+    """Return a function that builds a ball on a vertical slide over a floor, without gravity and dissipation."""
 
     def make(stiffness, time_step, mass=1.0):
         ball = Bounce(stiffness, mass=mass, gravity=0.0)
@@ -50,13 +50,13 @@ DROP, FALL = (0.6, 0.0), 0.5  # touches the floor after 0.319 s at 3.13 m/s
 @pytest.mark.slow
 @pytest.mark.parametrize(("stiffness", "tau", "h"), [(1e4, 0.01, 2e-3)])
 def test_a_gradient_that_converges_to_the_slope_of_the_teeth_is_refused(tmp_path, stiffness, tau, h):
-    """The force of `sap` jumps by k tau v at the touch: the loss is a sawtooth, the gradient the slope of a tooth."""
+    """The contact force of `sap` jumps by k tau v, so the loss is a sawtooth, and its gradient the slope of a tooth."""
     ball = Bounce(stiffness, relaxation_time=tau)
     model = ball.model(tmp_path / "bouncer.sdf", "sap", h)
     certificate = dd.certify_rollout(model, DROP, None, height, num_steps=round(FALL / h), refine=True, seconds=60)
     refinement, (truth, uncertain) = certificate.refinements[0], ball.slopes("sap", DROP, FALL)
     assert uncertain < 1e-4
-    assert np.ptp(refinement.values[:, 0]) < 0.08 * abs(refinement.values[0, 0])  # it converges, to something else
+    assert np.ptp(refinement.values[:, 0]) < 0.08 * abs(refinement.values[0, 0])  # it converges to a wrong value
     assert abs(refinement.values[2, 0] - truth[0]) > 3
     assert certificate.verdict == "not_converged"
     assert [slope.value for slope in certificate.truth.slopes] == pytest.approx(truth, abs=1e-3)
@@ -65,7 +65,7 @@ def test_a_gradient_that_converges_to_the_slope_of_the_teeth_is_refused(tmp_path
 
 @pytest.mark.parametrize("approximation", ["sap", "lagged"])
 def test_the_continuous_motion_is_that_of_the_contact_law(tmp_path, approximation):
-    """Event by event in another way: to 1e-6 of the height, over several bounces."""
+    """The motion over several bounces is compared with an independent integration from event to event."""
     ball = Bounce(2e3, relaxation_time=4e-3, dissipation=0.2, mass=0.7)
     model = ball.model(tmp_path / "bouncer.sdf", approximation, 0.01)
     found = ContinuousMotion(model).states(np.array([0.5, -0.5]), np.zeros((100, 0)))[-1]
@@ -79,7 +79,7 @@ def test_a_smooth_motion_converges_to_the_slopes_of_the_motion_itself(load):
     slopes = certificate.truth.slopes
     assert [slope.column for slope in slopes] == ["hinge_q[0]", "hinge_w[0]", "motor at all times", "pole.mass"]
     limit = certificate.refinements[0].limit
-    for slope in slopes:  # what extrapolation leaves is of second order in h = 10 ms, at 4.4 rad/s
+    for slope in slopes:  # the error of extrapolation is of second order in h = 10 ms, at 4.4 rad/s
         assert limit[list(slope.columns)].sum() == pytest.approx(slope.value, rel=0.01)
     assert certificate.refinements[0].apart == ()
 
@@ -93,7 +93,7 @@ def test_where_there_is_no_continuous_motion_it_is_said_why(tmp_path):
     model = dd.load_model(held, time_step=0.01)
     certificate = dd.certify_rollout(model, [0.5, 0.3], np.zeros((30, 1)), height, refine=True).require()
     assert "PD controllers are not supported in continuous time" in certificate.no_truth
-    assert certificate.refinements[0].converged.all()  # nothing touches: no tooth can be taken for a slope
+    assert certificate.refinements[0].converged.all()  # without contact, the loss has no sawtooth
 
 
 def test_a_motion_that_is_too_stiff_for_error_control_says_so(tmp_path, monkeypatch):
@@ -105,13 +105,13 @@ def test_a_motion_that_is_too_stiff_for_error_control_says_so(tmp_path, monkeypa
 
 @each_row("kind, converges", [("position [rad]", True), ("position [m]", False)])
 def test_an_entry_is_judged_by_the_size_of_those_of_its_kind(kind, converges):
-    """0.02, 0.01 and 0.005 are an error of first order that matters little beside ones, and all of it alone."""
+    """The first-order error 0.02, 0.01, 0.005 is small next to an entry of 1 of the same kind, and large alone."""
     values = np.array([[1.0, 0.02], [1.0, 0.01], [1.0, 0.005]])
     found = judge_levels((1.0, 0.5, 0.25), ["a", "b"], values, ["position [rad]", kind])
     assert found.converged.tolist() == [True, converges]
 
 
-SLOPES = {  # value and error of the slope in continuous time, whether something touches, and whether 1 converges
+SLOPES = {  # value and error of the slope in continuous time, whether there is contact, and whether 1 converges
     "the same": ((1.0, 0.0), True, True),
     "9 % off": ((0.92, 0.01), True, True),
     "12 % off": ((0.88, 0.0), False, False),
@@ -140,7 +140,7 @@ def test_a_gradient_of_one_is_compared_with_the_slope_of_the_motion(case):
 @pytest.mark.slow
 @pytest.mark.parametrize("h", [0.01, pytest.param(0.005, marks=pytest.mark.slow)])
 def test_the_gradient_of_a_spring_tends_to_the_continuous_one(load, h):
-    """x(T) of m x'' + c x' + k x = 0 by x(0): e^(-a T) (cos w T + a / w sin w T), a = c / 2 m; and by v(0)."""
+    """For m x'' + c x' + k x = 0, d x(T) / d x(0) = e^(-a T) (cos w T + a / w sin w T) with a = c / 2 m."""
     model, count = load("mass_spring_damper.sdf", time_step=h), round(0.5 / h)
     x0 = [0.35, -0.4]
     certificate = dd.certify_rollout(model, x0, np.zeros((count, 1)), height, refine=True).require()
@@ -148,7 +148,7 @@ def test_the_gradient_of_a_spring_tends_to_the_continuous_one(load, h):
     a, w, T = c / (2 * m), np.sqrt(k / m - (c / (2 * m)) ** 2), 0.5
     by_x = np.exp(-a * T) * (np.cos(w * T) + a / w * np.sin(w * T))
     by_v = np.exp(-a * T) * np.sin(w * T) / w
-    # What extrapolation leaves is of second order: h^2 times w^2.
+    # The error of extrapolation is of second order: h^2 times w^2.
     assert certificate.refinements[0].limit[:2] == pytest.approx([by_x, by_v], abs=(10 * h) ** 2)
 
 
@@ -164,7 +164,7 @@ def test_inputs_and_parameters_are_refined_too(load):
 
 
 def test_a_model_with_one_time_step_is_compared_with_the_truth_or_refused():
-    """A plant from a diagram: falling freely it has a motion in continuous time, held by springs of PD control none."""
+    """A plant from a diagram has a motion in continuous time if it falls freely, but not under PD control."""
     plant = Plant(0.01)
     plant.ball("ball", 1.0, 0.1, contact_properties(1e4), "z")
     certificate = dd.certify_rollout(plant.model(), [1.0, 0.0], None, height, num_steps=3, refine=True).require()
@@ -186,7 +186,7 @@ def test_the_time_step_is_not_refined_and_a_parameter_at_once(load):
 
 
 def two_balls(h, stiffness, masses=(1.0, 1.0)):
-    """The first runs into the second, which rests, along x."""
+    """Build two balls on slides along x. In the tests, the first runs into the second, which is at rest."""
     plant = Plant(h, "lagged", gravity=0.0)
     for name, mass in zip(("left", "right"), masses, strict=True):
         plant.ball(name, mass, 0.1, contact_properties(2 * stiffness), "x")
@@ -195,9 +195,9 @@ def two_balls(h, stiffness, masses=(1.0, 1.0)):
 
 @pytest.mark.parametrize("stiffness", [1e3, 1e5])
 def test_momentum_holds_of_a_gradient_that_is_wrong(stiffness):
-    """Rigid balls of one mass swap velocities, so d x2(T) / d (x1, x2, v1, v2) = (1, 0, 1, 0).
+    """Rigid balls of equal mass swap velocities, so d x2(T) / d (x1, x2, v1, v2) = (1, 0, 1, 0).
 
-    A discrete, compliant contact keeps the sums, by position 1 and by velocity T, and can be far from each part.
+    A discrete, compliant contact preserves the sums (1 for positions, T for velocities), but not the single entries.
     """
     h, count = 1 / 100, 100
     model = two_balls(h, stiffness)
@@ -211,21 +211,21 @@ def test_momentum_holds_of_a_gradient_that_is_wrong(stiffness):
 
 
 def test_two_balls_resolved_tend_to_the_rigid_gradient():
-    """The compliant closed form: d x2(T) / d (x1, x2, v1, v2) = (1, 0, T - tau, tau), tau = pi / w / 2 ... of the swap.
+    """In closed form, d x2(T) / d (x1, x2, v1, v2) = (1, 0, T - tau, tau) with tau = pi / (2 w) and w^2 = 2 k / m.
 
-    With w^2 = 2 k / m the balls touch for pi / w, in which their centre of mass runs on: x2(T) = x2 + v (T - t1 - pi/w)
-    + v pi / (2 w), t1 = (x2 - x1 - 2 r) / v: by x1 +1, by x2 0, by v1 T - pi / (2 w), by v2 pi / (2 w).
+    The balls are in contact for pi / w, while their centre of mass moves on. With t1 = (x2 - x1 - 2 r) / v, the time
+    of contact, x2(T) = x2 + v (T - t1 - pi / w) + v pi / (2 w).
     """
     h, count, k = 1e-4, 5000, 500.0
     x0 = [0.0, 0.25, 1.0, 0.0]
     gradient = dd.differentiate_rollout(two_balls(h, k), x0, None, lambda x: x[1], num_steps=count)
     half = np.pi / np.sqrt(2 * k) / 2
-    # h w = 0.003, over the 1000 steps in contact.
+    # h w = 0.003, over the 1000 steps in contact
     assert gradient.by_x0 == pytest.approx([1.0, 0.0, h * count - half, half], abs=0.05)
 
 
 def test_growth_rate_of_a_block_has_its_closed_form(write_urdf):
-    """|d x_N / d (x_k, v_k)| = |(1, (N - k) h)|, so that the rate over N steps is |(1, N h)|^(1/N)."""
+    """As |d x_N / d (x_k, v_k)| = |(1, (N - k) h)|, the growth rate over N steps is |(1, N h)|^(1/N)."""
     h, count = 0.1, 7
     model = write_urdf(mass=2.0, time_step=h)
     free = dd.differentiate_rollout(model, [0.5, -1.0], np.zeros((count, 1)), lambda x: x[0])
@@ -235,11 +235,11 @@ def test_growth_rate_of_a_block_has_its_closed_form(write_urdf):
 
 
 def test_a_gradient_grows_with_a_motion_that_falls_over_and_dies_out_where_friction_stops_one(load):
-    """An inverted pendulum: |dx_N / dx_k| grows by the spectral radius of its step. A ball that has stopped forgets."""
+    """|dx_N / dx_k| grows by the step's spectral radius for an inverted pendulum, and vanishes for a stopped ball."""
     model = load("pendulum.urdf", time_step=0.01)
     gradient = dd.differentiate_rollout(model, [np.pi, 0], np.zeros((600, 1)), lambda x: x[0])
     radius = np.abs(np.linalg.eigvals(dd.differentiate_step(model, [np.pi, 0], [0]).A)).max()
-    assert gradient.growth_rate == pytest.approx(radius, rel=1e-2)  # the ends are no eigenvectors
+    assert gradient.growth_rate == pytest.approx(radius, rel=1e-2)  # the start and the end are no eigenvectors
     plant = Plant(0.01, "lagged")
     plant.ball("ball", 1.0, 0.1, contact_properties(2e4, 10.0, 0.5), "x", "z")
     plant.ground(contact_properties(2e4, 10.0, 0.5))

@@ -1,4 +1,4 @@
-"""Certificates of rollouts, open and closed loop: what they must find, and refuse."""
+"""Certificates of open-loop and closed-loop rollouts find wrong gradients and refuse unsuitable policies."""
 
 import dataclasses
 import math
@@ -33,17 +33,17 @@ def feedback(x, t, p):
 
 
 def detached_parameter(x, t, p):
-    """The second gain is a plain number."""
+    """Compute the feedback with the second gain as a number without derivatives."""
     return np.array([-p[0] * x[0] - float(plain(p)[1]) * x[1] - p[2:] @ x[2:]])
 
 
 def detached_state(x, t, p):
-    """The pole's speed is a plain number."""
+    """Compute the feedback with the pole's speed as a number without derivatives."""
     return np.array([-p[:3] @ x[:3] - p[3] * float(plain(x)[3])])
 
 
 def by_hand(error):
-    """A policy that states its own derivative, as one of JAX does; by the first state it is off by `error`."""
+    """Return a policy with its own derivative, as with JAX. The first state's entry has the relative error `error`."""
 
     def policy(x, t, p):
         z = np.concatenate([x, p])
@@ -60,7 +60,7 @@ def by_hand(error):
 
 
 class Remembers:
-    """5 % of the state of the step before, kept by time."""
+    """A policy that also feeds back 5 % of the state of the previous step, which it stores by time."""
 
     def __init__(self, first_wins):
         self.seen, self.first_wins = {}, first_wins
@@ -117,7 +117,7 @@ def test_a_memory_in_a_closure_is_found_too(load):
 
     with pytest.raises(GradientError, match="the policy depends on earlier calls"):
         certified(load("cart_pole.urdf"), policy)
-    assert not seen  # it was a copy that was asked
+    assert not seen  # a copy was evaluated
 
 
 def test_the_copy_of_a_policy_shares_its_model_and_no_memory(load):
@@ -139,7 +139,7 @@ def test_a_policy_and_inputs_are_one_too_many(load):
         dd.certify_rollout(load("cart_pole.urdf"), X0, np.zeros((3, 1)), end, policy=lambda x, t: [0.0])
 
 
-# --- by random directions ---------------------------------------------------------------------------------------------
+# --- along random directions ------------------------------------------------------------------------------------------
 
 
 def linear(gradient, offset=0.0):
@@ -147,7 +147,7 @@ def linear(gradient, offset=0.0):
 
 
 def test_the_quantiles_are_those_of_chi_squared():
-    """Closed forms: 1 - e^(-x/2) (1 + x/2) and erf(sqrt(x/2)) - sqrt(2x/pi) e^(-x/2) (1 + x/3); to four digits."""
+    """The closed forms are 1 - e^(-x/2) (1 + x/2) and erf(sqrt(x/2)) - sqrt(2x/pi) e^(-x/2) (1 + x/3)."""
     four, five = SAMPLE.quantiles
     assert 1 - math.exp(-four / 2) * (1 + four / 2) == pytest.approx(SAMPLE.miss / 2, rel=1e-3)
     by_five = math.erf(math.sqrt(five / 2)) - math.sqrt(2 * five / math.pi) * math.exp(-five / 2) * (1 + five / 3)
@@ -155,7 +155,7 @@ def test_the_quantiles_are_those_of_chi_squared():
 
 
 def test_an_error_is_seldom_larger_than_the_bound():
-    """The bound fails for 1 of 2000 seeds, 5 of 10,000; more than 12 of them with a probability of 0.2 %."""
+    """The bound fails for 1 of 2000 seeds, 5 of 10,000. More than 12 failures have a probability of 0.2 %."""
     random, kinds, missed = np.random.default_rng(0), np.zeros(12, dtype=np.intp), 0
     for seed in range(10_000):
         true = random.standard_normal(12)
@@ -192,7 +192,7 @@ def test_an_entry_that_is_1_percent_wrong_is_found_and_named_at_every_scale_of_t
 
 
 def test_an_offset_that_drowns_the_gradient_is_undecided_and_not_agreed(load):
-    """Beside 1e14 a loss of 1 has two digits, and its differences none; where all is 0, nothing can be wrong."""
+    """Next to 1e14 a loss of 1 has two digits, and its differences have none. A constant loss has the gradient 0."""
     us = np.zeros((N, 1))
     certificate = dd.certify_rollout(load("cart_pole.urdf"), X0, us, lambda xs, us: 1e14 + end(xs, us), sampled=True)
     assert certificate.verdict == "undecided"
@@ -210,7 +210,7 @@ def test_a_wrong_policy_is_found_by_random_directions_too(load, function):
 
 
 def test_a_block_that_is_zero_is_found_though_it_is_small(load):
-    """The inputs' gradient is 1e-3 of the states', and left out."""
+    """The gradient with respect to the inputs is 1e-3 of that with respect to the states, and is set to 0."""
     model, us = load("cart_pole.urdf"), np.zeros((N, 1))
     g = dd.certify_rollout(model, X0, us, lambda x: x @ x, sampled=True).require().gradient
     assert np.abs(g.by_us).max() < 1e-2 * np.abs(g.by_x0).max()
@@ -230,7 +230,7 @@ def test_a_rollout_that_starts_at_touchdown_is_refused_by_random_directions_too(
 @pytest.mark.slow
 @pytest.mark.parametrize(("approximation", "closed"), [("sap", True)])
 def test_a_quadrupeds_plan_of_100_knots_is_certified_in_20_rollouts(approximation, closed):
-    """Four feet on the ground; 1,239 columns, or 63 under PD control, friction among them; 1 % in one is not missed."""
+    """For 1,239 columns, or 63 under PD control, including friction, an error of 1 % in one column is found."""
     model, random = example_robot("solo12.urdf", approximation=approximation, feet=True), np.random.default_rng(3)
     x0 = state_in_contact(model, random)
     us = None if closed else 0.5 * random.standard_normal((100, model.nu))
@@ -260,14 +260,14 @@ def test_a_quadrupeds_plan_of_100_knots_is_certified_in_20_rollouts(approximatio
 
 
 def rounded(values, step):
-    """To whole steps, with the derivative of what is not rounded, or a plain number."""
+    """Round `values` to multiples of `step`, without derivatives."""
     return step * np.round(plain(values) / step)
 
 
 @pytest.mark.slow
 @each_row("step", [1e-5, 1e-3, 0.1, 1.0])
 def test_a_staircase_in_the_loss_is_discontinuous(load, step):
-    """Its derivative by AutoDiffXd is 0, or that of the line through the stairs; both are told from the loss alone."""
+    """AutoDiffXd gives 0, or the slope of the line through the stairs. Both are found by evaluating the loss alone."""
     model, us = load("cart_pole.urdf"), np.zeros((3, 1))
     for loss in (lambda x: x @ x + rounded(x, step)[1], lambda x: x @ x + x[1] + rounded(x, step)[1] - plain(x)[1]):
         for sampled in (False, True):
@@ -295,11 +295,11 @@ def test_a_table_as_a_policy_is_discontinuous(load, step):
 
 def test_a_switch_far_away_clipping_and_single_precision_are_no_staircase(load):
     def policy(x, t, p):
-        far = 5.0 if plain(x)[0] > 0.7 else 0.0  # one jump, which the motion does not meet
+        far = 5.0 if plain(x)[0] > 0.7 else 0.0  # one jump, which the motion does not reach
         return np.clip(np.array([-p @ x + far]), -3.0, 3.0)
 
     def single(x, t, p):
-        """As a network of float32 would: the value is rounded, the derivative its own."""
+        """Return a value rounded to float32 with an exact derivative, as a float32 network does."""
         u = np.array([-np.tanh(p @ x)])
         return u + (plain(u).astype(np.float32).astype(float) - plain(u))
 
@@ -312,13 +312,13 @@ def test_a_switch_far_away_clipping_and_single_precision_are_no_staircase(load):
 @each_row("state", range(4))
 @each_row("kind", ["threshold", "sign", "two steps of rounding"])
 def test_a_policy_that_switches_between_two_states_of_the_motion_is_discontinuous(load, state, kind):
-    """The switch stands halfway on the first step, whose input it does not change, so that the motion passes it."""
+    """The switch is halfway along the first step. It does not change that step's input, so the motion passes it."""
     model = load("cart_pole.urdf")
     after = dd.step(model, X0, feedback(X0, 0.0, GAINS))
     half, move = (X0[state] + after[state]) / 2, after[state] - X0[state]
 
     def jump(y):
-        if kind == "two steps of rounding":  # at y = 0 and far away: round(10 x) / 10, cut off
+        if kind == "two steps of rounding":  # at y = 0 and far away: round(10 x) / 10, clipped
             return np.clip(np.round(y * np.sign(move) / 10 + 0.5), 0, 2)
         return float(y * move > 0) if kind == "threshold" else (np.sign(y * move) + 1) / 2
 
@@ -333,7 +333,7 @@ def test_a_policy_that_switches_between_two_states_of_the_motion_is_discontinuou
 
 
 def test_a_policy_is_asked_along_each_state_and_parameter(load):
-    """A rounded state that others saturate on any line through them, and a rounded parameter."""
+    """The policies have a rounded state, which is off on lines that move other states, and a rounded parameter."""
     model, x0 = load("cart_pole.urdf"), np.zeros(4)
 
     def of_a_state(x, t, p):
@@ -350,7 +350,7 @@ def test_a_policy_is_asked_along_each_state_and_parameter(load):
 
 
 def test_an_input_that_is_nothing_but_rounding_is_no_staircase(load):
-    """Feedback around x0 itself: near it u is a rounded difference of numbers of size 1."""
+    """With feedback around x0, u is a rounded difference of numbers of size 1 near x0."""
     model, random = load("acrobot.xml"), np.random.default_rng(3)
     for x0, gain in zip(random.standard_normal((5, 4)), 0.3 * random.standard_normal((5, 1, 4)), strict=True):
         policy = ParametricPolicy(lambda x, t, p, x0=x0: np.tanh(p[None] @ (x - x0)), gain[0])
@@ -359,7 +359,7 @@ def test_an_input_that_is_nothing_but_rounding_is_no_staircase(load):
 
 
 def test_a_wrong_derivative_of_a_policy_is_refused_though_the_loss_hardly_feels_it(load):
-    """Three steps under a small gain: 8 % of one of its derivatives are below 1 % of every entry that matters."""
+    """After three steps with a small gain, an error of 8 % in the policy is below 1 % of each significant entry."""
     policy = ParametricPolicy(by_hand(0.08), 0.02 * GAINS)
     found = dd.certify_rollout(load("cart_pole.urdf"), X0, None, end, policy=policy, num_steps=3, sampled=True)
     assert found.verdict == "disagree"

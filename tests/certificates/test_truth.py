@@ -1,4 +1,4 @@
-"""The truth in continuous time that a rollout's certificate carries: its integration, its slopes, and its verdicts."""
+"""A rollout's certificate contains the continuous-time truth: its integration, its slopes, and its verdicts."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.solve
 
 @pytest.mark.parametrize("approximation", slow_after(1, ["sap", "lagged"]))
 def test_a_motion_of_several_bounces_is_known_to_what_the_slopes_need(tmp_path, approximation):
-    """A hundredth of 0.1 % of a slope of 1 over the narrowest width of 1e-4; another way, event by event."""
+    """1e-8 is below 0.1 % of a slope of 1 over the smallest width, 1e-4. `Bounce` integrates from event to event."""
     ball = Bounce(2e3, relaxation_time=4e-3, dissipation=0.2, mass=0.7)
     motion = ContinuousMotion(ball.model(tmp_path / "bouncer.sdf", approximation, 0.01))
     for start in [(0.5, -0.5), (0.3, 1.0)]:
@@ -27,7 +27,7 @@ def test_a_motion_of_several_bounces_is_known_to_what_the_slopes_need(tmp_path, 
 
 
 def test_a_touch_that_is_over_within_a_step_is_seen(tmp_path):
-    """Thrown up from below a floor's reach: it grazes the floor by 1e-5 m in the middle of a step of 0.05 s."""
+    """A dropped ball touches the floor for about 3 ms in the middle of a step of 0.05 s."""
     ball = Bounce(1e6, relaxation_time=2e-3)
     model = ball.model(tmp_path / "bouncer.sdf", "sap", 0.05)
     fall = 0.175  # [s] half a step off the grid
@@ -36,7 +36,7 @@ def test_a_touch_that_is_over_within_a_step_is_seen(tmp_path):
     assert found == pytest.approx(ball.end("sap", start, 0.4), abs=1e-7)
 
 
-DROP, STEPS = (0.6, 0.0), 50  # of 10 ms: it touches after 0.319 s at 3.13 m/s
+DROP, STEPS = (0.6, 0.0), 50  # steps of 10 ms; the ball reaches the floor after 0.319 s at 3.13 m/s
 
 
 def height(x):
@@ -45,7 +45,7 @@ def height(x):
 
 @pytest.fixture
 def dropped(tmp_path):
-    """A ball that falls on a floor, in steps of 10 ms, and its model."""
+    """Return a function that builds a ball that falls on a floor, and its model with steps of 10 ms."""
 
     def make(approximation, **law):
         ball = Bounce(1e4, **law)
@@ -62,7 +62,7 @@ def test_the_truth_of_a_bounce_is_that_of_its_events_and_the_steps_have_another_
     certificate = dd.certify_rollout(model, DROP, None, height, num_steps=STEPS, refine=True, seconds=60)
     truth = certificate.truth
     assert truth.law == "Hunt-Crossley"
-    assert truth.other_law == ""  # Drake's continuous plant has the same
+    assert truth.other_law == ""  # Drake's continuous plant has the same law
     assert truth.loss == pytest.approx(ball.end("lagged", DROP, 0.5)[0], abs=1e-8)
     for slope, value in zip(truth.slopes, exact, strict=True):
         assert slope.exists, str(slope)
@@ -78,7 +78,7 @@ def test_the_truth_of_a_bounce_is_that_of_its_events_and_the_steps_have_another_
 
 @pytest.mark.slow
 def test_the_difference_of_the_laws_is_measured_apart_from_the_error_of_the_step(dropped):
-    """`sap` of a relaxation time, and Drake's continuous plant, which has Hunt and Crossley's law of the same file."""
+    """`sap` uses the relaxation time, and Drake's continuous plant Hunt and Crossley's law, both from the same file."""
     ball, model = dropped("sap", relaxation_time=0.01, dissipation=0.3)
     truth = dd.certify_rollout(model, DROP, None, height, num_steps=STEPS, refine=True, seconds=60).truth
     own, other = (ball.end(law, DROP, 0.5)[0] for law in ("sap", "lagged"))
@@ -94,7 +94,7 @@ def test_the_difference_of_the_laws_is_measured_apart_from_the_error_of_the_step
 
 @pytest.mark.parametrize("approximation", slow_after(1, ["sap", "lagged"]))
 def test_steps_tend_to_the_law_that_is_named(tmp_path, approximation):
-    """After a touch of 10 ms the ball's speed tends, at first order in h, to what its own law says."""
+    """After a contact of 10 ms, the ball's speed converges at first order in h to the speed of its own contact law."""
     ball, start = Bounce(1e5, relaxation_time=1e-3, dissipation=0.1), (0.1005, -1.0)
     files = tmp_path / "fine.sdf", tmp_path / "coarse.sdf"
     fine = ball.model(files[0], approximation, 2e-5)
@@ -109,7 +109,7 @@ def test_steps_tend_to_the_law_that_is_named(tmp_path, approximation):
     own, other = ends.values() if approximation == "sap" else reversed(ends.values())
     assert own == pytest.approx(ball.end(approximation, start, 0.015), abs=1e-6)
     assert (once - own[1]) / (twice - own[1]) == pytest.approx(2.0, abs=0.1)
-    assert 2 * twice - once == pytest.approx(own[1], abs=3e-4)  # of second order: (1e-5 s times 316 / s)^2, a few times
+    assert 2 * twice - once == pytest.approx(own[1], abs=3e-4)  # second order: a multiple of (1e-5 s times 316 / s)^2
     assert abs(other[1] - own[1]) > 0.1
 
 
@@ -124,9 +124,9 @@ def test_a_slope_that_is_not_measured_in_time_is_unknown_and_not_absent(dropped)
 
 
 def test_a_graze_has_no_slope_and_that_is_its_own_answer(dropped):
-    """It reaches the floor just at the end, or not at all."""
+    """The ball reaches the floor exactly at the end of the motion, or not at all."""
     _, model = dropped("sap", relaxation_time=0.01)
-    start = (0.1 + 9.81 * 0.2**2 / 2, 0.0)  # it touches at the end of the last step
+    start = (0.1 + 9.81 * 0.2**2 / 2, 0.0)  # the ball reaches the floor at the end of the last step
     certificate = dd.certify_rollout(model, start, None, lambda x: x[1], num_steps=20, method="continuous", seconds=60)
     assert certificate.verdict == "discontinuous", str(certificate)
     assert [slope.exists for slope in certificate.truth.slopes] == [False, False]
@@ -145,7 +145,7 @@ def test_the_gradient_in_continuous_time_is_certified_and_wrong_ones_are_not(dro
     right = dd.differentiate_rollout(model, start, None, height, num_steps=15, method="continuous")
     for by_x0 in (1.02 * right.by_x0, -right.by_x0, right.by_x0 * [0, 1]):
         wrong = dataclasses.replace(right, by_x0=by_x0)
-        found = dd.certify_rollout(model, start, None, height, gradient=wrong, **arguments)  # judged as continuous
+        found = dd.certify_rollout(model, start, None, height, gradient=wrong, **arguments)  # in continuous time
         assert found.verdict == "disagree", str(found)
     plain = dd.differentiate_rollout(model, start, None, height, num_steps=15)
     found = dd.certify_rollout(model, start, None, height, gradient=plain, method="continuous", **arguments)
@@ -163,7 +163,7 @@ def test_a_closed_loop_in_continuous_time_is_certified(load):
 
 
 def test_a_slope_exists_where_the_narrow_ones_agree_and_the_wide_one_as_on_a_curve():
-    """Of f = s w + c w^3 / 6 slopes over +-w are s + c w^2 / 6; those of a corner beside it are not."""
+    """For f = s w + c w^3 / 6, the slopes over +-w are s + c w^2 / 6. Near a corner they have another form."""
     still = np.zeros(3)
 
     def over(*slopes, widths=(1e-2, 5e-3, 1e-3, 1e-4), corners=(0.0, 0.0)):
@@ -177,7 +177,7 @@ def test_a_slope_exists_where_the_narrow_ones_agree_and_the_wide_one_as_on_a_cur
     corner = judged(over(1.0, 1.0, 1.0, widths=three, corners=(0.5, 0.5)), still, 0.0)
     assert corner.exists is False
     assert corner.reason == "the loss has a kink here: slope 1.25 ahead, 0.75 behind"
-    # An error of the loss of 1e-5 is one of 0.1 over 1e-4: nothing is known, unless it is far from settled.
+    # An error of 1e-5 in the loss is 0.1 in a slope over 1e-4. It is unknown, unless it is far from convergence.
     noise = np.full(3, 1e-5)
     assert judged(over(1.0, 1.0, 1.0, widths=three), noise, 1e-3).exists is None
     assert judged(over(1.0, 1.0, 1.0, 9.0), noise, 1e-3).exists is False
@@ -185,7 +185,7 @@ def test_a_slope_exists_where_the_narrow_ones_agree_and_the_wide_one_as_on_a_cur
 
 @pytest.mark.parametrize("stiffness", [1e4, 1e7])
 def test_contact_that_the_steps_soften_is_named_by_as_much_as_it_sinks_in(stiffness):
-    """A ball at rest sinks in by m g / k, and in steps of 10 ms by `factor` times that where it is near-rigid."""
+    """A ball at rest penetrates by m g / k, or by `factor` times m g / k if it is near-rigid at steps of 10 ms."""
     plant, properties = Plant(0.01, "sap"), contact_properties(2 * stiffness, 0.0, 0.5, 0.0)
     plant.ball("ball", 1.0, 0.1, properties)
     plant.ground(properties)

@@ -1,4 +1,4 @@
-"""Steps with contact, differentiated from their own equation: against closed forms, AutoDiffXd and differences."""
+"""Analytic derivatives of steps with contact equal closed forms, AutoDiffXd and differences."""
 
 import numpy as np
 import pytest
@@ -67,7 +67,7 @@ def _load(tmp_path, ground, moving, time_step=0.005, **options):
 
 
 def _walker(tmp_path, **options):
-    """A tumbling trunk with a hinged leg, a sliding foot on it and a second leg, over tilted ground, all off centre."""
+    """Load a free trunk with a hinged leg, a foot sliding on the leg and a tail, over tilted ground, all off centre."""
     ground = _collision("ground", SHAPES["ground"], "0 0 0 0.1 -0.2 0.3", k=3e4, tau=0.02, mu=0.5, d=1.5)
     feet = _sphere("toe", "0.02 0.01 -0.2", k=1e4) + _sphere("heel", "-0.05 0 -0.2", 0.03, mu=0.3)
     links = [
@@ -87,7 +87,7 @@ def _walker(tmp_path, **options):
 
 
 def _by_both(model, x, u):
-    """The Jacobians [A, B] by contact's own equation and by AutoDiffXd."""
+    """Return the analytic derivatives, and the Jacobians [A, B] by the analytic method and by AutoDiffXd."""
     ours = dd.differentiate_step(model, x, u, method="analytic")
     exact = dd.differentiate_step(model, x, u, method="autodiff")
     return ours, np.hstack([ours.A, ours.B]), np.hstack([exact.A, exact.B])
@@ -96,7 +96,7 @@ def _by_both(model, x, u):
 def _agree(model, x, u):
     ours, found, exact = _by_both(model, x, u)
     assert ours.method == "analytic", ours.reason
-    # Both are right to rounding, which near-rigid contact and the inverse of a mass matrix magnify.
+    # Both are accurate to rounding, which near-rigid contact and the inverse of a mass matrix magnify.
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-9 * np.abs(exact).max())
 
 
@@ -106,7 +106,7 @@ def _contacts(model):
 
 
 def _touching_states(model, count, seed, spread=1.0):
-    """States of a robot that falls and tumbles, from every one of which a step has contact; quaternions of any norm."""
+    """Return states and inputs of a tumbling robot at which the step has contact. Quaternions are not normalized."""
     random, found = np.random.default_rng(seed), []
     while len(found) < count:
         x = model.default_state
@@ -150,19 +150,19 @@ def test_many_steps_in_one_call_are_the_same(tmp_path):
 
 
 def test_what_rests_on_a_fixed_sphere(tmp_path):
-    """The sphere's side may be the one that does not move."""
+    """The sphere of a contact pair may belong to the fixed body."""
     post = _sphere("post", "0 0 0.2", 0.2)
     links = _link("x", mass=0.3) + _link("z", _collision("plate", SHAPES["box"]), 0.2)
     joints = _joint("along", "prismatic", "world", "x", "1 0 0") + _joint("up", "prismatic", "x", "z", "0 0 1")
     model = _load(tmp_path, post, links + joints)
-    for x in ([0.05, 0.499, 0.3, -0.1], [0.21, 0.45, -0.2, 0.1]):  # on its face, and at its edge
+    for x in ([0.05, 0.499, 0.3, -0.1], [0.21, 0.45, -0.2, 0.1]):  # on the face of the box, and at its edge
         _agree(model, x, np.zeros(0))
         assert _contacts(model)
 
 
 @pytest.mark.parametrize("other", ["box", "capsule", "ball"])
 def test_spheres_meet_moving_shapes(tmp_path, other):
-    """Faces, edges, corners and insides of a shape on a body that moves; two free bodies, off the origin."""
+    """A sphere on a free body overlaps faces, edges, corners and the inside of a shape on another free body."""
     moving = _link("a", _collision("shape", SHAPES[other], "0.05 0 0.02 0.3 0.2 0.1", k=5e3, mu=0.9), 1.5)
     moving += _link("b", _sphere("probe", "0.03 -0.02 0.01", 0.12, tau=0.005), 0.7)
     model = _load(tmp_path, "", moving)
@@ -196,7 +196,7 @@ MEETINGS = [
 @pytest.mark.slow
 @each_row("mine, other", MEETINGS)
 def test_other_shapes_meet_as_drake_lets_them(tmp_path, mine, other):
-    """Two free bodies, or one on the ground, turned anyhow: differences of the step solved to rounding."""
+    """Two free bodies, or one on the ground, in random poses agree with differences of the step solved to rounding."""
     fixed = _collision("shape", OTHERS[other], "0 0 0 0.1 -0.2 0.3", mu=0.9) if other == "ground" else ""
     moving = "" if fixed else _link("a", _collision("shape", OTHERS[other], "0.05 0 0.02 0.3 0.2 0.1", mu=0.9), 1.5)
     moving += _link("b", _collision("probe", OTHERS[mine], "0.03 -0.02 0.01 0.1 0.2 0.3", k=5e3, tau=0.005), 0.7)
@@ -212,9 +212,9 @@ def test_other_shapes_meet_as_drake_lets_them(tmp_path, mine, other):
         exact = dd.differentiate_step(model, x, method="finite_difference")
         if method == "analytic":
             seen += 1
-            # Differences of 3e-7 of a step to rounding, beside friction that turns within 1e-4 m/s.
+            # Differences over 3e-7 of a step solved to rounding, next to friction that reverses within 1e-4 m/s.
             np.testing.assert_allclose(A[0], exact.A, rtol=0, atol=1e-5 * np.abs(exact.A).max())
-        else:  # boxes that meet with an edge of a face, of which Drake's point jumps
+        else:  # boxes that meet at an edge of a face, where Drake's contact point jumps
             assert (mine, other) == ("foot", "box")
         if seen == 12:
             break
@@ -223,7 +223,7 @@ def test_other_shapes_meet_as_drake_lets_them(tmp_path, mine, other):
 
 @each_row("wrong", ["normal", "point", "swapped"])
 def test_a_wrong_motion_of_the_contact_is_refused(tmp_path, monkeypatch, wrong):
-    """One per cent of how the normal or the point turns, or the bodies swapped."""
+    """The derivative of the contact normal or point has an error of 1 %, or the bodies are swapped."""
     right = nearest_points.overlap_change
 
     def changed(a, b, of):
@@ -260,14 +260,14 @@ def test_distances_and_normals_are_drakes(tmp_path, other):
         assert len(touch.phi) == len(exact)
         for pair in exact:
             seen += 1
-            to_sphere = 1 if pair.id_A == pairs.ids[0][0] else -1  # Drake's normal leads into A
+            to_sphere = 1 if pair.id_A == pairs.ids[0][0] else -1  # Drake's normal points into A
             np.testing.assert_allclose(touch.phi[0], -pair.depth, atol=1e-14)
             np.testing.assert_allclose(touch.normal[0], to_sphere * pair.nhat_BA_W, atol=1e-12)
     assert seen > 30
 
 
 def _puck(tmp_path, **options):
-    """A ball of 0.5 kg on slides along x and z, over level ground."""
+    """Load a ball of 0.5 kg on slides along x and z, over level ground."""
     links = _link("x", mass=0.3) + _link("z", _sphere("tip", "0 0 0", 0.1, k=1e4, tau=0.02, mu=0.4), 0.2)
     joints = _joint("along", "prismatic", "world", "x", "1 0 0") + _joint("up", "prismatic", "x", "z", "0 0 1")
     ground = _collision("ground", SHAPES["ground"], k=3e4, tau=0.03, mu=0.6)
@@ -275,7 +275,7 @@ def _puck(tmp_path, **options):
 
 
 def test_a_sticking_balls_step_in_closed_form(tmp_path):
-    """m (v' - v*) = g with g_n = (-phi / (h + tau) - v') / R_n and g_t = -v' / R_t: two numbers each."""
+    """In both directions m (v' - v*) = g, with g_n = (-phi / (h + tau) - v') / R_n and g_t = -v' / R_t."""
     model, h = _puck(tmp_path), 0.004
     k, soft, z = 1e4 * 3e4 / 4e4, h + 0.05, 0.1 - 1e-3
     m_x, m_z = 0.5, 0.2
@@ -285,7 +285,7 @@ def test_a_sticking_balls_step_in_closed_form(tmp_path):
     to_x, to_z = R_t * m_x / (1 + R_t * m_x), R_n * m_z / (1 + R_n * m_z)
     by_phi = -1 / (soft * (1 + R_n * m_z))
     v_z = to_z * (-0.02 - 9.81 * h) + 1e-3 / (soft * (1 + R_n * m_z))
-    np.testing.assert_allclose(d.x_next[2:], [to_x * 1e-4, v_z], rtol=1e-6)  # SAP ends at 1e-6 of the momentum
+    np.testing.assert_allclose(d.x_next[2:], [to_x * 1e-4, v_z], rtol=1e-6)  # SAP stops at 1e-6 of the momentum
     exact = np.array([[0, 0, to_x, 0], [0, by_phi, 0, to_z]])
     np.testing.assert_allclose(d.A[2:], exact, atol=1e-10)
     np.testing.assert_allclose(d.A[:2], [[1, 0, 0, 0], [0, 1, 0, 0]] + h * exact, atol=1e-12)
@@ -294,7 +294,7 @@ def test_a_sticking_balls_step_in_closed_form(tmp_path):
 def test_a_sliding_balls_friction_in_closed_form(tmp_path):
     """g_n D = a + mu v_x, a = -phi / (h + tau) - v*, D = R_n + mu^2 (R_t + 1 / m_x) + 1 / m_z.
 
-    Both from v_x' > 0 and y_n, y_t of `laws`, but for its soft norm.
+    Both follow from v_x' > 0 and from y_n and y_t in `laws`, without the soft norm.
     """
     model, h = _puck(tmp_path), 0.004
     mu, soft, v_x, v_z = 2 * 0.4 * 0.6 / (0.4 + 0.6), h + 0.05, 1.0, -0.02 - 9.81 * h
@@ -305,10 +305,10 @@ def test_a_sliding_balls_friction_in_closed_form(tmp_path):
     g_n = (a + mu * v_x) / D
     g_mu = v_x / D - g_n * by_mu / D
     g_k = g_n * R_n / 7.5e3 / D
-    mu_s, k_s = 2 * 0.6**2, 0.75**2  # d mu / d mu_s = 2 mu_o^2 / (mu_s + mu_o)^2, and the same of stiffness by half
+    mu_s, k_s = 2 * 0.6**2, 0.75**2  # d mu / d mu_s = 2 mu_o^2 / (mu_s + mu_o)^2, and half of it for the stiffness
     exact = [[-(g_n + mu * g_mu) / 0.5 * mu_s, -mu * g_k / 0.5 * k_s], [g_mu / 0.2 * mu_s, g_k / 0.2 * k_s]]
     np.testing.assert_allclose(d.x_next[2:], [v_x - mu * g_n / 0.5, v_z + g_n / 0.2], rtol=1e-6)
-    # The soft norm of 1e-7 N s, beside impulses y_t of v_x / R_t = 1e3 N s, is lost in rounding.
+    # The soft norm of 1e-7 N s has no effect next to impulses y_t of v_x / R_t = 1e3 N s.
     np.testing.assert_allclose(d.C[2:], exact, rtol=1e-6)
 
 
@@ -323,7 +323,7 @@ def test_columns_by_the_material_are_differences_of_the_step(tmp_path, approxima
         differences = dd.differentiate_step(model, x, u, parameters=wanted, method="finite_difference")
         assert set(ours.sources) == {"analytic"}
         assert set(differences.sources) == {"finite_difference"}
-        # SAP leaves 1e-6 of the momentum unsolved, which differences show, and lagged contact magnifies.
+        # SAP leaves a residual of 1e-6 of the momentum, which affects differences, and lagged contact magnifies it.
         allowed = 2e-4 * np.abs(differences.C).max(axis=0) + {"lagged": 5e-5}.get(approximation, 1e-6) / _values(
             model, wanted
         )
@@ -331,7 +331,7 @@ def test_columns_by_the_material_are_differences_of_the_step(tmp_path, approxima
 
 
 def _values(model, names):
-    """(np,) the parameters' values: what a derivative by them is per."""
+    """Return the parameters' values (np,), the units of derivatives with respect to them."""
     values = {p.name: float(p.value[0]) for p in dd.list_parameters(model)}
     return np.array([values[name] for name in names])
 
@@ -359,7 +359,7 @@ def test_what_is_taken_for_a_single_step_with_contact_follows_the_models_size(tm
 
 
 def test_another_law_is_found_out(tmp_path, monkeypatch):
-    """A wrong constant moves v' off the solution, or, where it hardly does, the Jacobian off AutoDiffXd's."""
+    """A wrong constant changes v' from the solution or, if this change is small, the Jacobian from AutoDiffXd's."""
     x = [0.0, 0.1 - 1e-3, 1e-4, -0.02]
     monkeypatch.setattr(laws, "SIGMA", 1.1e-3)
     with pytest.raises(GradientError, match="no analytic derivative of this step is known"):
@@ -385,19 +385,19 @@ def test_a_joint_limit_beside_contact_is_known(tmp_path):
 
 @pytest.mark.parametrize("approximation", ["sap", "lagged"])
 def test_controllers_beside_contact_are_known_within_their_effort_limits(approximation):
-    """A robot on PD controllers on its feet, at 20 ms; with a limit that they reach the step goes to AutoDiffXd."""
+    """A robot with PD controllers has contact, at 20 ms. If an effort limit is reached, AutoDiffXd is used."""
     model = example_robot("go2.urdf", 0.02, approximation=approximation, feet=True, gains=(60.0, 3.0))
     random = np.random.default_rng(0)
     for _ in range(3):
         x = state_in_contact(model, random)
         x[7 : model.nq] *= 0.2  # near the targets, which are 0
         _agree(model, x, random.uniform(-2.0, 2.0, model.nu))
-    beyond = np.full(model.nu, 200.0)  # of 23.7 and 45 N m
+    beyond = np.full(model.nu, 200.0)  # the effort limits are 23.7 and 45 N m
     assert dd.linearize(model, x[None], beyond[None])[2] == ("autodiff",)
 
 
 def test_what_autodiff_does_not_step_is_certified_by_differences(tmp_path, monkeypatch):
-    """A slide at its stop, beside whose tilted cylinder another stands, near enough that AutoDiffXd asks for both."""
+    """A slide is at its limit. Its tilted cylinder is so close to another that AutoDiffXd queries the pair."""
     tilted = _collision("rod", SHAPES["cylinder"], "0.22 0 0.22 0 0.7854 0")
     moving = _link("x", tilted) + _joint("along", "prismatic", "world", "x", "1 0 0", limit=0.01)
     moving += _link("pole", com="0 0 0.3") + _joint("hinge", "revolute", "x", "pole", "0 1 0")

@@ -1,4 +1,4 @@
-"""The implicit step Jacobian is that of AutoDiffXd wherever a step is smooth, and is handed over wherever it is not."""
+"""The implicit step Jacobian equals AutoDiffXd's if a step is smooth. Otherwise another method is used."""
 
 import re
 import time
@@ -33,17 +33,17 @@ from drake_diff.exceptions import ModelError, ModelWarning, SimulationError
 pytestmark = pytest.mark.solve
 
 NAMES = sorted(path.name for path in MODELS.iterdir())
-BESIDE = 0.1  # [rad] or [m] inside joint limits: a step of 10 ms at 1 rad/s covers a tenth of it
+BESIDE = 0.1  # [rad] or [m] distance from joint limits: a step of 10 ms at 1 rad/s covers a tenth of it
 SAME = 1e-10  # two exact derivatives of one smooth step differ by rounding
 
 
 def exact_parameters(model):
-    """All whose derivative is no difference."""
+    """Return the names of the parameters whose derivatives are not differences."""
     return tuple(p.name for p in dd.list_parameters(model) if p.derivative_source != "finite_difference")
 
 
 def agree(a, b):
-    """Whether two StepDerivatives are the same to rounding, and lead to the same state to the bit."""
+    """Check that two StepDerivatives are equal to rounding, with next states that are equal to the last bit."""
     assert np.array_equal(a.x_next, b.x_next)
     for name in ("A", "B", "C"):
         ours, theirs = getattr(a, name), getattr(b, name)
@@ -52,7 +52,7 @@ def agree(a, b):
 
 
 def same_by_both(model, x, u=(), parameters=None, expected="implicit"):
-    """The implicit derivatives at (x, u), which autodiff and the automatic choice confirm."""
+    """Return the implicit derivatives at (x, u), and check them against autodiff and the automatic choice."""
     parameters = exact_parameters(model) if parameters is None else parameters
     found = {
         method: dd.differentiate_step(model, x, u, parameters=parameters, method=method)
@@ -74,7 +74,7 @@ def test_every_model_of_this_repository(load, name, seed):
     lower, upper = model.plant.GetPositionLowerLimits(), model.plant.GetPositionUpperLimits()
     x[: model.nq] = np.clip(x[: model.nq], lower + BESIDE, upper - BESIDE)
     u = random.standard_normal(model.nu)
-    if np.any(np.isfinite(lower)):  # nothing meets its stop within the step, not even links of 0.1 kg
+    if np.any(np.isfinite(lower)):  # no joint reaches its limit within the step, not even links of 0.1 kg
         x[model.nq :], u = 0.1 * x[model.nq :], 0.01 * u
     d = same_by_both(model, x, u)
     assert d.reason == "asked for"
@@ -92,7 +92,7 @@ def test_every_contact_approximation(load, approximation):
     [("panda.urdf", "panda_link0"), ("ur5_robot.urdf", None), ("solo12.urdf", None), ("solo12.urdf", "base_link")],
 )
 def test_real_robots(tmp_path, name, base):
-    """Panda without the coupling of its fingers, which is a constraint, and without their boxes, which touch."""
+    """The Panda has neither the coupler constraint of its fingers nor their boxes, which are in contact."""
     text = Path(robot_file(name)).read_text()
     path = tmp_path / name
     path.write_text(re.sub(r"(?s)<mimic.*?/>|<(collision|visual).*?</\1>", "", text))
@@ -126,7 +126,7 @@ def test_floating_bases_and_joints_of_many_degrees(joint_type, seed):
 
 
 def test_a_quaternion_that_is_not_of_unit_norm():
-    """Drake's coordinates are taken as they are; A has a column for each."""
+    """Drake's coordinates are used without normalization, and A has a column for each of them."""
     model, random = floating(None, 0), np.random.default_rng(0)
     x = random_state(model, random)
     x[:4] *= 1.1
@@ -159,7 +159,7 @@ def test_efforts_at_their_limits(kp, u):
 
 @pytest.mark.parametrize("method", ["analytic", "implicit", "autodiff"])
 def test_exactly_at_its_limit_an_input_has_the_derivative_of_the_inside(method):
-    """Plans end up there, and their bounds keep them on that side: a derivative of 0 would never lead away."""
+    """Planned inputs often are at their bounds. With a derivative of 0 there, no optimizer would change them."""
     model = springs_and_motors(limit=3.0)
     at, inside = (
         dd.differentiate_step(model, POINT[0], [a, 0.4, b], method=method).B for a, b in ((3, -3), (2.999, -2.999))
@@ -168,13 +168,13 @@ def test_exactly_at_its_limit_an_input_has_the_derivative_of_the_inside(method):
 
 
 def outside(u, limit):
-    """A fault: exactly at a limit the derivative is taken for that of the outside, which is 0."""
+    """Return which inputs are saturated, with a fault: an input exactly at its limit has the derivative 0."""
     return np.abs(u) >= limit
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 def test_a_derivative_of_the_outside_exactly_at_a_limit_is_found(monkeypatch, scale):
-    """The certificate's differences are taken beside the limit; what changes between there and the limit counts."""
+    """The certificate takes differences next to the limit, and compares the derivatives there and at the limit."""
     model = springs_and_motors(limit=3.0 * scale)
     x, u = np.array(POINT[0]), np.array([3.0, 0.4, -3.0]) * scale
     found = certify_inside(model, x, u)
@@ -202,7 +202,7 @@ def test_a_joint_at_its_limit_is_handed_over(q, w):
     assert d.reason.startswith("not implicit: ")
     assert "joint limit" in d.reason
     free = dd.differentiate_step(limited_pendulum(-9, 9), [q, w], [0.1])
-    assert not np.allclose(d.A, free.A, atol=1e-3)  # the limit does act here
+    assert not np.allclose(d.A, free.A, atol=1e-3)  # the limit has an effect
 
 
 def test_a_chosen_model_is_implicit_in_the_air_and_handed_over_on_the_ground(load):
@@ -221,7 +221,7 @@ def test_constraints_are_handed_over(kind):
     d = same_by_both(model, [0.3, 0.05, 0.2, -0.1], [0.4], parameters=("one.mass",), expected="autodiff")
     assert d.reason == "not implicit: constraints act at every step"
     found = dd.differentiate_step(model, [0.3, 0.05, 0.2, -0.1], [0.4])
-    if kind == "coupler" and found.method == "analytic":  # whose impulse is known with Pinocchio
+    if kind == "coupler" and found.method == "analytic":  # its impulse is known with Pinocchio
         exact = dd.differentiate_step(model, [0.3, 0.05, 0.2, -0.1], [0.4], method="autodiff")
         assert np.abs(found.A - exact.A).max() <= 1e-11 * np.abs(exact.A).max()
     else:
@@ -256,7 +256,7 @@ def test_a_diagram_that_applies_forces_is_handed_over(port):
         made.builder.Connect(source.get_output_port(), made.plant.get_applied_spatial_force_input_port())
     model = dd.model_from_diagram(made.builder.Build())
     assert dd.step(model, [0.0, 1.0], [3.0])[1] == pytest.approx(1 + 0.01 * 10.0 / 2, rel=1e-12)
-    # Drake cannot convert a constant spatial force to AutoDiffXd, and says so when the step is taken.
+    # Drake cannot convert a constant spatial force to AutoDiffXd, and reports it during the step.
     d = dd.differentiate_step(model, [0.0, 1.0], [3.0], method="implicit" if port == "generalized" else "auto")
     assert d.method == ("autodiff" if port == "generalized" else "finite_difference")
     assert "the diagram feeds applied" in d.reason
@@ -265,7 +265,7 @@ def test_a_diagram_that_applies_forces_is_handed_over(port):
     by_mass = dd.differentiate_step(model, [0.0, 1.0], [3.0], parameters=("block.mass",))
     assert by_mass.C[1, 0] == pytest.approx(-0.01 * 10.0 / 4, rel=1e-9)
     names = {p.name for p in dd.list_parameters(model)}
-    assert ("model.gravity" in names) == (port == "spatial")  # a fed port takes no force of ours
+    assert ("model.gravity" in names) == (port == "spatial")  # drake_diff cannot add forces to a connected port
 
 
 def test_pd_targets_that_the_diagram_feeds_are_handed_over():
@@ -286,12 +286,12 @@ def test_pd_targets_that_the_diagram_feeds_are_handed_over():
 
 
 def box_over(ground):
-    """A tilted box above the ground, its bounding volume in what is below it, itself not."""
+    """Build a tilted box that does not touch the shape below it, although its bounding volume overlaps this shape."""
     made = Plant(0.01)
     body = made.plant.AddRigidBody("box", SpatialInertia.SolidBoxWithMass(1.3, 0.3, 0.2, 0.1))
     made.shape(body, Box(0.3, 0.2, 0.1), contact_properties(1e4, friction=0.5))
     if ground == "box":
-        pose = RigidTransform([0.24, 0.19, 0.0])  # a corner beside a corner
+        pose = RigidTransform([0.24, 0.19, 0.0])  # two corners are close to each other
         world = made.plant.world_body()
         made.shape(world, Box(0.2, 0.2, 0.2), contact_properties(1e4, friction=0.5), pose)
     else:
@@ -325,7 +325,7 @@ def test_a_box_in_the_air_that_autodiff_refuses_on_a_broad_phase_hit(ground):
         assert pytest.approx(other.A, abs=1e-8) == d.A  # central differences with step 1e-5
         assert pytest.approx(other.C, abs=1e-8) == d.C
     dd.certify(model, x, parameters=names, method="implicit").require()
-    assert refused or ground == "half space"  # which 1.51 refuses and 1.58 does not
+    assert refused or ground == "half space"  # Drake 1.51 refuses a half space, Drake 1.58 does not
 
 
 def test_the_automatic_choice_says_what_it_took_and_why(load):
@@ -335,12 +335,12 @@ def test_the_automatic_choice_says_what_it_took_and_why(load):
     assert d.method == "implicit"
     assert "equal to autodiff, as certified on this model" in d.reason
     again = dd.differentiate_step(model, [0.1, 0.2, 0.3, 0.4], [0.0, 1.0], parameters=names)
-    assert (again.method, again.reason) == (d.method, d.reason)  # once and for all
+    assert (again.method, again.reason) == (d.method, d.reason)  # chosen once per model
 
 
 @pytest.mark.parametrize("slow", ["implicit", "autodiff"])
 def test_a_delay_changes_nothing_about_the_choice(load, monkeypatch, slow):
-    """The choice stands in records: one that went by the clock would change from machine to machine."""
+    """Run records contain the choice. If it depended on timing, it would differ between machines."""
     models = [load("double_pendulum.urdf") for _ in range(2)]
     point = [0.4, -0.9, 1.3, -0.6], [0.25, -0.15]
     names = tuple(p.name for p in dd.list_parameters(models[0]) if p.name.endswith(".mass"))
@@ -360,11 +360,11 @@ def test_a_delay_changes_nothing_about_the_choice(load, monkeypatch, slow):
 
     monkeypatch.setattr(place, name, late)
     assert chosen(models[1]) == expected
-    assert delays  # it was asked
+    assert delays  # the delayed function was called
 
 
 def test_a_choice_made_without_parameters_holds_with_them(load):
-    """Gravity and springs act as forces of ours beside Drake's own."""
+    """Gravity and springs act as additional applied forces next to Drake's own."""
     model = load("mass_spring_damper.sdf")
     dd.differentiate_step(model, [0.3, -0.4], [1.0])
     names = ("slide.spring_stiffness", "slide.spring_rest_length", "model.gravity")
@@ -381,12 +381,12 @@ def test_values_given_by_mapping_are_differentiated_where_they_are(seed):
     model, random = springs_and_motors(kp=(0.0, 20.0, 0.0), gear=3.0), np.random.default_rng(seed)
     values = {}
     for p in dd.list_parameters(model):
-        factor = random.uniform(0.8, 1.25)  # one for all its entries: an inertia stays possible
+        factor = random.uniform(0.8, 1.25)  # the same for all entries, so that an inertia stays physical
         values[p.name] = factor * p.value if np.any(p.value) else p.value + 0.1 * (p.name[-4:] != "rtia")
     given = dd.differentiate_step(model, *POINT, parameters=values, method="implicit")
     assert given.method == "implicit"
     by_autodiff = dd.differentiate_step(model, *POINT, parameters=values, method="autodiff")
-    agree(given, by_autodiff)  # the differenced ones by the same differences
+    agree(given, by_autodiff)  # both use the same differences for some parameters
     own = dd.differentiate_step(model, *POINT, method="implicit")
     assert not np.allclose(own.x_next, given.x_next)
     agree(own, dd.differentiate_step(model, *POINT, method="autodiff"))
@@ -404,5 +404,5 @@ def test_rollouts_by_both_methods_are_the_same(load):
     )
     assert (a.methods, b.methods) == (("implicit",), ("autodiff",))
     for name in ("by_x0", "by_us", "by_parameters"):
-        # 60 steps, whose rounding the motion magnifies as it does the gradient itself
+        # The motion magnifies the rounding of its 60 steps as it magnifies the gradient.
         assert getattr(a, name) == pytest.approx(getattr(b, name), rel=1e-8, abs=1e-8)

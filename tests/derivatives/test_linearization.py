@@ -1,4 +1,4 @@
-"""Many steps linearized in one call, by Pinocchio where that is certified: closed forms, AutoDiffXd, and refusals."""
+"""Linearizations of many steps in one call equal closed forms and AutoDiffXd, or name the method used instead."""
 
 import warnings
 from dataclasses import replace
@@ -29,11 +29,11 @@ from drake_diff.model.parameters import applied, select
 pytestmark = pytest.mark.solve
 
 NAMES = sorted(path.name for path in MODELS.iterdir())
-SAME = 1e-9  # of the largest entry, as the gate has it: one derivative in two orders of operations
+SAME = 1e-9  # relative to the largest entry, as in the gate: rounding of two orders of operations
 
 
 def equal(model, xs, us, method="auto", expected=("analytic",), **known):
-    """linearize, each step of it confirmed by AutoDiffXd."""
+    """Return the result of `linearize`, and check each step against AutoDiffXd."""
     A, B, methods = dd.linearize(model, xs, us, method, **known)
     assert A.shape == (len(us), model.nx, model.nx)
     assert B.shape == (len(us), model.nx, model.nu)
@@ -49,7 +49,7 @@ def equal(model, xs, us, method="auto", expected=("analytic",), **known):
 
 
 def test_the_damped_pendulum(load):
-    """theta'' = (u - m g l sin theta - d theta') / (m l^2) with damping implicit, at three states in one call."""
+    """The motion is theta'' = (u - m g l sin theta - d theta') / (m l^2), with implicit damping, at three states."""
     theta, h, gl = np.array([0.7, -2.0, 3.0]), 0.01, G / 0.5
     s, c = 1 / (1 + h * 0.1 / 0.25), np.cos(theta)
     xs = np.column_stack([theta, [-1.2, 0.0, 2.0]])
@@ -62,7 +62,7 @@ def test_the_damped_pendulum(load):
 
 
 def test_a_thrown_body(load):
-    """A hundred steps' product is N h by velocity."""
+    """Over N = 100 steps, the derivative of the position with respect to the velocity is N h."""
     model, x = load("projectile.sdf"), np.array([1.0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 2, 1, 5])
     xs = dd.rollout(model, x, num_steps=100).xs
     A, B, methods = dd.linearize(model, xs, np.zeros((100, 0)))
@@ -94,7 +94,7 @@ def test_real_robots(tmp_path, name):
 
 @each_row("name", ["ur5_robot.urdf", "panda.urdf", "xarm7.urdf", "finger_edu.urdf"])
 def test_a_single_smooth_step_of_a_fixed_robot(name, monkeypatch):
-    """It is had without the calls for many steps, and is AutoDiffXd's; frozen, and its end is Drake's own."""
+    """The derivative equals AutoDiffXd's without the batched code. Its arrays are read-only, and x_next is Drake's."""
     model, random = example_robot(name, 0.005), np.random.default_rng(5)
     analytic_of(model)
     monkeypatch.setattr(SmoothStep, "__call__", None)
@@ -132,7 +132,7 @@ def test_a_free_body_with_a_sprung_arm_turned_by_a_quaternion_of_any_norm(seed):
     equal(model, x[None], random.standard_normal((1, 1)))
     x_next, d = dd.step(model, x, [0.2]), dd.differentiate_step(model, x, [0.2], method="analytic")
     assert d.method == "analytic"
-    assert np.array_equal(d.x_next, x_next)  # Drake's own
+    assert np.array_equal(d.x_next, x_next)  # from Drake's step
     by_differences = dd.differentiate_step(model, x, [0.2], method="finite_difference")
     np.testing.assert_allclose(d.A, by_differences.A, atol=1e-7)  # central differences with step 1e-5
 
@@ -151,7 +151,7 @@ def test_inputs_at_their_effort_limits_have_no_effect():
     assert np.all(np.abs(B[0, :, 1:]).max(axis=0) > 0)
 
 
-# ---- steps that are not smooth go elsewhere, and say so --------------------------------------------------------------
+# ---- steps that are not smooth, and the methods used for them --------------------------------------------------------
 
 
 def _a_fall(load, **options):
@@ -186,12 +186,12 @@ def test_a_joint_limit_that_acts_is_in_the_derivative():
     xs, us = np.array([[0.3, 0.2], [0.999, 2.0]]), np.array([[0.1], [0.1]])
     A, _, _ = equal(model, xs, us)
     assert A[1, 1, 1] < 0.1 < A[0, 1, 1]
-    free = np.array([dd.step(model, xs[0], us[0]), xs[1] + 0.01])  # the second is not where the step leads
+    free = np.array([dd.step(model, xs[0], us[0]), xs[1] + 0.01])  # the second is not the end of the step
     equal(model, xs, us, x_next=free)
 
 
 def test_a_limits_impulse_has_its_closed_form():
-    """One joint of inertia I: v' = (v* + v_hat / b) / (1 + 1 / b) at a limit, v_hat = d / 2h from a distance d."""
+    """At a distance d from a limit, v' = (v* + v_hat / b) / (1 + 1 / b) for one joint, with v_hat = d / 2h."""
     model, x, h = limited_pendulum(), np.array([0.999, 2.0]), 0.01
     A, B, (method,) = dd.linearize(model, x[None], np.array([[0.1]]))
     free = dd.linearize(model, np.array([[0.3, 2.0]]), np.array([[0.1]]))
@@ -203,7 +203,7 @@ def test_a_limits_impulse_has_its_closed_form():
 
 
 def test_a_controller_at_its_limit_is_no_smooth_step():
-    """Gains that hold the joints near their references, and inputs that do and do not exceed 30 N or N m."""
+    """PD control with gains that keep the joints near their references, and inputs below and above 30 N or 30 N m."""
     model = springs_and_motors(limit=30.0, kp=(20.0, 5.0, 8.0))
     xs, us = np.array([POINT[0]] * 2), np.array([POINT[1], [0.4, 900.0, -900.0]])
     _, _, methods = equal(model, xs, us, expected=("analytic", "implicit"))
@@ -216,7 +216,7 @@ def test_x_next_that_is_wrong_is_found(load):
     model = load("double_pendulum.urdf")
     xs, us = np.array([[0.4, -0.9, 1.3, -0.6]]), np.array([[0.25, -0.15]])
     wrong = dd.step(model, xs[0], us[0])[None] + [[0, 0, 1e-8, 0]]
-    _, _, methods = equal(model, xs, us, x_next=wrong, expected=("analytic",))  # of the step itself
+    _, _, methods = equal(model, xs, us, x_next=wrong, expected=("analytic",))  # derivatives of the step itself
     assert methods == ("analytic",)
 
 
@@ -235,7 +235,7 @@ def test_a_doctored_inertia_is_caught(load):
 
 @pytest.mark.parametrize("part", [0, 1, 2])
 def test_a_derivative_that_is_not_its_steps_is_caught(load, part):
-    """By q, by v and by the forces."""
+    """The parts are the derivatives with respect to q, v and the forces."""
     model = load("acrobot.xml")
     analytic = build_analytic(model)
 
@@ -286,7 +286,7 @@ def test_a_model_that_pinocchio_is_not_given_says_why():
 
 
 def example_robots():
-    """Every robot of example-robot-data that Drake reads and steps, at a state within its limits."""
+    """Yield the robots of example-robot-data that Drake reads and steps, each with a state within limits and inputs."""
     random = np.random.default_rng(0)
     for file in sorted(str(f) for f in files("example-robot-data") if str(f).endswith((".urdf", ".sdf"))):
         try:
@@ -301,7 +301,7 @@ def example_robots():
 
 
 def same_where_autodiff_works(model, x, u):
-    """Whether it does; `auto` must have the same to rounding then, and else name what was refused."""
+    """Check `auto` against AutoDiffXd or, if AutoDiffXd fails, its reason. Return whether AutoDiffXd works."""
     found = dd.differentiate_step(model, x, u)
     try:
         exact = dd.differentiate_step(model, x, u, method="autodiff")
@@ -309,7 +309,7 @@ def same_where_autodiff_works(model, x, u):
         assert found.method == "analytic" or "not " in found.reason
         return False
     for ours, theirs in ((found.A, exact.A), (found.B, exact.B)):
-        # Masses of 1e-6 kg beside 10 kg, as some of these robots have, magnify rounding.
+        # Some of these robots have masses of 1e-6 kg and of 10 kg, which magnify rounding.
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-8 * np.abs(exact.A).max(), err_msg=model.name)
     return True
 
@@ -336,10 +336,10 @@ def test_auto_serves_wherever_autodiff_does_and_every_step_is_had_to_rounding():
 
 @each_row("name", ["solo12.urdf", "go2.urdf", "bolt.urdf"])
 def test_floating_robots_are_autodiffs(name):
-    """In flight and on their feet, at their stops too, as AutoDiffXd has them; a wrong inertia is found out."""
+    """In flight, in contact and at joint limits, the derivatives equal AutoDiffXd's. A wrong inertia is detected."""
     model, random = example_robot(name, 0.01, feet=True), np.random.default_rng(4)
     xs = np.array([state_in_contact(model, random), state_in_range(model, random)])
-    xs[1, :4] *= 1.1  # of any norm
+    xs[1, :4] *= 1.1  # not of unit norm
     xs[1, model.nq - 1] = model.position_limits[0][-1] + 1e-3
     equal(model, xs, 0.1 * random.standard_normal((2, model.nu)))
     smooth = analytic_of(model)
@@ -365,13 +365,13 @@ def test_bad_input_is_named(load, xs, us, wanted):
         dd.linearize(load("pendulum.urdf"), np.zeros((2, 2)), np.zeros((2, 1)), "guess")
 
 
-# ---- joint limits, couplers and shapes that AutoDiffXd does not know ----------------------------------------------
+# ---- joint limits and couplers --------------------------------------------------------------------------------------
 
 
 @each_row("name", ["solo12.urdf", "go2.urdf", "ur5_robot.urdf", "bolt.urdf"])
 @pytest.mark.parametrize("time_step", [0.005, 0.02, 0.05])
 def test_robots_at_their_limits_are_linearized_at_once(name, time_step):
-    """Three joints at their stops, some beyond; those with feet stand on them too."""
+    """Three joints are at or beyond their limits. Robots with feet also stand on the ground."""
     model, random = example_robot(name, time_step, feet=ROBOTS_STAND[name]), np.random.default_rng(3)
     lower, upper = model.position_limits
     limited = np.flatnonzero(np.isfinite(lower) & np.isfinite(upper))
@@ -387,7 +387,7 @@ def test_robots_at_their_limits_are_linearized_at_once(name, time_step):
 
 
 def test_joints_that_are_coupled_are_linearized_at_once():
-    """A Panda whose second finger follows the first by Drake's coupler, in flight and closing onto its stop."""
+    """A coupler constraint makes the second finger of a Panda follow the first, far from its limit and close to it."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
         model = dd.load_model(robot_file("panda.urdf"), time_step=0.01, base="weld", actuators="all", contact=False)

@@ -1,4 +1,4 @@
-"""Steps solved to rounding: closed forms, AutoDiffXd, and equations that are not Drake's and must be refused."""
+"""Steps solved to rounding agree with closed forms and AutoDiffXd. Equations other than Drake's are refused."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ from drake_diff.model import contact_modes
 from drake_diff.model.parameters import applied, select
 
 H = 0.005
-NEAR_RIGID = 0.01 / (4 * np.pi**2)  # Drake's, of limits, controllers and couplers
+NEAR_RIGID = 0.01 / (4 * np.pi**2)  # Drake's near-rigid constant for limits, controllers and couplers
 
 
 def refined(model, x, u=(), parameters=()):
@@ -40,12 +40,12 @@ def why_not(model, x, u=()):
 
 
 def slope(f, at, step):
-    """The central difference of a scalar's function."""
+    """Return the central difference of a function of one number."""
     return (f(at + step) - f(at - step)) / (2 * step)
 
 
 def ball(approximation="lagged", *, stiffness=1e6, time_step=H, axes="xz", pushed=False, **material):
-    """A ball of 1 kg and 0.1 m on slides over the ground, both of one material; `stiffness` is that of the pair."""
+    """Build a ball of 1 kg and 0.1 m on slides over ground of the same material. `stiffness` is that of the pair."""
     made, time = Plant(time_step, approximation), material.get("relaxation_time")
     properties = contact_properties(2 * stiffness, material.get("dissipation", 0.0), 0.5, time)
     made.ball("ball", 1.0, 0.1, properties, *axes)
@@ -61,7 +61,7 @@ def ball(approximation="lagged", *, stiffness=1e6, time_step=H, axes="xz", pushe
 @pytest.mark.parametrize("approximation", ["lagged", "similar"])
 @each_row("overlap, speed", [(3e-3, -0.2), (3e-3, 0.4), (5e-4, -1.0)])
 def test_a_ball_that_presses_on_the_ground(approximation, overlap, speed):
-    """v' = (v - g h + h k x / m) / (1 + h^2 k / m), and its slopes, of a spring that is implicit in v'."""
+    """A spring that is implicit in v' gives v' = (v - g h + h k x / m) / (1 + h^2 k / m) and its slopes."""
     model, k = ball(approximation, stiffness=5e3, axes="z"), 5e3
 
     def end(z, v):
@@ -70,13 +70,13 @@ def test_a_ball_that_presses_on_the_ground(approximation, overlap, speed):
     exact = (speed - 9.81 * H + H * k * overlap) / (1 + H * H * k)
     z = 0.1 - overlap
     assert end(z, speed) == pytest.approx(exact, rel=1e-13)
-    # Differences of 1e-5 m and m/s know a number near 1 to rounding / 1e-5; in them the step is linear.
+    # Differences over 1e-5 m and m/s have an error of rounding / 1e-5. Within them the step is linear.
     assert slope(lambda v: end(z, v), speed, 1e-5) == pytest.approx(1 / (1 + H * H * k), abs=1e-10)
     assert slope(lambda z: end(z, speed), z, 1e-5) == pytest.approx(-H * k / (1 + H * H * k), abs=1e-9)
 
 
 def test_a_compliant_ball_of_sap():
-    """v' = (v - g h + v_hat / (m R)) / (1 + 1 / (m R)), R = 1 / (h k (h + tau)), v_hat = x / (h + tau)."""
+    """v' = (v - g h + v_hat / (m R)) / (1 + 1 / (m R)) with R = 1 / (h k (h + tau)) and v_hat = x / (h + tau)."""
     made, properties = Plant(H, "sap"), contact_properties(1e4, 0.0, 0.5, 0.01)
     made.plant.set_sap_near_rigid_threshold(0.0)
     made.ball("ball", 1.0, 0.1, properties, "z")
@@ -89,7 +89,7 @@ def test_a_compliant_ball_of_sap():
 
 @each_row("v0, push", [(1.0, 0.0), (0.0, 4.9), (0.0, 6.0), (1e-4, 2.0)])
 def test_a_ball_that_slides_or_creeps(v0, push):
-    """v' = v0 + h u / m - mu g h v' / sqrt(v'^2 + e^2) of lagged friction, at a stiffness of 1e6 N/m."""
+    """Lagged friction gives v' = v0 + h u / m - mu g h v' / sqrt(v'^2 + e^2), at a stiffness of 1e6 N/m."""
     model = ball(stiffness=1e6, pushed=True)
 
     def state(v):
@@ -104,13 +104,13 @@ def test_a_ball_that_slides_or_creeps(v0, push):
         slope(lambda v: refined(model, state(v), [push])[2], v0, step),
         slope(lambda u: refined(model, state(v0), [u])[2], push, step),
     )
-    # Rounding / step is 1e-9 at most; what the friction's bend adds in 1e-7 m/s, beside e, is a part of 1e-6.
+    # Rounding / step is 1e-9 at most. The curvature of friction over 1e-7 m/s, relative to e, adds a fraction of 1e-6.
     assert by_v == pytest.approx(1 / stiff, rel=2e-6, abs=3e-9)
     assert by_u == pytest.approx(h / stiff, rel=2e-6, abs=3e-9)
 
 
 def test_a_push_that_drakes_solver_does_not_notice():
-    """A resting ball creeps by h u / (m D), D = 1 + mu g h / e, of which 5e-6 N are less than 1e-6 of h m g."""
+    """A resting ball creeps by h u / (m D) with D = 1 + mu g h / e. A force of 5e-6 N is less than 1e-6 of m g."""
     h = 1e-3
     model, x = ball(stiffness=1e6, time_step=h, pushed=True), [0.0, 0.1 - 9.81e-6, 0.0, 0.0]
     exact = h / (1 + 0.5 * 9.81 * h / 1e-4)
@@ -130,7 +130,7 @@ def slide(*, limits=None, gains=None, effort=np.inf, damping=0.0, mass=2.0):
         joint.set_position_limits([limits[0]], [limits[1]])
     motor = made.plant.AddJointActuator("motor", joint, effort)
     motor.set_default_rotor_inertia(1e-3)
-    motor.set_default_gear_ratio(10.0)  # reflected: 0.1 kg
+    motor.set_default_gear_ratio(10.0)  # a reflected inertia of 0.1 kg
     if gains is not None:
         motor.set_controller_gains(PdControllerGains(p=gains[0], d=gains[1]))
     return made.model()
@@ -148,7 +148,7 @@ def slide(*, limits=None, gains=None, effort=np.inf, damping=0.0, mass=2.0):
     ],
 )
 def test_a_joint_at_its_limit(q, v, u, held):
-    """A (v' - v*) = g where g = (v_hat - v') / R is positive at the lower limit, and mirrored at the upper one."""
+    """A (v' - v*) = g if g = (v_hat - v') / R is positive at the lower limit. The upper limit is mirrored."""
     model, A = slide(limits=(-1.0, 1.0), damping=3.0), 2.1 + 3.0 * H
     free = v + H * (u - 3.0 * v) / A
     R, exact = NEAR_RIGID / A, free
@@ -177,7 +177,7 @@ def test_a_pd_controller_within_its_effort_at_its_limit_and_too_stiff_for_the_st
 
 @each_row("u", [0.0, 3.0])
 def test_two_blocks_whose_rails_are_coupled(u):
-    """q_0 = 2 q_1 with masses 1 and 1: A (v' - v*) = (1, -2) g, g = (-d / 2h - (v_0' - 2 v_1')) / R, R = b (1 + 4)."""
+    """For q_0 = 2 q_1, A (v' - v*) = (1, -2) g with g = (-d / 2h - (v_0' - 2 v_1')) / R, R = b (1 + 4)."""
     model, h, j = block(blocks=2, couple=True), 0.1, np.array([1.0, -2.0])
     q, v = np.array([0.3, 0.05]), np.array([0.2, -0.1])
     free = v + h * np.array([u, 0.0])
@@ -189,7 +189,7 @@ def test_two_blocks_whose_rails_are_coupled(u):
 
 @pytest.mark.parametrize("time_step", [0.005, 0.05])
 def test_couplers_of_light_fingers_of_a_robot_that_falls(time_step):
-    """Its momentum of falling is 1e7 times the impulses of its fingers: 12 are 1 or -1 times their leaders."""
+    """12 fingers are 1 or -1 times their leaders. The momentum of the fall is 1e7 times the fingers' impulses."""
     model = dd.load_model(robot_file("talos_full_v2.urdf"), time_step=time_step)
     found = couplers_of(model)
     assert not isinstance(found, Refusal), found
@@ -204,7 +204,7 @@ def test_couplers_of_light_fingers_of_a_robot_that_falls(time_step):
 
 
 def on_four_feet(approximation, random, stiffness=1e5, **options):
-    """Solo12 whose four feet press on the ground, and states in which it sinks, slides and turns."""
+    """Load Solo12 with four feet on the ground, and define random states in which it sinks, slides and turns."""
     model = example_robot("solo12.urdf", 0.002, approximation=approximation, feet=True, stiffness=stiffness, **options)
     x = model.default_state
     x[:7] = [1, 0, 0, 0, 0, 0, 0]
@@ -241,7 +241,7 @@ def test_the_differences_on_four_feet_are_autodiffs(approximation):
     drakes = ((found.drake[::2] - found.drake[1::2]) / (2 * step)).T
     size = np.abs(exact.A[:, columns]).max(axis=0)
     errors = [(np.abs(d - exact.A[:, columns]) / size).max() for d in (ours, drakes)]
-    # AutoDiffXd's derivative is taken where Drake stopped, up to 1e-6 of the momentum beside the solution.
+    # AutoDiffXd's derivative is taken where Drake's solver stopped, up to 1e-6 of the momentum from the solution.
     assert errors[0] < 1e-4
     assert np.all(found.left <= 1e-6)
 
@@ -262,11 +262,11 @@ def test_a_box_in_point_contact_which_autodiff_does_not_have():
     assert d.reason.endswith("of the step solved to rounding")
     found = dd.differentiate_step(model, x)
     assert found.method == "analytic"
-    assert np.abs(found.A - d.A).max() <= 1e-5 * np.abs(d.A).max()  # two ways to one derivative of a stiff step
+    assert np.abs(found.A - d.A).max() <= 1e-5 * np.abs(d.A).max()  # two derivatives of a stiff step
 
 
 def test_parts_of_one_body_that_overlap_take_no_part():
-    """Two spheres on the world and one on the ball's slide, the three in one another: the first pair moves nothing."""
+    """Of three overlapping spheres, two are fixed to the world. The contact between these two has no effect."""
     made, properties = Plant(H, "sap"), contact_properties(2e4, 0.0, 0.5, 0.01)
     made.ball("ball", 1.0, 0.1, properties, "z")
     post = made.plant.AddRigidBody("post", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
@@ -279,7 +279,7 @@ def test_parts_of_one_body_that_overlap_take_no_part():
 
 
 def test_a_link_far_lighter_than_what_carries_it():
-    """Sums of the momentum are 1e6 times what they amount to, and rounding is that much larger."""
+    """The terms of the momentum are 1e6 times their sum, so that rounding is larger by the same factor."""
     made = Plant(H, "sap")
     heavy = made.plant.AddRigidBody("heavy", SpatialInertia.SolidSphereWithMass(100.0, 0.1))
     light = made.plant.AddRigidBody("light", SpatialInertia.SolidSphereWithMass(1e-6, 0.1))
@@ -312,12 +312,12 @@ def test_a_step_is_the_same_alone_and_among_others_and_free_steps_are_drakes():
     many = refine_steps(model, select(model, ()), xs, us)
     for k in range(6):
         assert np.array_equal(many.x_next[k], refined(model, xs[k], us[k]))
-    np.testing.assert_allclose(many.x_next[2], many.drake[2], rtol=0, atol=1e-14)  # two orders of one sum
+    np.testing.assert_allclose(many.x_next[2], many.drake[2], rtol=0, atol=1e-14)  # the same sum in two orders
     assert np.abs(many.x_next - many.drake).max() > 1e-10
 
 
 def test_parameters_of_each_step():
-    """Friction, mass and the time step, as one by one with the value applied; what was applied is so still."""
+    """Batched values of friction, mass and time step act as single ones. Applied parameters are restored at the end."""
     model = dd.load_model("models/sphere_on_ground.sdf", time_step=H, contact_approximation="lagged")
     x = model.default_state
     x[6], x[10:] = 0.0999, [0.3, 0.0, -0.1]
@@ -333,7 +333,7 @@ def test_parameters_of_each_step():
     for k in range(5):
         given = dict(zip(names, values[k], strict=True))
         np.testing.assert_array_equal(many.drake[k], dd.step(model, x, parameters=given))
-        np.testing.assert_allclose(many.x_next[k], many.drake[k], atol=1e-6)  # Drake's tolerance, of 1 kg and 1 m/s
+        np.testing.assert_allclose(many.x_next[k], many.drake[k], atol=1e-6)  # Drake's tolerance for 1 kg and 1 m/s
     assert np.abs(many.x_next - before).max(axis=1).min() > 1e-6
 
 
@@ -341,7 +341,7 @@ def test_parameters_of_each_step():
 
 
 def test_parity_knows_the_solvers_tolerance_and_no_more(monkeypatch):
-    """An AutoDiffXd step that its solver left 1e-8 m/s beside the double one is it; 1e-4 m/s beside, or q', is not."""
+    """An AutoDiffXd step may differ from the double step by 1e-8 m/s (solver tolerance), not by 1e-4 m/s or in q."""
     model = ball(stiffness=1e4, dissipation=2.0)
     x, u, right = np.array([0.0, 0.0985, 1.0, -0.3]), np.zeros(0), sources.advance
 
@@ -366,7 +366,7 @@ def test_parity_knows_the_solvers_tolerance_and_no_more(monkeypatch):
 
 @each_row("wrong", ["friction", "stiffness", "dissipation", "time"])
 def test_another_material_is_refused(monkeypatch, wrong):
-    """By 1e-4 of its value: what the solver would have had to leave is 20 to 1,000 times its tolerance."""
+    """An error of 1e-4 in a value leaves a residual of 20 to 1,000 times the tolerance of Drake's solver."""
     approximation = "sap" if wrong == "time" else "lagged"
     model = ball(approximation, stiffness=1e4, relaxation_time=0.02, dissipation=2.0)
     x, right = [0.0, 0.0985, 1.0, -0.3], refining.combine
@@ -422,9 +422,9 @@ def test_what_is_not_known_is_named():
     "approximation", [*(pytest.param(name, marks=pytest.mark.slow) for name in ("lagged", "similar")), "sap"]
 )
 def test_robots_in_contact_are_never_refused_and_planted_materials_nearly_always(approximation, monkeypatch):
-    """288 random states of walking robots: Drake's steps are within its tolerance, and 1 % of stiffness is noticed.
+    """At 288 random states, Drake's steps are within its tolerance, and an error of 1 % in the stiffness is detected.
 
-    Where a foot leaves the ground in the step, or presses with less than 1e-6 of the momentum, nobody can notice.
+    It cannot be detected if a foot leaves the ground in the step, or presses with less than 1e-6 of the momentum.
     """
     random, right = np.random.default_rng(7), refining.combine
     noticed, states, worst = 0, 0, 0.0
@@ -445,5 +445,5 @@ def test_robots_in_contact_are_never_refused_and_planted_materials_nearly_always
                 noticed += len(refine_steps(model, select(model, ()), xs, us).refused)
             states += 12
     assert states == 288
-    assert 1e-7 < worst < 1e-3  # what the solver's stop is worth
+    assert 1e-7 < worst < 1e-3  # the error of Drake's solver
     assert noticed >= 0.7 * states

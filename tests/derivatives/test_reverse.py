@@ -1,4 +1,4 @@
-"""Gradients of functions of whole arrays: each operation against AutoDiffXd, and what must be refused."""
+"""Gradients of functions of arrays equal AutoDiffXd's for each operation. Unknown operations are refused."""
 
 import math
 
@@ -51,7 +51,7 @@ def test_a_gradient_is_autodiffs(name):
     if name == "at a corner":
         us[0] = 0.0
     value, by_xs, by_us, method = differentiate_loss(LOSSES[name], xs, us)
-    assert method == ("autodiff" if name == "a plain array's dot" else "autograd")  # NumPy does not pass that on
+    assert method == ("autodiff" if name == "a plain array's dot" else "autograd")  # NumPy does not dispatch Q.dot
     exact, of_xs, of_us = _by_autodiff(LOSSES[name], xs, us)
     assert value == pytest.approx(exact, rel=1e-14)
     np.testing.assert_allclose(by_xs, of_xs, rtol=0, atol=1e-13)  # the same sums in another order
@@ -90,7 +90,7 @@ def _moved(xs, us):
     ],
 )
 def test_what_is_not_known_is_not_answered(loss):
-    """NumPy's own answer would lose the derivative, or be another."""
+    """NumPy's own result would have no derivative, or a wrong one."""
     with pytest.raises((UntraceableError, TypeError, AttributeError, ValueError)):
         traced_gradient(loss, (np.ones((4, 3)), np.ones((3, 2))))
 
@@ -113,7 +113,7 @@ def test_what_is_not_known_goes_to_autodiff():
 
 @pytest.mark.solve
 def test_a_long_motions_loss_is_differentiated_in_time_that_grows_with_it(load):
-    """By AutoDiffXd the 20,000 numbers of this motion would take minutes."""
+    """AutoDiffXd would take minutes for the 20,000 numbers of this motion."""
     model, count = load("pendulum.urdf"), 10_000
     us = 0.1 * np.sin(0.01 * np.arange(count))[:, None]
     found = dd.differentiate_rollout(model, [0.1, 0.0], us, lambda xs, us: 1e-4 * ((xs * xs).sum() + (us * us).sum()))
@@ -124,4 +124,4 @@ def test_a_long_motions_loss_is_differentiated_in_time_that_grows_with_it(load):
         1e-4 * ((m.xs**2).sum() + (m.us**2).sum())
         for m in (dd.rollout(model, [0.1, 0.0], us + s * move) for s in (1, -1))
     ]
-    assert (ends[0] - ends[1]) / 2 == pytest.approx((found.by_us * move).sum(), rel=1e-4)  # of two sums of 20,000
+    assert (ends[0] - ends[1]) / 2 == pytest.approx((found.by_us * move).sum(), rel=1e-4)  # two sums of 20,000 terms

@@ -1,4 +1,4 @@
-"""What Drake differentiates wrongly without a word, and the gate that catches each."""
+"""Wrong derivatives that Drake returns without an error, and the checks that detect them."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from drake_diff.model.plant import actuators
 
 
 def test_pd_gains_reach_the_autodiff_twin():
-    """(m l^2 + h d + h^2 p) w+ = m l^2 w + h (u - m g l sin q - p q), the target being q = 0 at rest."""
+    """(m l^2 + h d + h^2 p) w+ = m l^2 w + h (u - m g l sin q - p q) with the target q = 0 at rest."""
     model, h, q, w, u = pd_pendulum(), 0.01, 0.7, -1.2, 0.3
     inertia = 0.25 + h * 3.0 + h**2 * 20.0
     w_next = (0.25 * w + h * (u - 9.81 * 0.5 * np.sin(q) - 20.0 * q)) / inertia
@@ -29,11 +29,11 @@ def test_pd_gains_reach_the_autodiff_twin():
 def test_dropped_pd_gains_are_caught_by_the_parity_gate():
     model = pd_pendulum()
     twin = actuators(model.autodiff.plant)[0]
-    twin.set_controller_gains(PdControllerGains(p=1e-12, d=0.0))  # as good as dropped
+    twin.set_controller_gains(PdControllerGains(p=1e-12, d=0.0))  # almost 0, as if they were dropped
     with pytest.raises(GradientError, match="the AutoDiffXd step differs from the double step: hinge_w"):
         dd.differentiate_step(model, [0.7, -1.2], [0.3], method="autodiff")
     found = dd.differentiate_step(model, [0.7, -1.2], [0.3])
-    assert found.method == "analytic"  # whose equation has the gains of the double plant
+    assert found.method == "analytic"  # its equation has the gains of the double plant
     np.testing.assert_allclose(found.A, dd.differentiate_step(pd_pendulum(), [0.7, -1.2], [0.3]).A, rtol=1e-12)
 
 
@@ -56,11 +56,11 @@ def test_the_derivative_that_drake_drops_at_an_identity_offset_is_caught(monkeyp
 
 
 def refuses(model, x):
-    """Whether a derivative here is refused outright or not certified."""
+    """Return whether the derivative at x is refused or not certified."""
     try:
         return dd.certify(model, x, method="autodiff").verdict != "agree"
     except GradientError:
-        return True  # AutoDiffXd gives NaN here in Drake 1.51
+        return True  # AutoDiffXd gives NaN at this state in Drake 1.51
 
 
 @pytest.mark.solve
@@ -80,7 +80,7 @@ def test_the_same_sphere_beside_the_axis_is_certified():
     slow_after(
         1,
         [
-            (Sphere(0.1), Cylinder(0.2, 0.2), 0.095),  # over an untilted cap
+            (Sphere(0.1), Cylinder(0.2, 0.2), 0.095),  # a sphere over a horizontal cap
             (Cylinder(0.1, 0.2), Cylinder(0.2, 0.2), 0.095),  # aligned caps
             (Box(0.2, 0.2, 0.2), Box(1, 1, 0.2), 0.0995),  # flat faces
         ],
@@ -120,7 +120,7 @@ def test_an_unknown_method_or_parameter_is_named(load):
 
 
 def test_parameter_columns_have_their_closed_form(load):
-    """w+ = s (w + h (u - m g l sin q) / I), s = 1 / (1 + h b / I), I = m l^2: by damping, and by mass at fixed l."""
+    """w+ = s (w + h (u - m g l sin q) / I) with s = 1 / (1 + h b / I), I = m l^2, and a fixed l."""
     h, q, w, u, b, inertia = 0.01, 0.7, -1.2, 0.3, 0.1, 0.25
     d = dd.differentiate_step(load("pendulum.urdf"), [q, w], [u], parameters=("hinge.damping", "pole.mass"))
     s = 1 / (1 + h * b / inertia)
@@ -137,7 +137,7 @@ def test_every_listed_parameter_is_certified_at_a_good_state():
     model = dd.load_model(MODELS / "double_pendulum.urdf", time_step=0.005)
     names = [p.name for p in dd.list_parameters(model)]
     assert {"upper.mass", "lower.center_of_mass", "elbow.damping", "elbow.offset"} <= set(names)
-    edge = (".damping", ".rotor_inertia", ".inertia")  # zero, and rods: see the next test
+    edge = (".damping", ".rotor_inertia", ".inertia")  # values of zero, and rods: see the next test
     names = [name for name in names if not name.endswith(edge)]
     dd.certify(model, [0.4, -0.9, 1.3, -0.6], [0.25, -0.15], parameters=names).require()
 

@@ -1,4 +1,4 @@
-"""Postures by inverse kinematics: closed forms, joints that follow, a closed loop, and a base that floats."""
+"""Tests of inverse kinematics against closed forms, with mimic joints, a closed loop, and a floating base."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def link(name, joint, parent, origin, more=""):
 
 
 def arm(tmp_path, more=""):
-    """Two links of 0.5 m about y that hang down, the second by `more` a follower of the first."""
+    """Write the URDF of two hanging links of 0.5 m that turn about y. `more` may make the elbow mimic the shoulder."""
     path = tmp_path / "arm.urdf"
     links = link("upper", "shoulder", "world", "0 0 0") + link("lower", "elbow", "upper", "0 0 -0.5", more)
     path.write_text(f'<robot name="arm"><link name="world"/>{links}</robot>')
@@ -40,12 +40,12 @@ def solve(model, frame, point, position, first, tolerance=1e-8):
 def test_two_links_reach_by_the_law_of_cosines(tmp_path, bent):
     model, r = dd.load_model(arm(tmp_path), time_step=0.01, actuators="all"), 0.7
     q = solve(model, "lower", [0, 0, -0.5], [r * np.sin(0.3), 0, -r * np.cos(0.3)], np.array([0.0, bent]))
-    half = np.arccos(r)  # of the triangle 0.5, 0.5, r
+    half = np.arccos(r)  # the base angle of the triangle with sides 0.5, 0.5, r
     assert q == pytest.approx([-0.3 - bent * half, bent * 2 * half], abs=1e-6)
 
 
 def test_what_is_free_stays_where_it_is_wished_for(tmp_path):
-    """Only the height is asked for: of the circle of elbows the posture nearest to the first one, by a fine search."""
+    """Only the tip's height is prescribed. The expected posture is the one nearest to the first, by a grid search."""
     model, first = dd.load_model(arm(tmp_path), time_step=0.01, actuators="all"), np.array([0.5, 0.4])
     q = solve(model, "lower", [0, 0, -0.5], [np.nan, np.nan, -0.6], first)
     shoulders = np.linspace(-1, 2, 300_001)
@@ -55,7 +55,7 @@ def test_what_is_free_stays_where_it_is_wished_for(tmp_path):
 
 
 def test_a_joint_that_follows_goes_along(tmp_path):
-    """The elbow is twice the shoulder: the tip is at 0.5 (sin a + sin 3 a, cos a + cos 3 a)."""
+    """The elbow angle is twice the shoulder angle a, so the tip is at 0.5 (sin a + sin 3 a, cos a + cos 3 a)."""
     mimic = '<mimic joint="shoulder" multiplier="2" offset="0"/>'
     model = dd.load_model(arm(tmp_path, mimic), time_step=0.01, actuators="all", mimic="reduce")
     height = -0.5 * (np.cos(0.4) + np.cos(1.2))
@@ -64,7 +64,7 @@ def test_a_joint_that_follows_goes_along(tmp_path):
 
 
 def test_a_loop_that_is_closed_stays_closed(tmp_path):
-    """A parallelogram of two cranks and a coupler that a ball joint ties: both cranks are at one angle."""
+    """Both cranks of a parallelogram, whose coupler is connected by a ball joint, have the same angle."""
     path = tmp_path / "loop.xml"
     inertia = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
     hinge = '<joint name="{}" type="hinge" axis="0 1 0" range="-170 170"/>'
@@ -86,7 +86,7 @@ def test_a_base_turns_and_moves_so_that_feet_and_centre_of_mass_are_where_they_a
     q0 = np.array(model.default_state[: model.nq])
     robot = Legs.named(model, legs, q0)
     way = np.random.default_rng(0).uniform(-0.1, 0.1, model.nv)
-    way[:3] *= 3  # [rad] about any axis
+    way[:3] *= 3  # [rad], about a random axis
     there = robot.moved(q0, way)
     feet, mass = robot.points_in(there), robot.center_of_mass()
     robot.put(q0)
@@ -101,7 +101,7 @@ def test_a_base_turns_and_moves_so_that_feet_and_centre_of_mass_are_where_they_a
 @pytest.mark.skipif(not LEGGED["talos"].is_installed, reason="no example-robot-data")
 @pytest.mark.parametrize(("seed", "steps", "ahead"), [(0, 60, 0.0), (10, 60, 0.0), (12, 40, 0.02)])
 def test_a_robot_on_flat_feet_rises_smoothly(seed, steps, ahead):
-    """Joints that turn by d in T accelerate by 10 / sqrt(3) d / T^2 at most; at some postures SNOPT fails."""
+    """Joints that turn by d in time T accelerate by at most 10 / sqrt(3) d / T^2. SNOPT fails at some postures."""
     model, robot = legged_model("talos"), LEGGED["talos"]
     first = rest("talos", model, np.array(robot.low), np.random.default_rng(seed))
     end = rest("talos", model, np.array(robot.high))[: model.nq]
@@ -110,11 +110,11 @@ def test_a_robot_on_flat_feet_rises_smoothly(seed, steps, ahead):
     turned = np.max(np.abs(xs[-1, 7 : model.nq] - first[7 : model.nq]))
     most = 10 / np.sqrt(3) * turned / (steps * model.time_step) ** 2
     acceleration = np.diff(xs[LEVELLED:, model.nq + 6 :], axis=0) / model.time_step
-    assert np.max(np.abs(acceleration)) < 1.5 * most  # the knees turn the fastest, and not as evenly; 20 with a jump
+    assert np.max(np.abs(acceleration)) < 1.5 * most  # the knees turn fastest, and less evenly; a jump gives 20
 
 
 def test_a_foot_that_rolls_goes_as_far_as_its_ball_turns():
-    """The body of a ball turned by a: its centre has gone r a, to the third order of a."""
+    """When the body of a ball foot turns by a, the ball's centre moves by r a, up to the third order in a."""
     legs = [f"{leg}_foot" for leg in ("FL", "FR", "RL", "RR")]
     model = dd.load_model(MODELS / "quadruped.urdf", time_step=0.02, ground=True, actuators="all", base="free")
     q0 = np.array(model.default_state[: model.nq])

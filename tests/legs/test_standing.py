@@ -1,4 +1,4 @@
-"""Legged robots on their feet: weights that are shared, postures that are refused, and a plan that holds."""
+"""Tests of standing robots: contact forces, refused postures, and a plan with the feet on the ground."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def sphere(place, radius):
 
 
 def quadruped(*, load="0 0 0", effort=60.0, foot=True, trunk=10.0, bottom=0.05):
-    """A trunk of 10 kg on four legs of 0.2 + 0.2 m, 1 kg each, with balls as feet; `load` is the trunk's centre."""
+    """Return the URDF of a 10 kg trunk, centred at `load`, on four ball-footed legs of 0.2 + 0.2 m and 1 kg each."""
     text = '<robot name="table">' + body("trunk", trunk, load, sphere("0 0 0", bottom))
     for leg, (x, y) in HIPS.items():
         text += body(f"{leg}_thigh", 0.5, "0 0 -0.1")
@@ -67,12 +67,12 @@ def legged(model):
 
 
 def test_four_feet_share_the_weight(on_feet):
-    """m g in all, no force sideways in all, no moment about the centre of mass; by symmetry a fourth on each foot."""
+    """Check that the forces sum to m g, have no moment about the centre of mass, and are equal by symmetry."""
     robot = legged(on_feet())
     stance = standing_posture(robot, robot.model.default_state[: robot.model.nq])
     total = np.sum(stance.forces, axis=0)
-    assert total == pytest.approx([0.0, 0.0, 14 * G], abs=1e-5)  # what Clarabel may be off, 1e-8 of the weight
-    assert stance.forces[:, 2] == pytest.approx(np.full(4, 14 * G / 4), rel=0.05)  # the trunk is centred to mm
+    assert total == pytest.approx([0.0, 0.0, 14 * G], abs=1e-5)  # Clarabel's error may be 1e-8 of the weight
+    assert stance.forces[:, 2] == pytest.approx(np.full(4, 14 * G / 4), rel=0.05)  # the trunk is centred to a few mm
     robot.put(stance.q)
     center = robot.model.plant.CalcCenterOfMassPositionInWorld(robot.model.double.context)
     moment = np.sum(np.cross(stance.points - center, stance.forces), axis=0)
@@ -80,7 +80,7 @@ def test_four_feet_share_the_weight(on_feet):
 
 
 def test_forces_of_a_load_off_the_middle_obey_the_lever(on_feet):
-    """The trunk's centre 0.1 m to the front: moments about the hind feet's line give what the front feet carry."""
+    """The trunk's centre is 0.1 m to the front. Moments about the line of the hind feet give the front feet's load."""
     robot = legged(on_feet(load="0.1 0 0"))
     model = robot.model
     stance = hold(robot, model.default_state[: model.nq] + np.eye(model.nq)[robot.base_q + 6] * 0.4)
@@ -89,15 +89,15 @@ def test_forces_of_a_load_off_the_middle_obey_the_lever(on_feet):
 
 
 def test_the_centre_of_mass_has_to_be_over_the_feet(on_feet):
-    """Legs straight, so that motors carry little: what is outside of the feet's rectangle falls, what is inside stands.
+    """Check that a robot falls if its centre of mass is outside the feet's rectangle, and stands if it is inside.
 
-    Each foot carries a tenth of an even share at least, which takes a twentieth of the half widths off.
+    With straight legs, motors carry little. A tenth of an even share per foot takes a twentieth off the half widths.
     """
     random, seen = np.random.default_rng(0), {True: 0, False: 0}
     for load in random.uniform([-0.4, -0.2], [0.4, 0.2], (24, 2)):
         robot = legged(on_feet(load=f"{load[0]} {load[1]} 0", effort=500))
         q = robot.model.default_state[: robot.model.nq] + np.eye(robot.model.nq)[robot.base_q + 6] * 0.42
-        part = float(np.max(np.abs(load * 10 / 14) / [0.2, 0.1]))  # of the half widths
+        part = float(np.max(np.abs(load * 10 / 14) / [0.2, 0.1]))  # relative to the half widths
         held = not isinstance(hold(robot, q), Refusal)
         if part > 1 or part < 0.9:
             assert held == (part < 1), (load, part)
@@ -108,10 +108,10 @@ def test_the_centre_of_mass_has_to_be_over_the_feet(on_feet):
 @each_row(
     "change, why",
     [
-        ({"load": "0.9 0 0", "trunk": 60.0}, "no forces"),  # beyond the feet, wherever they are put on 0.4 m of leg
-        ({"effort": 0.5}, "no forces"),  # a fourth of 14 kg on a bent knee takes some N m
+        ({"load": "0.9 0 0", "trunk": 60.0}, "no forces"),  # outside the feet, wherever legs of 0.4 m put them
+        ({"effort": 0.5}, "no forces"),  # a fourth of 14 kg on a bent knee needs a few N m
         ({"foot": False}, "has no shape|end in a shape"),
-        ({"bottom": 0.6}, "not at the end of a limb"),  # it lies on its belly
+        ({"bottom": 0.6}, "not at the end of a limb"),  # the trunk lies on the ground
     ],
 )
 def test_what_cannot_stand_is_refused_with_the_reason(change, why, on_feet):
@@ -122,19 +122,19 @@ def test_what_cannot_stand_is_refused_with_the_reason(change, why, on_feet):
 
 
 def test_at_rest_the_step_changes_nothing_and_drake_carries_the_weight(on_feet):
-    """In Drake's own contact forces, and over 100 steps under constant inputs too short for a fall."""
+    """Check that a step keeps the robot at rest and that Drake's own contact forces carry the weight."""
     model = on_feet()
     robot, rest = stand(model, *ranges(model))
     x = np.array(advance(model.double, rest.x, rest.u))
     forces = sum(contact.force for contact in contacts_of_the_step(model))
-    assert forces == pytest.approx([0.0, 0.0, 14 * G], abs=0.05)  # at 1e-4 m/s per step of 5 ms: 14 kg * 0.02 m/s^2
-    assert np.max(np.abs(x[model.nq :])) < 5e-3  # what counts as rest
+    assert forces == pytest.approx([0.0, 0.0, 14 * G], abs=0.05)  # 1e-4 m/s per step of 5 ms is 14 kg * 0.02 m/s^2
+    assert np.max(np.abs(x[model.nq :])) < 5e-3  # the threshold of rest
     assert {contact.body_a for contact in contacts_of_the_step(model)} == {f"{leg}_shank" for leg in HIPS}
     assert np.max(np.abs(robot.points_in(rest.x[: model.nq])[:, 2])) < 1e-3
 
 
 def test_a_frame_and_a_joint_go_where_they_are_asked_to(on_feet):
-    """By Drake's kinematics of the last state; what no motion of legs with feet in place reaches is refused."""
+    """Check by Drake's kinematics of the last state. A shift that legs with fixed feet cannot make is refused."""
     model = on_feet()
     robot, rest = stand(model, *ranges(model))
     frame, context = model.plant.GetFrameByName("trunk"), model.plant.CreateDefaultContext()
@@ -179,7 +179,7 @@ def test_a_robot_may_touch_the_ground_and_not_itself(tmp_path):
 
 
 def test_the_law_of_contact_can_be_told_where_the_file_does_not(tmp_path):
-    """A ball of 1 kg sinks by m g / k, which the near-rigid threshold would hide at long steps for light bodies."""
+    """Check the near-rigid option, whose threshold hides the sinkage m g / k of light bodies at long steps."""
     path = tmp_path / "table.urdf"
     path.write_text(quadruped())
     model = dd.load_model(path, time_step=0.01, near_rigid=0.1, relaxation_time=0.02)
@@ -191,7 +191,7 @@ def test_the_law_of_contact_can_be_told_where_the_file_does_not(tmp_path):
 
 
 def test_a_range_of_a_quaternion_is_that_of_the_turn(on_feet):
-    """Turned by a small angle the unit quaternion changes by half of it."""
+    """When a body turns by a small angle, its unit quaternion changes by half of this angle."""
     model = on_feet()
     space, x = tangent_space(model), model.default_state
     turn = np.zeros(space.size)
@@ -202,7 +202,7 @@ def test_a_range_of_a_quaternion_is_that_of_the_turn(on_feet):
 
 @pytest.mark.slow
 def test_solo12_lowers_its_trunk_with_its_feet_on_the_ground(tmp_path):
-    """Its own file in a plant of ours tells where feet and trunk are, in a replay in half the steps."""
+    """Check feet and trunk by a plant of the original file, over a replay at half the time step."""
     file = robot_file("solo12.urdf")
     done = plan(file, out=tmp_path / "out")
     assert done.success, done.lines
@@ -225,8 +225,8 @@ def test_solo12_lowers_its_trunk_with_its_feet_on_the_ground(tmp_path):
 
     first = places(motion.xs[0])
     way = np.max([np.abs(places(x) - first) for x in motion.xs])
-    assert way < 4e-3  # [m] a foot: a ball of 5 mm that rolls as the leg turns by a third of a radian
+    assert way < 4e-3  # [m] per foot: a ball of 5 mm rolls as the leg turns by a third of a radian
     trunk = [motion.xs[0][6], solution.xs[-1][6], motion.xs[-1][6]]
-    assert trunk[0] - trunk[1] > 0.003  # it is lowered
+    assert trunk[0] - trunk[1] > 0.003  # the trunk is lowered
     assert trunk[2] == pytest.approx(trunk[1], abs=1e-3)
     assert np.max(np.abs(motion.xs[-1][model.nq :])) < 0.05  # [rad/s, m/s] at rest

@@ -1,4 +1,4 @@
-"""Loops against closed forms: delays, lags, rates, noise, pushes; and what is done where the controller fails."""
+"""Control loops with delays, lags, rates, noise and pushes equal closed forms. Failing controllers are handled."""
 
 import dataclasses
 import re
@@ -37,7 +37,7 @@ def gain(kp, kd):
 
 
 def iterated(delay, kp, kd, x, steps, *, every=1):
-    """The double integrator written out, the command `delay` steps late by what is seen, x(0) before that."""
+    """Simulate the double integrator with commands from the state of `delay` steps before, or from x(0) at first."""
     seen, xs, y = [np.array(x)] * (delay + 1), [np.array(x)], np.array(x)
     for k in range(steps):
         y = seen[0] if k % every == 0 else y
@@ -58,8 +58,8 @@ def test_a_delayed_sensor_is_the_delayed_recursion(cart, delay):
 
 @pytest.mark.parametrize("delay", [1, 2, 4])
 def test_the_stability_limit_of_the_double_integrator_under_a_delay(cart, delay):
-    """z^d (z - 1)^2 + (h^2 kp z + h kd (z - 1)) / m = 0. Without kp what remains is z^d (z - 1) + h kd / m = 0, an
-    integrator, which is stable to h kd / m = 2 sin(pi / (2 (2 d + 1))): Kuruklis 1994.
+    """The poles solve z^d (z - 1)^2 + (h^2 kp z + h kd (z - 1)) / m = 0. For kp = 0, z^d (z - 1) + h kd / m = 0
+    remains, an integrator that is stable up to h kd / m = 2 sin(pi / (2 (2 d + 1))) (Kuruklis 1994).
     """
     limit = MASS / H * 2 * np.sin(np.pi / (2 * (2 * delay + 1)))
     for factor, stable in ((0.97, True), (1.03, False)):
@@ -71,12 +71,12 @@ def test_the_stability_limit_of_the_double_integrator_under_a_delay(cart, delay)
 @each_row("upright", [False, True])
 @each_row("limit", ["lower", "upper"])
 def test_the_stability_limits_of_the_pendulum_under_a_delay_of_one_step(load, upright, limit):
-    """Linearized about hanging (c = 1) or upright (c = -1), q from there, m = 1 kg, l = 0.5 m, I = m l^2, b = 0.1,
+    """The motion linearized at q = 0, hanging (c = 1) or upright (c = -1), has m = 1 kg, l = 0.5 m, I = m l^2, b = 0.1,
         w+ = s (w - h c (g / l) q + h u / I),  q+ = q + h w+,  s = 1 / (1 + h b / I),  u_k = -kp q_(k-1) - kd w_(k-1).
     With B = h s / I, p = h B kp, y = B kd, a = c h^2 s g / l and h z w = (z - 1) q this is
         z^3 - (1 + s - a) z^2 + (s + p + y) z - y = 0.
-    A pair z, 1/z on the unit circle leaves y as the third root, and by the coefficients y^2 - (s - a) y + s + p - 1 is
-    0: it is stable between the two y that make it so. (Jury's conditions at 1 and -1 hold with these numbers.)
+    If a pair z, 1/z is on the unit circle, the third root is y, and y^2 - (s - a) y + s + p - 1 = 0 from the
+    coefficients. The loop is stable between the two solutions. (Jury's conditions at 1 and -1 hold with these numbers.)
     """
     g, length, inertia, damping, kp = 9.81, 0.5, 0.25, 0.1, 200.0
     s = 1 / (1 + H * damping / inertia)
@@ -88,7 +88,7 @@ def test_the_stability_limits_of_the_pendulum_under_a_delay_of_one_step(load, up
     model, rest = load("pendulum.urdf", time_step=H), np.array([np.pi if upright else 0.0, 0.0])
     loop = Loop(sensor=Sensor(delay=1))
     for factor in (0.97, 1.03):
-        law, start = gain(kp, factor * y / B), rest + np.array([1e-6, 0.0])  # 1e-6 rad stay small: sin q is q to 1e-13
+        law, start = gain(kp, factor * y / B), rest + np.array([1e-6, 0.0])  # small angles: sin q is q to 1e-13
         found = closed_loop(model, lambda x, t, law=law: law(x - rest, t), start, 800, loop)
         sizes = np.linalg.norm((found.motion.xs - rest) * [1, H], axis=1)
         assert (sizes[-50:].max() < sizes[50:100].max()) == ((factor < 1) == (limit == "upper"))
@@ -98,7 +98,7 @@ def test_a_slow_sensor_holds_and_a_predictor_makes_up_for_a_delay(cart):
     slow = closed_loop(cart, gain(30, 8), [1.0, 0.0], 100, Loop(sensor=Sensor(every=4)))
     np.testing.assert_allclose(slow.motion.xs, iterated(0, 30, 8, [1.0, 0.0], 100, every=4), atol=1e-12)
     assert np.isnan(slow.observations[1:4]).all()
-    # With the state of 5 steps ago and the model, the state now is known: as if there were no delay after the first 5.
+    # The model predicts the current state from that of 5 steps before, as if there were no delay after the first 5.
     loop = Loop(sensor=Sensor(delay=5), estimator=Predictor(cart, 5))
     made_up = closed_loop(cart, gain(30, 8), [1.0, 0.0], 100, loop)
     np.testing.assert_allclose(made_up.estimates, made_up.motion.xs[:-1], atol=1e-12)
@@ -110,7 +110,7 @@ def test_noise_and_bias_are_what_was_asked_for(cart):
     found = closed_loop(cart, lambda x, t: np.zeros(1), [0.0, 0.0], 4000, Loop(sensor=sensor), seed=3)
     error = found.observations - found.motion.xs[:-1]
     np.testing.assert_allclose(error[:, 1], 0.2, atol=1e-12)
-    # The mean of 4000 is known to 0.3 / sqrt(4000) = 0.005, its standard deviation to 0.0034: four of them.
+    # The standard errors of the mean and of the deviation of 4000 values are 0.3 / sqrt(4000) = 0.005 and 0.0034.
     assert abs(error[:, 0].mean()) < 0.02
     assert abs(error[:, 0].std() - 0.3) < 0.014
     again = closed_loop(cart, lambda x, t: np.zeros(1), [0.0, 0.0], 4000, Loop(sensor=sensor), seed=3)
@@ -181,7 +181,7 @@ def test_substeps_are_the_plants_and_the_controller_has_its_own_period(cart):
 
 @pytest.mark.parametrize(("mode", "command"), [("hold", -30.0), ("stop", 0.0), ("damp", -2.0)])
 def test_the_fallback_takes_over_and_the_controller_recovers(cart, mode, command):
-    """It sees nothing for a while: steps 20 to 39 of a sensor that is torn off."""
+    """The sensor returns no samples from step 20 to step 39."""
 
     class TornOff(Sensor):
         def start(self, space, random):
@@ -214,7 +214,7 @@ def test_a_controller_that_fails_ends_the_run_or_is_replaced(cart):
 
 
 class Broken:
-    """A controller or an estimator that raises, or answers nonsense, in its start or from the fourth call on."""
+    """A controller or estimator that raises or returns a wrong shape, in its start or from the fourth call on."""
 
     def __init__(self, where):
         self.where, self.calls = where, 0
@@ -237,7 +237,7 @@ class Broken:
 @pytest.mark.parametrize("component", ["controller", "estimator"])
 @pytest.mark.parametrize(("where", "steps"), [("start", 0), ("call", 3), ("shape", 3)])
 def test_whatever_a_part_of_the_loop_raises_is_its_own_failure(cart, component, where, steps):
-    """It ends the run; a fallback takes the place of the controller, and of no estimator."""
+    """The failure ends the run, except that a fallback replaces a failed controller, but not a failed estimator."""
     why = r"ShapeError: .*" if where == "shape" else r"KeyError: 'no model'"
     for fallback in (None, Fallback("stop")):
         broken = Broken(where)
@@ -263,7 +263,7 @@ def test_ctrl_c_in_a_controller_is_no_failure_of_it(cart):
 
 
 def test_a_late_answer_is_not_used_and_the_last_command_is_held(cart):
-    """It is late in the steps 3, 4 and 7, whose answers nobody waits for; the plant is that of the commands held."""
+    """The controller is late in steps 3, 4 and 7, in which the plant moves under the previous command."""
 
     def answers(x, t):
         k = round(t / H)
@@ -291,7 +291,7 @@ def test_where_the_first_answer_is_late_nothing_is_applied(cart):
     assert found.late == 5
     assert found.latencies.min() >= 0.003
     assert not found.applied.any()
-    free = closed_loop(cart, slow, [0.0, 1.0], 5)  # no budget: it is waited for
+    free = closed_loop(cart, slow, [0.0, 1.0], 5)  # without a budget, the loop waits
     assert free.late == 0
     assert free.applied.all()
 
@@ -363,7 +363,7 @@ def test_each_part_makes_the_recorded_rows_again_and_a_changed_row_is_that_parts
     changed[20] += 0.1
     made = replayed(dataclasses.replace(run, commands=changed), cart, controller, loop, 4)
     wrong = [row for row in ROWS if not np.array_equal(getattr(made, row), getattr(run, row), equal_nan=True)]
-    assert wrong == ["estimates", "applied"]  # which follow from commands; the controller's own are as they were
+    assert wrong == ["estimates", "applied"]  # both follow from the commands, which the controller computes as before
     assert np.array_equal(made.xs, run.xs)
 
 

@@ -1,4 +1,4 @@
-"""Closed loops saved: what is in the directory, what `verify` makes again, what it finds, and what it leaves alone."""
+"""Saved closed loops: the files, their replay by `verify`, the changes that it detects, and code that it never runs."""
 
 import dataclasses
 import json
@@ -46,7 +46,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def mpc(folder):
-    """It swings the pole of a Furuta pendulum up in 1.5 s."""
+    """Build an MPC that swings up the pole of a Furuta pendulum in 1.5 s."""
     problem = dd.Problem(
         furuta(folder, 0.1, time_step=0.02),
         x0=np.zeros(4),
@@ -107,7 +107,7 @@ def test_the_trace_has_all_that_the_loop_saw_and_did(saved, swing_up):
 
 @pytest.mark.slow
 def test_a_perturbed_and_a_late_run_hold_too(mpc, folder):
-    """A heavier pole in finer steps, a push, noise, a delay that a predictor makes up for, a lag; and late answers."""
+    """One run has a heavier pole, finer steps, a push, noise, a predicted delay and a lag, another has late answers."""
     plant = furuta(folder, 0.12, time_step=0.005)
     loop = Loop(
         Sensor(noise=0.002, delay=1),
@@ -133,7 +133,7 @@ def test_a_perturbed_and_a_late_run_hold_too(mpc, folder):
 
 
 class Counted:
-    """A user's controller, estimator and sensor, which must not be called by `verify`."""
+    """A user's controller and estimator, which `verify` must not call."""
 
     calls = 0
 
@@ -194,7 +194,7 @@ def test_a_killed_save_leaves_a_directory_that_says_so_with_all_that_was_recorde
 
 @pytest.fixture(scope="module")
 def small(folder):
-    """A pendulum under MPC that answers late twice, measured with noise, through a lag."""
+    """Run a pendulum under MPC with measurement noise and an actuator lag."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
     goal = {"x0": [0.4, 0], "x_goal": [0, 0], "num_steps": 20, "running_cost": dd.QuadraticCost(Q=np.eye(2), R=[[1.0]])}
     mpc = dd.loop.MPC(dd.Problem(model, **goal), horizon=5)
@@ -209,7 +209,7 @@ ALTERED = ("xs", "us", "observations", "estimates", "commands", "applied", "time
 
 
 def altered(run, how, seed):
-    """The run with one value changed, by 1e-6 of the largest of its kind at least."""
+    """Return the run with one value changed, by at least 1e-5 of the largest of its kind."""
     chance = random.Random(seed)
     if how == "status":
         statuses = list(run.controller_status)
@@ -217,10 +217,10 @@ def altered(run, how, seed):
         return dataclasses.replace(run, controller_status=tuple(statuses))
     rows = np.array(getattr(run, how))
     entry = tuple(chance.randrange(n) for n in rows.shape)
-    largest = -2 if how == "times" else 0  # times still rise: else no trace could be written
+    largest = -2 if how == "times" else 0  # times must increase to write a trace
     change = chance.choice([-1, 1]) * 10 ** chance.uniform(-5, largest) * np.abs(rows).max()
     rows[entry] += 2.0 if how == "latencies" else change
-    if how == "us":  # as if the actuator had done it
+    if how == "us":  # as if the actuator had applied it
         return dataclasses.replace(run, us=rows, motion=dataclasses.replace(run.motion, us=rows))
     if how == "xs":
         return dataclasses.replace(run, xs=rows, motion=dataclasses.replace(run.motion, xs=rows))
@@ -244,7 +244,7 @@ def forged_metric(seed):
     "count", [pytest.param(10, marks=pytest.mark.slow), pytest.param(40, marks=[pytest.mark.slow, pytest.mark.long])]
 )
 def test_altered_runs_are_broken_although_everything_written_of_them_agrees(small, folder, monkeypatch, count):
-    """Record, trace, pages and seals are all made of the altered rows, by one who says that each part made its row."""
+    """Record, trace, pages and hashes are written from the altered rows, and a forged replay agrees with them."""
     dd.save(small, folder / "small")
     assert dd.verify(folder / "small").holds
     missed = []
@@ -279,7 +279,7 @@ def test_the_report_opens_without_a_network_and_without_an_error(saved, browser,
 
 
 def test_a_small_state_beside_a_fast_wheel_is_compared_by_its_own_size():
-    """A slide of 1e-6 m beside a wheel that has turned by 1e5 rad: 1 % of the slide is no rounding."""
+    """A change of 1 % in a slide of 1e-6 m is no rounding, even if a wheel has turned by 1e5 rad."""
     recorded = np.column_stack([np.linspace(0, 1e5, 11), np.linspace(0, 1e-6, 11), np.full(11, 1e-17)])
     other = recorded * [1, 1 + 1e-2, 1]
     assert files._relative_difference(recorded, other) > files.ROUNDED

@@ -1,4 +1,4 @@
-"""MPC against Riccati's recursion and Drake's regulator, on the pushed cart-pole, and where its solve fails."""
+"""MPC equals Riccati's recursion and Drake's regulator, swings up a pushed cart-pole, and handles failed solves."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 
 def straight(problem):
-    """A guess that is no motion: with linear dynamics and quadratic costs any will do."""
+    """Return a guess that is no motion. With linear dynamics and quadratic costs, any guess is sufficient."""
     return np.tile(problem.x0, (problem.num_steps + 1, 1)), np.zeros((problem.num_steps, 1))
 
 
@@ -36,7 +36,7 @@ def swung():
 @each_row("case", OTHERS)
 @each_row("horizon", [1, 4, 1000])
 def test_it_is_the_remaining_horizons_lqr_whatever_its_own_horizon(case, horizon):
-    """From states far from any plan; 1e-9 of an input of about 5: the sums of a few dozen rounded terms."""
+    """The states are far from any plan. A tolerance of 1e-9 for inputs of about 5 is rounding of dozens of terms."""
     problem, gains = lqr(*case), riccati(*case)[1]
     mpc = dd.loop.MPC(problem, horizon=horizon, plan=straight(problem))
     random = np.random.default_rng(0)
@@ -70,7 +70,7 @@ def test_after_the_end_the_goal_is_stayed_at_by_lqr():
 
 
 def test_a_goal_that_gravity_pulls_away_from_is_stayed_at_by_the_input_that_holds_it():
-    """m g l sin q = 9.81 / 2 N m holds the pendulum of 1 kg and 0.5 m level; 1e-6 is LQR's own check."""
+    """The pendulum of 1 kg and 0.5 m is horizontal under m g l sin q = 9.81 / 2 N m. LQR's tolerance is 1e-6."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
     problem = dd.Problem(model, x0=[0, 0], x_goal=[np.pi / 2, 0], num_steps=50, running_cost=EFFORT)
     mpc = dd.loop.MPC(problem, horizon=20)
@@ -83,7 +83,7 @@ def test_a_goal_that_gravity_pulls_away_from_is_stayed_at_by_the_input_that_hold
 
 @pytest.mark.slow
 def test_the_pushed_cart_pole_ends_upright(swung):
-    """One push on the way that open loop does not survive, one when it stands; both within |u| <= 20."""
+    """One push acts during the swing-up, after which the open loop fails, and one when the pole is upright."""
     problem, pushes = swung.problem, [dd.loop.Push("pole", [1.5, 0, 0], 0.8), dd.loop.Push("pole", [-0.5, 0, 0], 2.6)]
     runs = {}
     for name, controller in (
@@ -92,16 +92,16 @@ def test_the_pushed_cart_pole_ends_upright(swung):
     ):
         runs[name] = dd.loop.closed_loop(problem.model, controller, problem.x0, 300, dd.loop.Loop(pushes=pushes))
     end = runs["mpc"].motion.xs[-1]
-    assert np.abs(end - [1, np.pi, 0, 0]).max() < 0.02  # 3.4 s after the push, and the cart is slow to come back
+    assert np.abs(end - [1, np.pi, 0, 0]).max() < 0.02  # 3.4 s after the push; the cart returns slowly
     assert np.abs(runs["open loop"].motion.xs[-1] - end).max() > 1
     assert np.abs(runs["mpc"].commands).max() <= 20
-    assert np.abs(runs["mpc"].commands).max() > 19.9  # the bound is met, at which Drake's derivative is 0
+    assert np.abs(runs["mpc"].commands).max() > 19.9  # the bound is active, where Drake's derivative is 0
     assert runs["mpc"].ended == ""
 
 
 def test_between_two_plans_the_first_ones_inputs_are_given(swung):
-    """Only steps 0, 3 and 6 look at the state, and there it is as planned: 1e-4 of 3 N is what two minima of a cost of
-    59 can differ by that both leave 1e-16 of it."""
+    """Only steps 0, 3 and 6 use the state, which is the planned one. The inputs of two minima of a cost of 59 that are
+    equal to 1e-16 may differ by 1e-4 of 3 N."""
     mpc = dd.loop.MPC(swung.problem, horizon=30, plan=swung, replan_every=3)
     xs, us = mpc._reference.xs, mpc._reference.us
     given = [mpc(xs[k] + (0.1 if k % 3 else 0.0), 0.02 * k) for k in range(7)]
@@ -123,7 +123,7 @@ def test_a_refused_solve_is_told_and_the_last_plan_followed(swung, monkeypatch):
             command = mpc(x1, 0.02 * k)
             assert mpc.status == "the last plan is followed further: GradientError: this far and no further"
             assert np.array_equal(command, planned[k] if k < 30 else reference.us[k])
-            assert mpc.gains is None  # of no step that was solved
+            assert mpc.gains is None  # no step was solved
     assert mpc(np.full(4, np.nan), 0.02 * 36) == pytest.approx(reference.us[36])
     assert "NonFiniteError" in mpc.status
     assert mpc(reference.xs[37], 0.02 * 37) == pytest.approx(reference.us[37], abs=1e-4)

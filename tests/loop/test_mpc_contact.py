@@ -1,4 +1,4 @@
-"""MPC of models that touch: sliding friction in closed form, a quadruped under a blow, derivatives that are wrong."""
+"""MPC of models with contact: sliding friction in closed form, a quadruped after a push, and a pushed sphere."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ G, FRICTION = 9.81, 0.5
 
 
 def sliding(h, count, Q, R, Qf):
-    """A block of 1 kg is to slide at 1 m/s over a ground of friction 0.5; states x, z and their speeds."""
+    """Build the task to slide 1 kg at 1 m/s over ground of friction 0.5, with the states x, z and their velocities."""
     plant = Plant(h, "lagged")
     plant.ball("ball", 1.0, 0.1, contact_properties(2e4, 10, FRICTION), "x", "z")
     plant.ground(contact_properties(2e4, 10, FRICTION))
@@ -24,7 +24,7 @@ def sliding(h, count, Q, R, Qf):
     model = plant.model()
     times = h * np.arange(count + 1)
     rest = model.default_state
-    rest[1] = 0.1 - G / 1e4  # the stiffness of two like shapes is half of each
+    rest[1] = 0.1 - G / 1e4  # the stiffness of two equal shapes is half of each
     xs = np.tile(rest, (count + 1, 1))
     xs[:, 0], xs[:, 2] = times, 1.0
     us = np.full((count, 1), FRICTION * G)
@@ -38,7 +38,7 @@ def sliding(h, count, Q, R, Qf):
 
 @pytest.mark.parametrize("horizon", [3, 20])
 def test_against_sliding_friction_it_is_lqr_beside_what_friction_takes(horizon):
-    """u = mu m g - K (x - x_ref); 1e-4: Drake's friction at 0.5 m/s lacks 2e-8, its normal force settles to 1e-5."""
+    """u = mu m g - K (x - x_ref). Drake's friction at 0.5 m/s has an error of 2e-8, its normal force of 1e-5."""
     case = 0.02, 20, np.diag([5.0, 1.0]), 0.1, 10 * np.eye(2)
     problem, xs, us = sliding(*case)
     gains = riccati(*case)[1]
@@ -54,7 +54,7 @@ def test_against_sliding_friction_it_is_lqr_beside_what_friction_takes(horizon):
 
 @pytest.fixture(scope="module")
 def solo():
-    """Solo12 on PD controllers that hold its stance, at 20 ms for the plan and at 1 ms to be driven, and its rest."""
+    """Load Solo12 with PD control of its stance, at 20 ms for plans and at 1 ms for simulation, and its rest state."""
     options = {"feet": True, "gains": (5.0, 0.2), "leg": (0.0, 0.8, -1.6)}
     model, fine = (example_robot("solo12.urdf", h, **options) for h in (0.02, 0.001))
     x = model.default_state
@@ -81,7 +81,7 @@ def struck(model, rest, speed):
 
 
 def test_a_quadruped_stays_on_its_feet_where_its_controllers_alone_fall(solo):
-    """The trunk is struck sideways to 1.4 m/s, and driven in steps of 1 ms: it is upright, as high as it was, still."""
+    """After a lateral push to 1.4 m/s, simulated at steps of 1 ms, the trunk is upright, at its height, and slow."""
     model, fine, rest = solo
     problem, plan = standing(model, rest)
     mpc = dd.loop.MPC(problem, horizon=10, plan=plan)
@@ -102,7 +102,7 @@ def test_a_quadruped_stays_on_its_feet_where_its_controllers_alone_fall(solo):
 
 
 def test_its_plan_is_the_plants_own_motion(solo):
-    """What touches is rolled out: no gap is left between the steps, exactly."""
+    """The plan of a model with contact is a rollout, which has no gaps between its steps."""
     model, _, rest = solo
     problem, plan = standing(model, rest)
     mpc = dd.loop.MPC(problem, horizon=10, plan=plan)
@@ -114,9 +114,9 @@ def test_its_plan_is_the_plants_own_motion(solo):
 
 
 def test_it_pushes_from_a_guess_that_does_not_touch(two_spheres):
-    """A sphere pushes another, 0.1 m apart at first, to 0.5 m, and stops: by a cost that wants it behind the other.
+    """A sphere, at first 0.1 m away, pushes another to 0.5 m and stops. The cost tracks a position behind the other.
 
-    0.5 kg against 5 N s/m stops within 2 cm from 0.2 m/s.
+    A mass of 0.5 kg with a damping of 5 N s/m stops from 0.2 m/s within 2 cm.
     """
     model = two_spheres(damping=5.0)
     times, x0, steps = 0.02 * np.arange(101), np.array([0.0, 0.3, 0.0, 0.0]), 100

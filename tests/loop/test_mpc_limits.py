@@ -1,4 +1,4 @@
-"""What MPC keeps: limits against another solver's optimum, what gives way, late answers, wrong derivatives, contact."""
+"""Limits in MPC as in another solver's optimum, relaxed limits, late answers, wrong derivatives, and contact."""
 
 from dataclasses import replace
 
@@ -27,9 +27,9 @@ def straight(problem):
 
 
 def by_clarabel(x0, count, *, u_max, v_max, price=None):
-    """(us (count,), cost, (count,) how far |v| is beyond v_max) of the double integrator by Drake's own solver.
+    """Solve for us (count,), the cost, and the excess of |v| over v_max (count,) of the double integrator.
 
-    With a price the limit of the speed may give way, else it is kept.
+    With a price, the limit of the speed may be violated.
     """
     program = MathematicalProgram()
     us, xs, slacks = (program.NewContinuousVariables(count, n, name) for n, name in ((1, "u"), (2, "x"), (1, "s")))
@@ -62,7 +62,7 @@ def limited(u_max=1.0, v_max=0.4):
 
 
 def test_with_limits_that_hold_it_is_the_programs_solution():
-    """1e-6 of inputs within 1: Clarabel's tolerance is 1e-8, of a cost that is flat to second order."""
+    """Inputs up to 1 agree to 1e-6: Clarabel's tolerance is 1e-8, of a cost that is flat at its minimum."""
     problem, random, held = limited(), np.random.default_rng(0), 0
     mpc = MPC(problem, horizon=COUNT, plan=straight(problem))
     for _ in range(20):
@@ -73,12 +73,12 @@ def test_with_limits_that_hold_it_is_the_programs_solution():
         np.testing.assert_allclose(mpc.plan[1][:, 0], us, atol=1e-6)
         assert mpc.status == "ok"
         held += int(np.any(np.abs(mpc.plan[0][1:, 1]) > 0.4 - 1e-6))
-    assert held > 10  # the limit of the speed is met in most of them
+    assert held > 10  # the limit of the speed is active in most solutions
 
 
 @each_row("x0", [[1.2, -0.15], [-0.9, 0.1]])
 def test_gains_and_value_are_the_derivatives_of_the_programs_solution_by_its_first_state(x0):
-    """Central differences over 1e-3 of Clarabel's solutions, where the same limits hold on both sides."""
+    """The reference is central differences over 1e-3 of Clarabel's solutions with the same active limits."""
     problem = limited()
     mpc = MPC(problem, horizon=COUNT, plan=straight(problem))
     x0, d, with_limits = np.array(x0), 1e-3, {"u_max": 1.0, "v_max": 0.4}
@@ -97,11 +97,11 @@ def test_gains_and_value_are_the_derivatives_of_the_programs_solution_by_its_fir
         x = A @ x + B @ moved[k]
     assert np.any(np.abs(mpc.plan[1]) > 1 - 1e-6)
     assert np.any(np.abs(mpc.plan[0][1:, 1]) > 0.4 - 1e-6)
-    np.testing.assert_allclose(np.array(moved)[:, 0], us, atol=1e-3)  # of gains of 10
+    np.testing.assert_allclose(np.array(moved)[:, 0], us, atol=1e-3)  # gains are about 10
 
 
 def test_what_cannot_be_kept_gives_way_by_as_little_as_it_can_and_is_told():
-    """At 0.6 m/s with |u| <= 1 the next speed is 0.5 at least, 0.1 beyond its limit."""
+    """At 0.6 m/s with |u| <= 1, the next speed is at least 0.5 m/s, which is 0.1 m/s beyond its limit."""
     problem = limited()
     mpc = MPC(problem, horizon=COUNT, plan=straight(problem))
     assert mpc([-1.0, 0.6], 0.0) == pytest.approx([-1.0], abs=1e-6)
@@ -115,7 +115,7 @@ def test_what_cannot_be_kept_gives_way_by_as_little_as_it_can_and_is_told():
 
 
 def test_a_limit_that_the_motion_need_not_pass_is_never_traded_for_its_cost():
-    """From 20 m off the cost of a state is 400 times that within: the speed's limit stays."""
+    """At 20 m from the goal, the cost of a state is 400 times larger, but the limit of the speed is satisfied."""
     problem = limited()
     mpc = MPC(problem, horizon=COUNT, plan=straight(problem))
     mpc.start([20.0, 0.0])
@@ -140,7 +140,7 @@ def test_a_waypoint_is_met_at_the_problems_own_knot(horizon):
 
 
 def test_constraints_of_states_and_inputs_are_kept_at_their_knots():
-    """Power at all knots, and a speed between the knots 5 and 8 alone."""
+    """The power is limited at all knots, and the speed only at knots 5 to 8."""
     power = dd.Constraint(lambda x, u: x[1] * u[0], lower=-0.2, upper=0.2, name="power")
     slow = dd.Constraint(lambda x: x[1], upper=0.15, knots=[5, 6, 7, 8], name="slow")
     problem = dd.Problem(
@@ -148,7 +148,7 @@ def test_constraints_of_states_and_inputs_are_kept_at_their_knots():
     )
     run = closed_loop(problem.model, MPC(problem, horizon=12), problem.x0, 40)
     xs, us = run.motion.xs, run.applied
-    assert np.abs(xs[:-1, 1] * us[:, 0]).max() < 0.2 + 1e-3  # RTI: of one step from the plan's own optimum
+    assert np.abs(xs[:-1, 1] * us[:, 0]).max() < 0.2 + 1e-3  # one real-time iteration from the plan's optimum
     assert xs[5:9, 1].max() < 0.15 + 1e-5
     assert xs[10:20, 1].max() > 0.3
     assert np.abs(xs[-1] - [1, 0]).max() < 1e-3
@@ -156,7 +156,7 @@ def test_constraints_of_states_and_inputs_are_kept_at_their_knots():
 
 @pytest.mark.slow
 def test_a_goal_is_stayed_at_past_an_obstacle():
-    """The double pendulum's tip, without a whole goal state, and a ball that the free motion would enter."""
+    """A double pendulum reaches its goal past a ball that the motion without an obstacle would enter."""
     model = dd.load_model(MODELS / "double_pendulum.urdf", time_step=0.02)
     goals = [dd.SphereObstacle([0.5, 0.0, -0.75], 0.1, margin=0.02, name="ball")]
     end = [1.2, 0.3, 0.0, 0.0]
@@ -167,14 +167,14 @@ def test_a_goal_is_stayed_at_past_an_obstacle():
     run = closed_loop(model, mpc, problem.x0, 70, Loop(pushes=pushes))
     clear = problem.kept_goals[0]
     assert np.abs(run.motion.xs[-1] - end).max() < 1e-2
-    assert np.max(clear.lacking(run.motion.xs)) < 0.02  # the margin may be used, the ball is not entered
+    assert np.max(clear.lacking(run.motion.xs)) < 0.02  # the margin may be violated, but the ball is not entered
 
 
 def test_a_late_answer_is_not_used_and_the_last_plan_goes_on():
     problem = limited()
 
     def ticking(taken):
-        """A clock of which each call of the controller takes `taken` of its list."""
+        """Return a clock, and a function that advances it by the next duration in `taken`."""
         now = [0.0]
         rows = iter(taken)
 
@@ -213,7 +213,7 @@ def test_a_late_answer_is_not_used_and_the_last_plan_goes_on():
 @pytest.mark.slow
 @each_row("wrong", ["sign", "half", "transposed"])
 def test_wrong_derivatives_are_seen(wrong):
-    """B of the other sign, of half its size, or A transposed: the plant does not do what they promise."""
+    """With a wrong sign or half the size of B, or a transposed A, the plant does not move as predicted."""
     model = dd.load_model(MODELS / "double_pendulum.urdf", time_step=0.02)
     problem = dd.Problem(model, x0=[0, 0, 0, 0], x_goal=[1.0, 0.5, 0, 0], num_steps=50,
                          running_cost=dd.QuadraticCost(R=0.01 * np.eye(2)))  # fmt: skip
@@ -236,7 +236,7 @@ def test_wrong_derivatives_are_seen(wrong):
 
 
 def test_it_starts_and_stays_in_contact():
-    """A box of 2 kg pressed on the ground, where only contact holds it up; the press lifts it within its bounds."""
+    """Contact alone supports a box of 2 kg on the ground. The actuator's bounds allow lifting the box."""
     model = box_on_the_ground(pusher=True)
     x0 = dd.rollout(model, model.default_state, np.zeros((1000, 1))).xs[-1]
     cost = dd.QuadraticCost(Q=np.diag([1e4, 1.0]), R=[[1e-4]], x_ref=x0)
@@ -253,7 +253,7 @@ def test_a_solution_of_another_horizon_starts_it():
     problem = dd.Problem(block(time_step=0.1), x0=[1, 0], x_goal=[0, 0], num_steps=20, running_cost=EFFORT)
     other = dd.solve(dd.Problem(block(time_step=0.05), x0=[1, 0], x_goal=[0, 0], num_steps=50, running_cost=EFFORT))
     found = MPC(problem, horizon=5, plan=other), MPC(problem, horizon=5)
-    # Of 1.4 N: what it costs to miss the goal is in the unit of the given plan's own cost.
+    # Of 1.4 N: the penalty on the goal error is in units of the given plan's cost.
     np.testing.assert_allclose(found[0]._reference.us, found[1]._reference.us, atol=3e-3)
     model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.05)
     of_another = dd.solve(dd.Problem(model, x0=np.zeros(4), num_steps=5, running_cost=EFFORT))

@@ -1,4 +1,4 @@
-"""Distances of a robot's pieces: against closed forms, against Drake's own queries, and their derivatives."""
+"""Distances of a robot's pieces and their derivatives equal closed forms, Drake's queries and AutoDiffXd."""
 
 import itertools
 import re
@@ -59,15 +59,15 @@ from drake_diff.model.tangent import any_state
 pytestmark = pytest.mark.solve
 
 ROBOTS = ("ur5_robot.urdf", "panda.urdf", "a1.urdf")  # hinges; hinges and slides; a free base
-CLOSED = 1e-9  # [m] of metres: closed forms on both sides
-# [m] For a pair of capsules Drake has no closed form: its library searches, and stops above the least distance. Ours is
+CLOSED = 1e-9  # [m] for distances of metres, with closed forms on both sides
+# [m] For two capsules, Drake has no closed form. Its library iterates, and stops above the minimal distance. Ours is
 # compared with a finer search below.
 ITERATED = 1e-4
-SLOPES = 1e-11  # of slopes up to 2: both exact
+SLOPES = 1e-11  # for slopes up to 2, which are exact on both sides
 
 
 class Two:
-    """Two shapes in Drake, and their signed distance by its QueryObject."""
+    """Two shapes in Drake, whose signed distance its QueryObject computes."""
 
     def __init__(self, *shapes):
         builder = DiagramBuilder()
@@ -136,11 +136,11 @@ def test_two_segments_are_as_near_as_a_search_over_both_finds():
         squared = [np.sum((b - a) ** 2) for a, b in (one, other)]
         s, t = along_segments(tuple(one), tuple(other), *map(np.asarray, squared))
         found = np.linalg.norm(one[0] + s * (one[1] - one[0]) - other[0] - t * (other[1] - other[0]))
-        # for each place on one of them the nearest on the other in closed form, and that on a fine grid
+        # the nearest point of the other segment in closed form, for points of a fine grid on this segment
         places = one[0] + np.linspace(0, 1, 4001)[:, None] * (one[1] - one[0])
         along = np.clip((places - other[0]) @ (other[1] - other[0]) / max(squared[1], 1e-300), 0, 1)
         best = np.min(np.linalg.norm(places - other[0] - along[:, None] * (other[1] - other[0]), axis=1))
-        assert best - 1e-3 <= found <= best + 1e-9, k  # the grid is that much too far at most
+        assert best - 1e-3 <= found <= best + 1e-9, k  # the grid's minimum is at most 1e-3 too large
 
 
 @pytest.mark.parametrize("robot", slow_after(1, ROBOTS))
@@ -183,7 +183,7 @@ def test_where_links_are_is_refused_where_the_tree_is_another(monkeypatch):
 
 
 def inside(pieces, points):
-    """Whether each of `points` (P, 3) is in one of the pieces (start, end, radius)."""
+    """Return whether each of `points` (P, 3) is in one of the pieces (start, end, radius)."""
     found = np.zeros(len(points), dtype=bool)
     for start, end, radius in pieces:
         t = np.clip((points - start) @ (end - start) / max(np.sum((end - start) ** 2), 1e-300), 0, 1)
@@ -192,7 +192,7 @@ def inside(pieces, points):
 
 
 def within(shape, random, count):
-    """Random points of a shape, many of them on its surface."""
+    """Draw random points of a shape, many of them near its surface."""
     part = random.uniform(0, 1, (count, 1)) ** 0.1
     if isinstance(shape, Box):
         points = random.uniform(-1, 1, (count, 3))
@@ -248,7 +248,7 @@ def test_a_robot_without_readable_shapes_is_a_skeleton_and_says_so():
 
 
 def without_shapes():
-    """Two rods whose file has no visuals and no collisions."""
+    """Load two rods whose file has no visuals and no collisions."""
     text = (MODELS / "double_pendulum.urdf").read_text()
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.01, use_sampled_output_ports=False), builder)
@@ -260,7 +260,7 @@ def without_shapes():
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", ["ur5_robot.urdf", "xarm7.urdf"])
 def test_collision_meshes_are_contained_though_the_step_skips_them(robot):
-    """Every corner of every mesh, as trimesh reads the file's own, is in a capsule of its link."""
+    """Every vertex of every mesh file, read with trimesh, is in a capsule of its link."""
     model = dd.load_model(robot_file(robot), time_step=0.02, base="weld")
     links = forward_kinematics(model)
     cover = cover_of(model, links)
@@ -290,7 +290,7 @@ def test_collision_meshes_are_contained_though_the_step_skips_them(robot):
 
 @each_row("options", [{}, {"contact_geometry": "corner_spheres"}, {"contact": False}])
 def test_what_a_step_touches_with_is_not_what_is_kept_clear(options):
-    """Spheres in its corners leave most of a box open: the cover is that of the box that the file gives."""
+    """Spheres at the corners of a box do not cover it, so that the cover is that of the box in the file."""
     model = dd.load_model(MODELS / "box_push.sdf", time_step=0.01, **options)
     whole = dd.load_model(MODELS / "box_push.sdf", time_step=0.01)
     found, wanted = ([p for p in cover_of(m, forward_kinematics(m)).pieces if p.link >= 0] for m in (model, whole))
@@ -308,7 +308,7 @@ def test_parameters_that_move_links_are_refused():
 
 
 def chain(*kinds):
-    """Balls of 0.1 m on joints of these types, each turned and 0.4 m from the last."""
+    """Build balls of 0.1 m on joints of the types `kinds`, each rotated and at a distance from the previous one."""
     plant, turn = Plant(0.01), RigidTransform(RollPitchYaw(0.3, -0.4, 0.5), [0.1, 0.2, 0.4])
     before = plant.plant.world_body()
     for i, kind in enumerate(kinds):
@@ -360,7 +360,7 @@ def test_joints_of_several_coordinates_are_chains_of_hinges_and_slides(kinds):
 
 @each_row("kinds", [(PlanarJoint, RevoluteJoint), (BallRpyJoint, UniversalJoint), (RpyFloatingJoint, RevoluteJoint)])
 def test_the_way_of_a_step_is_along_the_rates_of_positions(kinds):
-    """A little earlier the positions were those at now's rates, but for what turns freely."""
+    """Earlier positions are extrapolated with the current rates, except for free rotations."""
     model, random = chain(*kinds), np.random.default_rng(3)
     links = forward_kinematics(model)
     clearance = from_ball(model, links, cover_of(model, links).pieces, np.array([0.4, 0.1, 0.5]), 0.1)
@@ -376,7 +376,7 @@ def test_the_way_of_a_step_is_along_the_rates_of_positions(kinds):
 
 
 def surface(kind, sizes, random, count=4000):
-    """(P, 3) points on a box, and on a cylinder along z, edges and rims among them."""
+    """Return random points (P, 3) on a box or on a cylinder along z, including its edges or rims."""
     at = random.uniform(-1, 1, (count, 3))
     if kind == "box":
         for row in at:
@@ -393,7 +393,7 @@ def surface(kind, sizes, random, count=4000):
     [("box", (0.06, 0.08, 0.26), 1.0), ("cylinder", (0.03, 0.28), 1.0), ("box", (0.06, 0.08, 0.26), 0.05)],
 )
 def test_links_and_a_table_are_as_far_apart_as_their_surfaces(tmp_path, kind, sizes, scale):
-    """The table is wide and thin: capsules around it are 0.2 m high. Points miss the nearest by 2 mm of metres."""
+    """The table is wide and thin: capsules around it are 0.2 m high. Points are up to 2 mm from the closest point."""
     random, sizes, table = np.random.default_rng(4), scale * np.array(sizes), scale * np.array([1.4, 1.2, 0.05])
     words = f"<radius>{sizes[0]}</radius><length>{sizes[-1]}</length>" if kind == "cylinder" else ""
     words = words or f"<size>{' '.join(map(str, sizes))}</size>"
@@ -403,7 +403,7 @@ def test_links_and_a_table_are_as_far_apart_as_their_surfaces(tmp_path, kind, si
     goal = dd.SelfCollision(margin=0.02 * scale)
     (constraint,) = goal.bind(model)
     clearance, plant = constraint.clearance, model.plant
-    assert clearance.labels == ("upper and top", "lower and top")  # neighbours but for the table
+    assert clearance.labels == ("upper and top", "lower and top")  # the two links are neighbours
     context, turned = plant.CreateDefaultContext(), RigidTransform(RollPitchYaw(0, np.pi / 2, 0), [0.15 * scale, 0, 0])
     exact = 0
     for _ in range(20):

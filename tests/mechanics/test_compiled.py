@@ -1,4 +1,4 @@
-"""Compiled functions against other forms of the same: NumPy's of a tree, AutoDiffXd of a step."""
+"""Compiled functions agree with differences for a tree, and with AutoDiffXd for a step."""
 
 import importlib
 import sys
@@ -30,14 +30,14 @@ def test_the_slope_of_a_trees_inertia_is_its_difference():
     for j in range(model.nv):
         move = 1e-5 * np.eye(model.nv)[j]
         ahead, behind = (np.diag(tree(q + m, still, still).mass[0]) for m in (move, -move))
-        assert slope[:, j] == pytest.approx((ahead - behind) / 2e-5, abs=1e-9)  # of second differences of 1e-10
+        assert slope[:, j] == pytest.approx((ahead - behind) / 2e-5, abs=1e-9)  # differences with an error of 1e-10
 
 
 @pytest.mark.solve
 @pytest.mark.parametrize("approximation", ["sap", "similar", "lagged"])
 @pytest.mark.parametrize("time_step", [0.005, 0.05])
 def test_steps_with_impulses_are_autodiffs(approximation, time_step):
-    """In contact, on controllers, and thrown at stops by the speed."""
+    """The states are in contact, and joints with high speeds reach their limits."""
     model, random = (
         example_robot("go2.urdf", time_step, approximation=approximation, feet=True),
         np.random.default_rng(3),
@@ -49,7 +49,7 @@ def test_steps_with_impulses_are_autodiffs(approximation, time_step):
         if ours.method == "analytic":
             seen += 1
             exact = dd.differentiate_step(model, x, u, method="autodiff")
-            # The equation's matrix may be a thousand times stiffer along a contact than across.
+            # The matrix of the step's equation may be a thousand times stiffer along a contact than across.
             assert max(_largest(ours.A, exact.A), _largest(ours.B, exact.B)) < 1e-8
     assert seen >= 3
 
@@ -57,7 +57,7 @@ def test_steps_with_impulses_are_autodiffs(approximation, time_step):
 @pytest.mark.solve
 @each_row("table", ["mass", "center", "moves"])
 def test_a_wrong_number_in_the_tables_is_found_out(table, monkeypatch):
-    """By Drake's solution, which does not solve such a step, or by AutoDiffXd's Jacobian."""
+    """Drake's solution does not satisfy the wrong equation, or AutoDiffXd's Jacobian differs."""
     model, random = example_robot("solo12.urdf", feet=True), np.random.default_rng(4)
     x, u = state_in_contact(model, random), random.uniform(-1, 1, model.nu)
     if table in ("mass", "center"):
@@ -72,19 +72,19 @@ def test_a_wrong_number_in_the_tables_is_found_out(table, monkeypatch):
 
 
 def _off(tables, name):
-    """With a thousandth more of one table, or, of what moves what, without it."""
+    """Return `tables` with one table 0.1 % too large or, for `moves`, set to 0."""
     wrong = 0.0 if name == "moves" else 1.001
     return tables._replace(**{name: wrong * getattr(tables, name)})
 
 
 def test_nothing_is_compiled_for_more_than_one_kind_of_arguments():
-    """As of read-only arrays, which states may be, or of those that are not contiguous: each takes seconds."""
+    """Read-only and non-contiguous arrays would be further kinds, each of which takes seconds to compile."""
     model, random = example_robot("solo12.urdf", feet=True), np.random.default_rng(6)
     xs = np.array([state_in_contact(model, random) for _ in range(3)])
     us = np.zeros((3, model.nu))
     functions = kernel.overlapping, kernel.touch, kernel.step_jacobians, tree_kernel.differentiate_tree
     dd.linearize(model, xs, us)
-    compiled = [len(function.signatures) for function in functions]  # other kernels call the last one as well
+    compiled = [len(function.signatures) for function in functions]  # other kernels also call the last function
     assert min(compiled) > 0
     xs.setflags(write=False)
     dd.linearize(model, xs, us)
@@ -95,7 +95,7 @@ def test_nothing_is_compiled_for_more_than_one_kind_of_arguments():
 
 
 def test_a_function_without_a_folder_for_its_cache_is_compiled_all_the_same(monkeypatch, tmp_path):
-    """As in an installation that is read-only, of a user without a home."""
+    """This occurs in a read-only installation, for a user without a home folder."""
     from numba.core import caching
 
     def refuses(self):
@@ -111,7 +111,7 @@ def test_a_function_without_a_folder_for_its_cache_is_compiled_all_the_same(monk
 
 @pytest.mark.solve
 def test_a_cache_that_names_a_class_of_an_older_version_is_compiled_anew(tmp_path, monkeypatch):
-    """Numba unpickles the index of a cache, with the classes of its signatures, before it looks at the source."""
+    """Numba unpickles the index of a cache, with the classes of its signatures, before it compares the source."""
     monkeypatch.syspath_prepend(str(tmp_path))
     text = (
         "from typing import NamedTuple\nfrom drake_diff._base.compiled import compiled\n"

@@ -1,4 +1,4 @@
-"""Task quantities against closed forms, against Drake's own Jacobians, and against differences."""
+"""Task quantities and their derivatives equal closed forms, Drake's Jacobians, and differences."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def differences(function, x, step=1e-6):
 
 
 def test_a_pendulums_tip(load):
-    """q about +y from hanging: p = l (-sin q, 0, -cos q), v = l w (-cos q, 0, sin q); centre of mass the same."""
+    """The tip is p = l (-sin q, 0, -cos q) with v = l w (-cos q, 0, sin q), and is also the centre of mass."""
     model, x = load("pendulum.urdf"), np.array([0.7, -1.2])
     tip, speed, center = (
         dd.quantities.frame_position(model, "pole", [0, 0, -0.5]),
@@ -34,7 +34,7 @@ def test_a_pendulums_tip(load):
 
 
 def test_a_double_pendulums_tip_in_the_world_and_in_its_upper_rod(load):
-    """Rods of 0.8 and 0.5 m; the centre of mass weighs 1 kg at 0.4 m and 0.7 kg at 0.25 m of them."""
+    """The rods of 0.8 and 0.5 m have masses of 1 and 0.7 kg, with centres at 0.4 and 0.25 m."""
     model, x = load("double_pendulum.urdf"), np.array([0.4, -0.9, 1.3, -0.6])
 
     def rod(angle, length):
@@ -74,7 +74,7 @@ def test_gradients_on_a_ur5_are_drakes_own_jacobians(seed):
 
 @each_row("angle", [0.0, 1e-9, 1e-4, 1.0, 2.0, 3.0, 3.14, np.pi - 1e-7])
 def test_a_rotation_error_is_two_sines_of_half_the_angle_up_to_half_a_turn(angle):
-    """A free body turned by `angle` from a goal about random axes; gradients against differences, value by angle."""
+    """A free body is rotated by `angle` from a goal about a random axis. Gradients equal differences."""
     model = craft()
     for seed in range(4):
         random = np.random.default_rng(seed)
@@ -103,7 +103,7 @@ def _last_body(model):
 
 
 def two_arms():
-    """Two instances with a body and a frame of the same names."""
+    """Build two model instances whose bodies and frames have the same names."""
     plant = Plant(0.01)
     for name in ("left", "right"):
         instance = plant.plant.AddModelInstance(name)
@@ -125,7 +125,7 @@ def test_frames_of_two_instances_are_told_apart():
 
 @pytest.mark.parametrize("kind", ["spheres", "hydroelastic"])
 def test_a_box_at_rest_presses_with_its_weight(kind):
-    """m g = 19.62 N; SAP stops at 1e-6 of it."""
+    """The weight is m g = 19.62 N, and SAP stops at 1e-6 of it."""
     model, x = box_on_the_ground(kind), np.array([0.0995, 0.0])
     for _ in range(300):
         x = dd.step(model, x)
@@ -136,7 +136,7 @@ def test_a_box_at_rest_presses_with_its_weight(kind):
 
 @pytest.mark.parametrize("kind", ["spheres", "hydroelastic"])
 def test_a_contact_force_is_the_change_of_momentum_and_differentiates(kind):
-    """F h = m (v+ - v) - (u - m g) h; derivatives against differences of it, 1e-7 of 1e4 N/m."""
+    """F h = m (v+ - v) - (u - m g) h. Derivatives equal differences over 1e-7, at a stiffness of 1e4 N/m."""
     model = box_on_the_ground(kind, pusher=True)
     force, x, u = dd.quantities.contact_force(model, "box"), np.array([0.0981, -0.05]), np.array([-3.0])
     change = 2 * (dd.step(model, x, u)[1] - x[1]) / 0.01
@@ -149,7 +149,7 @@ def test_a_contact_force_is_the_change_of_momentum_and_differentiates(kind):
 
 
 def test_two_balls_push_each_other_with_opposite_forces():
-    """An overlap d of 1 mm at rest; SAP is implicit: F = k d / (1 + h k (h + tau) / m), tau = 0.2 s, m = 0.5 kg."""
+    """For an overlap d of 1 mm at rest, F = k d / (1 + h k (h + tau) / m) with tau = 0.2 s and m = 0.5 kg."""
     plant = Plant(0.01)
     for name, axis in (("a", "x"), ("b", "x")):
         plant.ball(name, 1.0, 0.1, contact_properties(1e4), axis)
@@ -180,7 +180,7 @@ def test_what_does_not_exist_or_fit_is_named(load, make, words):
 
 @each_row("part", ["running_cost", "final_cost", "trajectory_cost", "constraints"])
 def test_a_place_beside_an_offset_is_refused(load, part):
-    """It would be that of the model's own link length, and its gradient by the length would be missing."""
+    """It would use the model's own link length, and its gradient with respect to the length would be missing."""
     model = load("double_pendulum.urdf")
     tip = dd.quantities.frame_position(model, "lower", [0, 0, -0.5])
     functions = {
@@ -198,7 +198,7 @@ def test_a_place_beside_an_offset_is_refused(load, part):
         match=r"parameters: expected parameters that do not change the functions of dd.quantities, got offset",
     ):
         dd.Problem(model, **fields, parameters=["lower.mass", "elbow.offset"], **both)
-    assert tip(np.zeros(4))[2] == -1.3  # and works again
+    assert tip(np.zeros(4))[2] == -1.3  # the function still works
 
 
 def test_a_centre_of_mass_beside_a_mass_and_a_contact_force_beside_anything_are_refused():

@@ -1,4 +1,4 @@
-"""Expressions of functions and of plants against plain calls and Drake, and what must not become one."""
+"""Symbolic expressions of functions and plants equal plain calls and Drake. Unsuitable functions have none."""
 
 import dataclasses
 import math
@@ -105,7 +105,7 @@ PLANTS = ["pendulum.urdf", "cart_pole.urdf", "acrobot.xml", "double_pendulum.urd
 
 @each_row("name", [*PLANTS, "ur5_robot.urdf", "tree0", "tree1", "tree2"])
 def test_a_plants_expression_and_its_derivative_are_drakes(name):
-    """1e-9 of the largest entry: the trees' mass matrices have condition numbers up to 1e5."""
+    """The tolerance is 1e-9 of the largest entry, as the trees' mass matrices have condition numbers up to 1e5."""
     model, random = model_named(name), np.random.default_rng(5)
     plant, equations = symbolic_plant(model), EquationsOfMotion(model)
     assert isinstance(plant, PlantFunctions), plant
@@ -126,7 +126,7 @@ def test_a_plants_expression_and_its_derivative_are_drakes(name):
 
 
 def test_a_solve_computes_each_jacobian_once(monkeypatch):
-    """The solver asks for Jacobian and Hessian at each iterate: as many as iterates, and the two it asks ahead."""
+    """The solver requests Jacobian and Hessian at each iterate, and at most two more in advance."""
     model, calls = model_named("acrobot.xml"), []
     compute = PlantRates.jacobian
     monkeypatch.setattr(PlantRates, "jacobian", lambda self, knots: (calls.append(len(knots)), compute(self, knots))[1])
@@ -160,7 +160,7 @@ def test_a_model_that_is_no_tree_of_hinges_and_slides_has_none():
     assert "quaternion_floating" in why.reason
 
 
-# ------------------------------------------------------------------------------ two routes, one result
+# ------------------------------------------------------------------------------ solves without expressions
 
 
 def test_a_branch_goes_the_other_way_and_says_so():
@@ -179,7 +179,7 @@ def test_functions_of_every_kind_may_go_the_other_way():
 
     motion = move(10, x_goal=None, final_cost=lambda x: same(10 * (x[0] - 1) ** 2))
     assert "final_cost: TypeError" in motion.options["derivatives"]
-    assert motion.cost == pytest.approx(30 / 13, rel=1e-8)  # 3 c / (3 + c), twice test_a_final_cost's
+    assert motion.cost == pytest.approx(30 / 13, rel=1e-8)  # 3 c / (3 + c), twice the cost of test_a_final_cost
     limit = dd.Constraint(lambda x: same(x[1]), upper=1.25)
     motion = move(10, constraints=limit)
     assert "constraint 0: TypeError" in motion.options["derivatives"]
@@ -188,7 +188,7 @@ def test_functions_of_every_kind_may_go_the_other_way():
 
 @pytest.mark.parametrize("scheme", ["trapezoid", "hermite_simpson"])
 def test_both_routes_find_the_same_swing_up(scheme):
-    """The same program by expressions, and by batched calls with approximate Hessians."""
+    """The program is solved with expressions, and with batched calls and approximate Hessians."""
     plant = plant_dynamics(dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04))
     called = Dynamics(own_derivatives(plant), 4, 1)
     task = {
@@ -203,12 +203,12 @@ def test_both_routes_find_the_same_swing_up(scheme):
     assert a.options["derivatives"] == EXACT
     assert b.options["derivatives"].endswith("dynamics: an object with derivatives of its own")
     assert a.cost == pytest.approx(b.cost, rel=1e-8)
-    # where two approximations of one flat optimum end
+    # two approximations of a flat optimum
     assert a.transcribed.nodes == pytest.approx(b.transcribed.nodes, abs=1e-4)
 
 
 def test_a_floating_body_goes_the_other_way():
-    """A body of 1 kg without gravity's help: to hover is the cheapest, and its quaternion stays one."""
+    """The cheapest motion has no input. The body has a quaternion, for which there is no expression."""
     model = floating(QuaternionFloatingJoint, 0)
     dynamics = plant_dynamics(model)
     x = model.default_state
@@ -218,7 +218,7 @@ def test_a_floating_body_goes_the_other_way():
 
 
 def test_a_hessian_that_is_not_finite_is_left_and_that_is_told():
-    """|v|^1.5 has a first derivative at rest and no second, where differences cannot certify the first either."""
+    """At rest |v|^1.5 has a first but no second derivative, and differences cannot certify the first."""
     drag = Dynamics(lambda x, u: [x[1], u[0] - 0.1 * abs(x[1]) ** 1.5], 2, 1)
     motion = move(10, drag)
     assert (

@@ -1,4 +1,4 @@
-"""Inverse dynamics of trees by their own formulas: closed forms, and Drake's AutoDiffXd entry by entry."""
+"""The inverse dynamics of trees equals closed forms, and Drake's AutoDiffXd entry by entry."""
 
 from dataclasses import replace
 
@@ -26,14 +26,14 @@ from drake_diff.model.parameters import applied, select
 
 
 def at(model, q, v, a):
-    """The tree's inverse dynamics at states (N, n)."""
+    """Compute the tree's inverse dynamics at states (N, n)."""
     tree = tree_of(model)
     q, v, a = (np.atleast_2d(z).astype(float) for z in (q, v, a))
     return tree(q, v, a)
 
 
 def by_drake(model, x, a):
-    """tau, d tau / d [q; v] by AutoDiffXd and M, from Drake."""
+    """Compute tau, d tau / d [q; v] by AutoDiffXd, and M with Drake."""
     twin = model.autodiff
     twin.plant.SetPositionsAndVelocities(twin.context, InitializeAutoDiff(x).ravel())
     forces = MultibodyForces_[AutoDiffXd](twin.plant)
@@ -70,7 +70,7 @@ def test_a_pendulum_is_its_closed_form(load, q, w, a):
 
 
 def test_a_double_pendulum_of_rods_has_its_mass_matrix_and_bias(load):
-    """Uniform rods, m1 = 1, m2 = 0.7, l1 = 0.8, l2 = 0.5:
+    """For uniform rods with m1 = 1, m2 = 0.7, l1 = 0.8, l2 = 0.5:
 
     M11 = m1 l1^2 / 3 + m2 (l1^2 + l2^2 / 3 + l1 l2 cos q2), M12 = m2 (l2^2 / 3 + l1 l2 cos(q2) / 2), M22 = m2 l2^2 / 3.
     """
@@ -131,7 +131,7 @@ def test_what_is_no_such_tree_is_told_and_taken_by_autodiff(make, words):
 
 
 def test_a_tree_that_is_not_drakes_is_not_used(monkeypatch):
-    """The referee must refuse: a thousandth more inertia in one body."""
+    """The cross-check with Drake must refuse inertias that are 0.1 % too large."""
     real = tree_of
 
     def wrong(model):
@@ -149,7 +149,7 @@ def test_a_tree_that_is_not_drakes_is_not_used(monkeypatch):
 
 
 def are_autodiffs(model, x0, us, tolerance=1e-10):
-    """Whether the derivatives of a motion's steps are those by AutoDiffXd; the methods of ours."""
+    """Check the derivatives of a motion's steps against AutoDiffXd. Return the methods of ours."""
     ours, drakes = (derivatives_along(model, x0, us, method=method) for method in ("implicit", "autodiff"))
     for a, b in zip(ours, drakes, strict=True):
         assert np.array_equal(a.x_next, b.x_next)
@@ -161,24 +161,24 @@ def are_autodiffs(model, x0, us, tolerance=1e-10):
 @pytest.mark.solve
 @each_row("name", ["cart_pole.urdf", "acrobot.xml", "mass_spring_damper.sdf", "double_pendulum.urdf", "PD control"])
 def test_a_whole_rollout_in_one_call_is_the_one_by_autodiff(load, name):
-    """Of the PD controller the inputs are clipped."""
+    """The inputs of the PD controller are clipped."""
     model, random = pd_pendulum() if name == "PD control" else load(name), np.random.default_rng(0)
     x0, us = 0.3 * random.standard_normal(model.nx), random.standard_normal((30, model.nu))
     assert are_autodiffs(model, x0, us) == {"implicit"}
 
 
 def test_in_a_rollout_through_a_joint_limit_the_steps_at_it_are_autodiffs():
-    """The UR5 falls from rest until a joint stops it."""
+    """The UR5 falls until a joint reaches its limit."""
     with pytest.warns(ModelWarning):
         model = dd.load_model(robot_file("ur5_robot.urdf"), time_step=0.01)
     x0 = model.default_state
     upper = model.plant.GetPositionUpperLimits()
-    x0[2], x0[model.nq + 2] = upper[2] - 0.02, 3.0  # runs into its limit
+    x0[2], x0[model.nq + 2] = upper[2] - 0.02, 3.0  # moves into its limit
     assert are_autodiffs(model, x0, np.zeros((20, model.nu)), 1e-8) == {"implicit", "autodiff"}
 
 
 def test_a_clipped_input_has_no_derivative(write_urdf):
-    """The block's limit is 2 N: beyond it the push is 2 N and its derivative 0."""
+    """The block's effort limit is 2 N. Beyond it, the force is 2 N and its derivative 0."""
     model = write_urdf(mass=1.5, limit=2.0)
     found = derivatives_along(model, np.zeros(2), np.array([[1.9], [2.1], [-3.0]]), method="implicit")
     assert [d.B[1, 0] for d in found] == pytest.approx([0.1 / 1.5, 0.0, 0.0], abs=1e-15)
@@ -186,7 +186,7 @@ def test_a_clipped_input_has_no_derivative(write_urdf):
 
 @pytest.mark.parametrize("name", ["model.gravity", "hinge.damping"])
 def test_a_tree_is_not_made_of_another_models_parameters(load, name):
-    """The first step ever is taken with other parameters, the second with the model's own."""
+    """The first steps are taken with other parameters, the next with the model's own."""
     model, value = load("pendulum.urdf"), {"model.gravity": [0, 0, -1.0], "hinge.damping": 3.0}[name]
     x0, us = np.array([0.7, -1.2]), np.zeros((5, 1))
     for parameters in ({name: value}, {}):
@@ -196,7 +196,7 @@ def test_a_tree_is_not_made_of_another_models_parameters(load, name):
 
 @each_row("name", ["go2.urdf", "simple_humanoid.urdf"])
 def test_a_floating_robot_is_drakes_entry_by_entry(name):
-    """By small motion: the derivative by a quaternion, of any norm, is that by the turn that it is."""
+    """The derivative with respect to a quaternion of any norm follows from that with respect to small rotations."""
     model, random = example_robot(name), np.random.default_rng(1)
     n, (tree, coordinates) = model.nv, (tree_of(model, free=True), coordinates_of(model))
     x, a = state_in_range(model, random), random.standard_normal(n)
@@ -212,7 +212,7 @@ def test_a_floating_robot_is_drakes_entry_by_entry(name):
 
 @each_row("name", ["panda.urdf", "go2.urdf"])
 def test_accelerations_and_their_derivatives_solve_inverse_dynamics(name):
-    """M a + bias = force; da/dforce = M^-1, and d a = -M^-1 d tau at that a. Second derivatives by differences."""
+    """M a + bias = force, da/dforce = M^-1, and d a = -M^-1 d tau at a. Second derivatives equal differences."""
     model, random = example_robot(name), np.random.default_rng(4)
     tree, n = tree_of(model, free=True), model.nv
     x, force, armature = state_in_range(model, random)[None], random.standard_normal((1, n)), random.uniform(0, 1, n)

@@ -1,4 +1,4 @@
-"""The equations of motion in continuous time, against a closed form and against Drake's own continuous plant."""
+"""The equations of motion in continuous time equal a closed form and those of Drake's continuous plant."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def test_kellys_cart_pole(load):
 
 
 def test_many_knots_at_once_and_those_that_are_no_numbers(load):
-    """The second is that of the test before; a search may try what is not finite, a caller of one knot is told."""
+    """Values that are not finite give NaN for many knots, and an error for one. Knot 1 is that of the last test."""
     f = EquationsOfMotion(load("cart_pole.urdf"))
     knots = np.array([[0.0, 0.0, 0.0, 0.0, 1.3], [0.1, 0.7, -0.3, 1.1, 2.0], [0.0, np.nan, 0.0, 0.0, 0.0]])
     found = f.values(knots)
@@ -76,7 +76,7 @@ def test_pd_control_has_no_continuous_form():
 
 @pytest.mark.parametrize("unit", [1.0, 1e-6])
 def test_an_oscillator_is_followed_in_any_unit(tmp_path, unit):
-    """x = A cos(10 t) at 3 s, in steps of 0.15 s: a tolerance of 1e-6 of a metre says nothing of 1e-6 m."""
+    """At 3 s, x = A cos(10 t). The relative tolerance 1e-6 must also hold for an amplitude of 1e-6 m."""
     path = tmp_path / "spring.sdf"
     path.write_text(
         '<sdf version="1.7"><model name="m"><link name="b"/><joint name="j" type="prismatic"><parent>world</parent>'

@@ -1,4 +1,4 @@
-"""python-control as a second opinion on linearizations: poles of A, LQR gains and costs, in every engine's A and B."""
+"""python-control cross-checks the A and B of every engine: poles of A, LQR gains and costs."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def linearized(engine, model):
 @pytest.mark.solve
 @each_row("name", ENGINES)
 def test_the_poles_of_a_mass_on_a_spring(load, control, name):
-    """M v' = M v - h (k q + d v'), q' = q + h v': poles of det (z^2 (1 + h d/m) - z (2 + h d/m - h^2 k/m) + 1) = 0."""
+    """For m v' = m v - h (k q + d v'), the poles solve z^2 (1 + h d/m) - z (2 + h d/m - h^2 k/m) + 1 = 0."""
     model = load("mass_spring_damper.sdf", time_step=H)
     A, B, _ = linearized(engine_of(name, model), model)
     contract = engine_of("drake", model).contract.joints[0]
@@ -39,7 +39,7 @@ def test_the_poles_of_a_mass_on_a_spring(load, control, name):
 @pytest.mark.solve
 @each_row("name", ENGINES)
 def test_the_poles_of_a_hanging_pendulum(load, control, name):
-    """With w^2 = m g l / J the free pendulum is the oscillator above, damped as there."""
+    """With w^2 = m g l / J the free pendulum is a damped oscillator like the mass on a spring above."""
     model = load("pendulum.urdf", time_step=H)
     engine = engine_of(name, model)
     A, B, _ = linearized(engine, model)
@@ -55,7 +55,7 @@ def test_the_poles_of_a_hanging_pendulum(load, control, name):
 
 @each_row("name", ENGINES)
 def test_the_lqr_gain_of_the_cart_pole_upright(load, control, name):
-    """python-control's gain solves the Riccati equation for each engine's A and B, balances, and is the same in all."""
+    """python-control's gain solves the Riccati equation, stabilizes the cart-pole, and is equal for all engines."""
     model = load("cart_pole.urdf", time_step=H)
     x = np.array([0.0, np.pi, 0.0, 0.0])
     A, B, _ = engine_of(name, model).differentiate_step(x, np.zeros(1))
@@ -70,7 +70,7 @@ def test_the_lqr_gain_of_the_cart_pole_upright(load, control, name):
 
 
 def test_ilqrs_gain_at_rest_is_python_controls(load, control):
-    """Far from the horizon's end the time-varying gain is the Riccati equation's fixed point."""
+    """Far from the end of the horizon, the time-varying gain is the fixed point of the Riccati equation."""
     model = load("cart_pole.urdf", time_step=H)
     x = np.array([0.0, np.pi, 0.0, 0.0])
     Q, R = np.diag([1.0, 10.0, 0.1, 0.1]), np.array([[0.1]])

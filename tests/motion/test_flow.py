@@ -1,4 +1,4 @@
-"""The motion in continuous time through contact, and its derivative: closed forms, and Drake's continuous plant."""
+"""The continuous-time motion through contact and its derivative equal closed forms and Drake's continuous plant."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.solve
 
 
 def ball_on_rails(*, stiffness, dissipation=0.0, friction=0.0, gravity=0.0, approximation="lagged", relaxation=0.0):
-    """1 kg, radius 0.1 m, on rails along x and z above the ground; `stiffness` is that of the pair."""
+    """Build a ball of 1 kg and radius 0.1 m on rails along x and z over ground. `stiffness` is that of the pair."""
     plant = Plant(0.01, approximation)
     properties = contact_properties(2 * stiffness, dissipation, friction, relaxation / 2)
     plant.ball("ball", 1.0, 0.1, properties, "x", "z")
@@ -42,7 +42,7 @@ def height(x):
 
 @pytest.mark.parametrize("stiffness", [1e3, 1e4, 1e6])
 def test_an_elastic_bounce_has_the_slopes_of_its_closed_form(stiffness):
-    """Half a period pi / omega in contact: the end is at r + V (T - pi / omega) - (y0 - r)."""
+    """The contact takes half a period, pi / omega, so that the end is at r + V (T - pi / omega) - (y0 - r)."""
     model, speed, duration = ball_on_rails(stiffness=stiffness), 2.0, 1.0
     x0 = [0, 1.0, 0, -speed]
     motion = dd.differentiate_rollout(
@@ -52,17 +52,17 @@ def test_an_elastic_bounce_has_the_slopes_of_its_closed_form(stiffness):
     assert motion.loss == pytest.approx(0.1 + speed * (duration - touching) - 0.9, abs=1e-7)
     assert motion.by_x0[1] == pytest.approx(-1.0, abs=1e-6)
     assert motion.by_x0[3] == pytest.approx(-(duration - touching), abs=1e-6)
-    by_pair = speed * touching / (2 * stiffness)  # and the pair's stiffness by the ground's own is a fourth
+    by_pair = speed * touching / (2 * stiffness)  # d (pair's stiffness) / d (ground's stiffness) is 1 / 4
     assert motion.by_parameters[0] == pytest.approx(by_pair / 4, rel=1e-4)
     assert set(motion.methods) == {"continuous"}
 
 
 @pytest.mark.parametrize("relaxation", [0.001, 0.012, 0.03])
 def test_a_bounce_whose_force_jumps_at_touch_has_the_slopes_of_its_closed_form(relaxation):
-    """k (x + tau x')+ of `sap`: without gravity the way out is slower by a factor, whatever the speed.
+    """With the force k (x + tau x')+ of `sap` and without gravity, a bounce reduces any speed by the same factor e.
 
-    From x'' = -omega^2 (x + tau x'), x(0) = 0, x'(0) = V the force ends at t_c with x_c = V a, x'_c = -V e, and the
-    ball leaves at that speed: y = r - V a + V e (T - t_0 - t_c), t_0 = (y0 - r) / V.
+    From x'' = -omega^2 (x + tau x'), x(0) = 0, x'(0) = V the force ends at t_c with x_c = V a, x'_c = -V e. The ball
+    leaves at that speed, so that y = r - V a + V e (T - t_0 - t_c) with t_0 = (y0 - r) / V.
     """
     k, speed, duration = 1e4, 2.0, 1.0
     model = ball_on_rails(stiffness=k, approximation="sap", relaxation=relaxation)
@@ -81,11 +81,11 @@ def test_a_bounce_whose_force_jumps_at_touch_has_the_slopes_of_its_closed_form(r
     t_0 = 0.9 / speed
     assert motion.loss == pytest.approx(0.1 - speed * a + speed * e * (duration - t_0 - touching), abs=1e-6)
     assert motion.by_x0[1] == pytest.approx(-e, abs=1e-5)
-    assert motion.by_x0[3] == pytest.approx(-(-a + e * (duration - touching)), abs=1e-5)  # by the velocity, down
+    assert motion.by_x0[3] == pytest.approx(-(-a + e * (duration - touching)), abs=1e-5)  # the velocity is downward
 
 
 def test_a_slide_stops_where_coulomb_says():
-    """v0^2 / (2 mu g), and its slopes v0 / (mu g) and -v0^2 / (2 mu^2 g), but for the stiction speed of 1e-3 m/s."""
+    """The distance v0^2 / (2 mu g) and its slopes are exact up to the effect of the stiction speed of 1e-3 m/s."""
     mu, g, v0 = 0.5, 9.81, 1.0
     model = ball_on_rails(stiffness=1e4, dissipation=10, friction=mu, gravity=g)
     rest = [0, 0.1 - g / 1e4, v0, 0]
@@ -99,7 +99,7 @@ def test_a_slide_stops_where_coulomb_says():
 
 
 def cube(time_step, *, gravity, side=0.1, mass=0.1, radius=1e-3, stiffness=2e3, dissipation=0.5, friction=0.5):
-    """(plant, diagram) of a cube with a sphere in each corner, over the ground."""
+    """Return (plant, diagram) of a cube with a sphere in each corner, over the ground."""
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(
         time_step=time_step,
@@ -129,7 +129,7 @@ TOSSED = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0, 0, 0, 0, 0.2, 0, 0, 
 
 
 def test_the_rates_are_those_of_drakes_continuous_plant():
-    """At 40 states in contact, some of which slip by less than the stiction speed."""
+    """The rates are compared at 40 states in contact, some of which slip by less than the stiction speed."""
     model = dd.model_from_diagram(cube(1e-3, gravity=9.81)[1])
     plant, diagram = cube(0.0, gravity=9.81)
     context = plant.GetMyContextFromRoot(diagram.CreateDefaultContext())
@@ -149,7 +149,7 @@ def test_the_rates_are_those_of_drakes_continuous_plant():
 
 
 def can_and_ball(time_step, approximation="lagged"):
-    """(plant, diagram) of a free ball and a free can, which is turned in its body."""
+    """Return (plant, diagram) of a free ball and a free can, whose shape is rotated in its body."""
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(
         time_step=time_step, contact_model="point", stiction_tolerance=1e-3, use_sampled_output_ports=False
@@ -170,7 +170,7 @@ CAN = 0.2, 0.5  # [m] radius and length
 
 
 def test_a_ball_at_a_can_has_the_rates_of_drakes_continuous_plant_and_their_slopes():
-    """At 200 random places: over its side, its caps and their edge, from near and from within."""
+    """At 200 random states, the ball overlaps the can at its side, its caps or their edge, from outside or inside."""
     model = dd.model_from_diagram(can_and_ball(1e-3)[1])
     plant, diagram, turned = can_and_ball(0.0)
     context = plant.GetMyContextFromRoot(diagram.CreateDefaultContext())
@@ -210,7 +210,7 @@ def test_a_ball_at_a_can_has_the_rates_of_drakes_continuous_plant_and_their_slop
 
 @pytest.mark.parametrize("name", ["bolt.urdf", "solo12.urdf", "go2.urdf"])
 def test_the_rates_of_robots_are_those_of_drakes_terms(name):
-    """Without friction, whose law in continuous time the other form has otherwise."""
+    """The friction is 0, as the two implementations have different friction laws in continuous time."""
     model = example_robot(name, feet=True, friction=0.0)
     random = np.random.default_rng(1)
     ours, other = system_of(model), ContinuousMotion(model)
@@ -227,7 +227,7 @@ def test_the_rates_of_robots_are_those_of_drakes_terms(name):
 
 @pytest.mark.parametrize("name", ["bolt.urdf", "finger_edu.urdf"])
 def test_the_slopes_of_the_rates_are_those_of_casadi(name):
-    """The closed form beside algorithmic differentiation of the rates, one foot on the ground."""
+    """The closed form equals algorithmic differentiation of the rates, with one foot on the ground."""
     model, random = example_robot(name, feet=True), np.random.default_rng(2)
     x = state_in_contact(model, random) if model.nq > model.nv else random.standard_normal(model.nx)
     ours, u = flow_plant(model), random.standard_normal(model.nu)
@@ -241,7 +241,7 @@ def test_the_slopes_of_the_rates_are_those_of_casadi(name):
 
 
 class Equation(System):
-    """x' = f(x), whose slopes are `by_x`, without contacts."""
+    """A system x' = f(x) without contacts, whose derivative is `by_x`."""
 
     time_step, num_pairs = 0.1, 0
 
@@ -269,7 +269,7 @@ def end_of(system, x0, duration, tolerance):
 
 
 def test_a_stiff_motion_is_followed_by_long_steps_of_order_5():
-    """y' = -k (y - sin t) + cos t stays on the sine; explicit steps of 2e-6 would take 1e7 evaluations for 10 s."""
+    """The solution of y' = -k (y - sin t) + cos t is sin t. Explicit steps of 2e-6 would take 1e7 evaluations."""
     k = 1e6
     stiff = Equation(
         lambda x: [-k * (x[0] - np.sin(x[1])) + np.cos(x[1]), 1.0],
@@ -280,7 +280,7 @@ def test_a_stiff_motion_is_followed_by_long_steps_of_order_5():
 
 
 def test_the_error_follows_the_tolerance_and_non_finite_rates_end_the_motion():
-    """A pendulum with cubic drag, beside Dormand and Prince's eighth order at 1e-13."""
+    """A pendulum with cubic drag is compared with the eighth-order method of Dormand and Prince at 1e-13."""
     pendulum = Equation(lambda x: [x[1], -3 * np.sin(x[0]) - 0.2 * x[1] ** 3], None)
     exact = solve_ivp(lambda _, x: pendulum.rates(x), (0, 3), [1, 0.5], method="DOP853", rtol=1e-13, atol=1e-14).y[
         :, -1
@@ -288,13 +288,13 @@ def test_the_error_follows_the_tolerance_and_non_finite_rates_end_the_motion():
     for tolerance in (1e-6, 1e-9, 1e-11):
         assert np.max(np.abs(end_of(pendulum, [1.0, 0.5], 3.0, tolerance) - exact)) < 100 * tolerance
     with pytest.raises(SimulationError, match="the integration cannot continue"):
-        end_of(Equation(lambda x: x**2, lambda x: [2 * x]), [1.0], 1.1, 1e-9)  # 1 / (1 - t)
+        end_of(Equation(lambda x: x**2, lambda x: [2 * x]), [1.0], 1.1, 1e-9)  # x = 1 / (1 - t)
 
 
-@pytest.mark.filterwarnings("ignore::drake_diff.exceptions.GradientWarning")  # a little aside it flies past
+@pytest.mark.filterwarnings("ignore::drake_diff.exceptions.GradientWarning")  # a slightly displaced ball has no contact
 @pytest.mark.parametrize("depth", [3e-3, 1e-4, 1e-6])
 def test_a_touch_that_begins_and_ends_within_a_step_is_met(depth):
-    """A ball flies past another, both ends of the interval of 0.1 s far from it: as by intervals of 0.1 ms."""
+    """A ball grazes another in the middle of an interval of 0.1 s, and moves as with intervals of 0.1 ms."""
 
     def past(time_step, count):
         plant = Plant(time_step, "lagged", gravity=0.0)
@@ -305,14 +305,14 @@ def test_a_touch_that_begins_and_ends_within_a_step_is_met(depth):
         return dd.differentiate_rollout(plant.model(), x0, None, height, num_steps=count, method="continuous")
 
     once, often = past(0.1, 1), past(1e-4, 1000)
-    assert often.loss > 0.03 - depth + 1e-9  # it is thrown aside
+    assert often.loss > 0.03 - depth + 1e-9  # the ball is deflected
     assert once.loss == pytest.approx(often.loss, abs=1e-9)
     assert once.by_x0 == pytest.approx(often.by_x0, rel=1e-5, abs=1e-7)
 
 
 @pytest.mark.slow
 def test_a_tossed_cube_has_the_slope_of_drakes_error_controlled_motion():
-    """Runge-Kutta 3 of accuracy 1e-8 and central differences of three widths, which agree."""
+    """The reference is Runge-Kutta 3 with accuracy 1e-8, and central differences of three widths, which agree."""
     plant, diagram = cube(0.0, gravity=2.0)
     from_start = error_controlled_end(plant, diagram, 1.0)
 
@@ -328,7 +328,7 @@ def test_a_tossed_cube_has_the_slope_of_drakes_error_controlled_motion():
 
 
 def test_a_policy_is_differentiated_along_the_flow():
-    """A motor on the ball's rail that pushes it up by a gain: differences of the flow itself, at its tolerance."""
+    """A motor feeds back the ball's vertical velocity. The slope is compared with differences of the flow itself."""
     plant = Plant(0.01, "lagged")
     properties = contact_properties(2e4, 0.5, 0.3)
     plant.ball("ball", 1.0, 0.1, properties, "x", "z")
@@ -359,7 +359,7 @@ def test_what_has_no_continuous_motion_is_refused_by_name():
 
 
 def test_a_smooth_motion_has_the_slopes_of_its_closed_form():
-    """A mass on a spring, exp(A t) of its linear equations."""
+    """The flow of a mass on a spring is exp(A t) with the matrix A of its linear equations."""
     model = dd.load_model("models/mass_spring_damper.sdf", time_step=0.01)
     x0 = np.array([0.3, -0.2])
     motion = dd.differentiate_rollout(model, x0, np.zeros((100, model.nu)), lambda x: x[0], method="continuous")
@@ -373,7 +373,7 @@ def test_a_smooth_motion_has_the_slopes_of_its_closed_form():
 
 
 def test_shapes_that_touch_without_a_law_end_the_flow():
-    """Two boxes: a quadruped's shapes are known by its feet alone, and its trunk on the ground is refused by name."""
+    """Continuous time supports contact of spheres only. A box that reaches the ground raises an error with its name."""
     plant = Plant(0.01, "lagged")
     properties = contact_properties(2e4, 0.5, 0.3)
     body = plant.plant.AddRigidBody("box", SpatialInertia.SolidBoxWithMass(1, 0.2, 0.2, 0.2))
@@ -390,7 +390,7 @@ def test_shapes_that_touch_without_a_law_end_the_flow():
 
 @pytest.mark.parametrize("seed", range(8))
 def test_random_bounces_have_the_slopes_of_another_integration(tmp_path, seed):
-    """Both laws, by seed: up to a dozen bounces, piece by piece between events, and its differences."""
+    """For both laws, up to a dozen bounces agree with an event-by-event integration and its differences."""
     random = np.random.default_rng(seed)
     approximation = ("sap", "lagged")[seed % 2]
     ball = Bounce(
@@ -409,14 +409,14 @@ def test_random_bounces_have_the_slopes_of_another_integration(tmp_path, seed):
 
 
 def test_a_limit_that_is_passed_within_an_interval_is_seen():
-    """The cart is out of its rail for 0.2 s and back again at the end of the interval."""
+    """The cart is beyond its rail for 0.2 s, and has returned at the end of the interval."""
     model = dd.load_model("models/cart_pole.urdf", time_step=0.4)
     with pytest.raises(SimulationError, match="slide_x reaches a joint limit"):
         dd.differentiate_rollout(model, [1.99, 0, 0.5, 0], [[-5.0]], lambda x: x[0], method="continuous")
 
 
 def along(model, x0, count, tolerance=1e-9):
-    """(nx,) where a flow ends, and its derivative by the start."""
+    """Return the end state (nx,) of a flow, and its derivative (nx, nx) with respect to the initial state."""
     steps = FlowSteps(model, select(model, ()), tolerance)
     flow = steps.roll(np.array(x0, dtype=float), lambda x, k: np.zeros(model.nu), count)
     found = np.eye(model.nx)
@@ -426,7 +426,7 @@ def along(model, x0, count, tolerance=1e-9):
 
 
 def ball_at(shape, *, stiffness, radius=0.02, time_step=0.05, gravity=9.81, dissipation=0.1, friction=0.3):
-    """A ball on rails along x and z at a shape that stands still at the origin."""
+    """Build a ball on rails along x and z, and a fixed shape at the origin."""
     plant = Plant(time_step, "lagged", gravity=gravity)
     properties = contact_properties(2 * stiffness, dissipation, friction)
     plant.ball("ball", 1.0, radius, properties, "x", "z")
@@ -438,7 +438,7 @@ def ball_at(shape, *, stiffness, radius=0.02, time_step=0.05, gravity=9.81, diss
     "shape", [Capsule(0.1, 0.2), Box(0.2, 1, 0.2), Cylinder(0.1, 0.2)], ids=lambda s: type(s).__name__
 )
 def test_a_ball_that_rolls_over_an_edge_has_the_slopes_of_differences(shape):
-    """Where it passes from a face to the edge its normal begins to turn: a step ends there."""
+    """The normal starts to turn where the ball passes from a face to an edge, and the integrator ends a step there."""
     model = ball_at(shape, stiffness=1e3)
     x0 = [0.115, 0.12, -0.2, 0.0] if isinstance(shape, Capsule) else [-0.115, 0.15, 0.3, 0.0]
     _, found = along(model, x0, 8)
@@ -449,7 +449,7 @@ def test_a_ball_that_rolls_over_an_edge_has_the_slopes_of_differences(shape):
 
 
 def test_a_ball_that_goes_through_the_middle_of_a_shape_has_no_derivative():
-    """Its push turns round at once where its centre is in the middle of a soft box."""
+    """The contact force reverses its direction when the ball's centre passes the middle of a soft box."""
     model = ball_at(Box(0.1, 1, 0.1), stiffness=50, gravity=0.0)
     with pytest.raises(GradientError, match=r"ball and .* overlap so deeply that their contact normal jumps"):
         along(model, [-0.2, 0.01, 5.0, 0.0], 4)
@@ -457,7 +457,7 @@ def test_a_ball_that_goes_through_the_middle_of_a_shape_has_no_derivative():
     assert np.all(np.isfinite(along(stiff, [-0.2, 0.01, 5.0, 0.0], 4)[1]))
 
 
-# What a contact may begin with, by the height of the ball's centre less its radius [m] and its velocity [m/s].
+# Initial states: the height of the ball's centre minus its radius [m], and the velocity along x and z [m/s].
 STARTS = {
     "at rest in balance": (-9.81 / 1e4, 0.0, 0.0),
     "in exact touch, at rest": (0.0, 0.0, 0.0),
@@ -471,7 +471,7 @@ STARTS = {
 @pytest.mark.parametrize("approximation", ["lagged", "sap"])
 @pytest.mark.parametrize("start", STARTS)
 def test_a_contact_that_is_there_from_the_start_goes_on_as_by_another_integration(start, approximation):
-    """Without events, by Drake's own terms; a little deeper at the start the end moves as the derivative says."""
+    """The reference uses Drake's terms without events. A deeper start changes the end as the derivative predicts."""
     above, vx, vz = STARTS[start]
     given = {"dissipation": 0.5} if approximation == "lagged" else {"relaxation": 0.01}
     model = ball_on_rails(stiffness=1e4, friction=0.5, gravity=9.81, approximation=approximation, **given)
@@ -486,10 +486,10 @@ def test_a_contact_that_is_there_from_the_start_goes_on_as_by_another_integratio
 
 @pytest.mark.parametrize("ratio", [0.0, 0.15])
 def test_hard_contact_is_the_limit_of_the_compliant_one(ratio):
-    """Values and slopes differ by k^(-1/2), the time in contact, as the stiffness grows at the same damping ratio.
+    """At a constant damping ratio, values and slopes converge to hard contact as k^(-1/2), like the time in contact.
 
-    A ball of 1 kg falls h = 0.4 m at 1 m/s. The force k (x + tau x') of the damping ratio z ends at the speed
-    exp(-z (pi - 2 asin z) / sqrt(1 - z^2)) of that at which it began; t is the time of the fall, v that speed.
+    A ball of 1 kg falls h = 0.4 m from an initial speed of 1 m/s to the speed v in the time t. With a force
+    k (x + tau x') of the damping ratio z, the speed after contact is v exp(-z (pi - 2 asin z) / sqrt(1 - z^2)).
     """
     height, speed, duration, g = 0.4, 1.0, 0.4, 9.81
     v = np.sqrt(speed**2 + 2 * g * height)
@@ -497,7 +497,7 @@ def test_hard_contact_is_the_limit_of_the_compliant_one(ratio):
     left = duration - t
     end = 0.1 + e * v * left - g * left**2 / 2
     by_v, by_t = e * left, g * left - e * v
-    by = [by_v * g / v + by_t / v, -(by_v * speed / v + by_t * (speed / v - 1) / g)]  # by height and upward speed
+    by = [by_v * g / v + by_t / v, -(by_v * speed / v + by_t * (speed / v - 1) / g)]  # height, upward speed
     errors = []
     for stiffness in (1e4, 1e6, 1e8):
         plant = Plant(0.02, "sap" if ratio else "lagged")
@@ -511,4 +511,4 @@ def test_hard_contact_is_the_limit_of_the_compliant_one(ratio):
         errors.append([abs(soft.loss - end), apart])
     orders = np.log10(np.array(errors[:-1]) / np.array(errors[1:])) / 2
     assert np.all(np.abs(orders[-1] - 0.5) < 0.03), (errors, orders)
-    assert np.all(np.array(errors[-1]) < 1e-2)  # of 3e-4 s of contact
+    assert np.all(np.array(errors[-1]) < 1e-2)  # the contact takes 3e-4 s

@@ -1,6 +1,6 @@
-"""Motion in continuous time of random small trees, by seed: beside Drake's error-controlled continuous plant.
+"""Random small trees move in continuous time as Drake's continuous plant with error-controlled integration.
 
-The law of `sap` is not that of Drake's continuous plants: it is compared with the integration of `ContinuousMotion`.
+The law of `sap` differs from that of Drake's continuous plants. It is compared with `ContinuousMotion` instead.
 """
 
 from dataclasses import dataclass
@@ -36,10 +36,10 @@ WIDTHS = 1e-3, 1e-4, 1e-5
 
 @dataclass
 class Random:
-    """A tree of 1 to 4 bodies with spheres, over shapes that stand still, and a state."""
+    """A tree of 1 to 4 bodies with spheres, over fixed shapes, and its initial state."""
 
     seed: int
-    time_step: float  # 0: Drake's continuous plant
+    time_step: float  # 0 for Drake's continuous plant
 
     def __post_init__(self):
         self.random = np.random.default_rng(self.seed)
@@ -50,7 +50,7 @@ class Random:
         )
         config.discrete_contact_approximation = self.approximation
         self.plant, self.scene = AddMultibodyPlant(config, builder)
-        # One stiffness for all: between unlike ones Drake's steps act off the middle, and its continuous plants in it.
+        # All stiffnesses are equal: otherwise the contact points of Drake's steps and continuous plants would differ.
         self.properties = contact_properties(
             2 * 10 ** self.random.uniform(2, 6),
             self.some(5.0),
@@ -131,7 +131,7 @@ class Random:
 
 
 def other_end(seed, model, approximation, count):
-    """Where another integration ends, as a function of the start."""
+    """Return the function that maps an initial state to the end state of another integration."""
     if approximation == "sap":
         motion = ContinuousMotion(model)
         return lambda x: motion.states(x, np.zeros((count, model.nu)))[-1]
@@ -141,7 +141,7 @@ def other_end(seed, model, approximation, count):
 
 @dataclass
 class Comparison:
-    """Of a flow with another integration; slopes are None where those of the other do not settle."""
+    """The errors of a flow relative to another integration, without `slope_error` if its slopes do not converge."""
 
     error: float
     sensitivity: float
@@ -182,7 +182,7 @@ SLOW = [pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 6, 7)]
 def test_random_trees_move_as_by_another_integration_and_so_do_their_slopes(seed):
     found = compared(seed)
     assert found.touches
-    # Steps of 1e-8 and 1e-9 each, and what their errors become by the end; slopes over 1e-4 or 1e-5 of that noise.
+    # The errors of the steps, 1e-8 and 1e-9, grow with the motion. Slopes are this noise over 1e-4 or 1e-5.
     assert found.error <= 1e-8 * found.sensitivity
     assert found.slope_error is not None
     assert found.slope_error <= 1e-3

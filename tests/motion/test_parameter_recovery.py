@@ -1,4 +1,4 @@
-"""Hidden parameters are found again from a simulated motion: by every seed, to 1e-4 (measured: 1e-6)."""
+"""Hidden parameters are recovered from a simulated motion with every seed, to 1e-4 (measured: 1e-6)."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def within_a_factor_of_two(random):
 
 
 def recover(model, x0, us, truth, start, **fields):
-    """The solution of fitting `start` to the motion under `truth`, both by parameter name."""
+    """Fit the parameters `start` to the motion with `truth`. Return the solution and the values by parameter name."""
     xs_true = dd.rollout(model, x0, us, num_steps=len(us), parameters=truth).xs
     problem = dd.Problem(
         model,
@@ -51,9 +51,9 @@ def is_recovered(found, truth):
 
 
 def all_recovered(outcomes, *, certified=True):
-    """`outcomes` (solution, found, truth) by seed: all are the truth, and the solver knows it.
+    """Check that all `outcomes` (solution, found, truth) by seed are recovered and reported as converged.
 
-    Not `certified`: steps in contact may be solved more coarsely than a certificate takes, which the status tells.
+    If not `certified`, steps in contact may be too inaccurate for a certificate, which the status shows.
     """
     missed = {seed: (s.status, f, t) for seed, (s, f, t) in outcomes.items() if not is_recovered(f, t)}
     assert not missed
@@ -84,10 +84,10 @@ def test_a_hidden_mass(load, name, parameter, size):
 
 
 def sliding_ball(approximation):
-    """On a rail along the ground; free in z too where friction is lagged, else held where its weight holds it.
+    """Build a ball that slides on the ground. It is free in z under lagged, else fixed at its static height.
 
-    Under sap and similar a fast slide lifts a free ball (Drake's convex approximation), it hops, and the distance of
-    two motions jumps with the friction: no gradient leads through that.
+    Under sap and similar a fast slide lifts a free ball (Drake's convex approximation). The ball hops, and the
+    distance of two motions jumps with the friction, so that a gradient method fails.
     """
     made = Plant(0.01, approximation)
     properties = contact_properties(2e4, dissipation=5.0, friction=0.5, relaxation_time=0.01)
@@ -104,7 +104,7 @@ def sliding_ball(approximation):
 @pytest.mark.slow
 @pytest.mark.parametrize("approximation", ["lagged", "sap", "similar"])
 def test_a_hidden_friction(approximation):
-    """Of a ball that slides: the wrong friction at the start may already have stopped it."""
+    """The friction of a sliding ball is recovered, although the ball may stop with the initial guess."""
     (model, rest), outcomes = sliding_ball(approximation), {}
     for seed in SEEDS:
         random = np.random.default_rng(seed)
@@ -119,7 +119,7 @@ def test_a_hidden_friction(approximation):
 
 
 def gimbal():
-    """A body in three driven hinges about x, y and z, all through its centre of mass."""
+    """Build a body on three actuated hinges about x, y and z, all through its centre of mass."""
     made = Plant(0.02)
     plant, parent = made.plant, made.plant.world_frame()
     for name, axis in zip("abc", np.eye(3), strict=True):
@@ -135,7 +135,7 @@ def gimbal():
 
 @pytest.mark.slow
 def test_a_hidden_inertia():
-    """All six numbers, from a start off in each log-Cholesky coordinate; every iterate is a possible inertia."""
+    """All six entries are recovered from a guess with errors in each log-Cholesky coordinate, and are physical."""
     model, outcomes = gimbal(), {}
     for seed in SEEDS:
         random = np.random.default_rng(seed)
@@ -151,7 +151,7 @@ def test_a_hidden_inertia():
 
 
 def test_a_parameter_stops_at_its_bound(write_urdf):
-    """The truth, 2 kg, is out of reach: the nearest that is allowed is the best."""
+    """The truth, 2 kg, is outside the bounds, so that the bound nearest to it is optimal."""
     model = write_urdf(mass=1.0)
     us = np.ones((10, 1))
     solution, found = recover(
@@ -163,9 +163,9 @@ def test_a_parameter_stops_at_its_bound(write_urdf):
 
 @pytest.mark.parametrize(("count", "h", "weight"), [(20, 0.1, 0.3), (11, 0.05, 2.0)])
 def test_controls_initial_state_and_parameters_together_at_a_known_optimum(write_urdf, count, h, weight):
-    """Min sum h u^2 + w v0^2 from x = 0 to (1, 0): the lightest block, and the shortest (v0, u) that gets there.
+    """The minimum of sum h u^2 + w v0^2 from x = 0 to (1, 0) has the lightest block and the least norm of (v0, u).
 
-    x_N = N h v0 + (h^2 / m) sum (N - k) u_k, v_N = v0 + (h / m) sum u_k: a least-norm problem.
+    It is a least-norm problem as x_N = N h v0 + (h^2 / m) sum (N - k) u_k and v_N = v0 + (h / m) sum u_k.
     """
     model, lightest = write_urdf(mass=1.0, time_step=h), 0.6
     problem = dd.Problem(
@@ -183,12 +183,12 @@ def test_controls_initial_state_and_parameters_together_at_a_known_optimum(write
     solution = dd.solve(problem, method="shooting")
     k = np.arange(count)
     rows = np.vstack([[count * h, *(h**2 / lightest * (count - k))], [1.0, *np.full(count, h / lightest)]])
-    # The running cost is QuadraticCost's own multiple of u^2: ask it.
+    # The running cost is a multiple of u^2 that QuadraticCost defines.
     unit = float(problem.running_cost(np.zeros(2), np.ones(1)))
     inverse = 1 / np.array([weight, *np.full(count, h * unit)])
     best = inverse * (rows.T @ np.linalg.solve(rows * inverse @ rows.T, [1.0, 0.0]))
     assert solution.success, solution.message
     assert solution.vector.to_dict()["block.mass"] == pytest.approx([lightest], rel=1e-6)
-    assert solution.xs[0] == pytest.approx([0.0, best[0]], rel=1e-5)  # the solver's tolerance 1e-8, squared costs
+    assert solution.xs[0] == pytest.approx([0.0, best[0]], rel=1e-5)  # the solver's tolerance is 1e-8 for squared costs
     assert solution.us.ravel() == pytest.approx(best[1:], rel=1e-4, abs=1e-4)
     assert solution.cost == pytest.approx(best @ (best / inverse), rel=1e-7)

@@ -1,4 +1,4 @@
-"""Feedback policies: LQR and TVLQR against closed forms, derivatives by state and parameters, and what is refused."""
+"""Feedback policies: LQR and TVLQR, derivatives with respect to state and parameters, and invalid policies."""
 
 import math
 
@@ -17,18 +17,18 @@ from drake_diff.motion.policy import LQR, PD, TVLQR, ParametricPolicy, _check, d
 
 # The weights of the discrete double integrator with h = 0.1.
 Q, R = np.eye(2), np.array([[0.1]])
-UPRIGHT = np.array([0.0, np.pi, 0.0, 0.0])  # of the cart-pole
+UPRIGHT = np.array([0.0, np.pi, 0.0, 0.0])  # state of the cart-pole
 
 
 def network(x, t, p, hidden=16):
-    """A 4-16-1 network: W2 tanh(W1 x + b1) + b2, p = [W1; b1; W2; b2] (97,)."""
+    """Evaluate a 4-16-1 network W2 tanh(W1 x + b1) + b2 with p = [W1; b1; W2; b2] (97,)."""
     size = len(x)
     w1, rest = p[: hidden * size].reshape(hidden, size), p[hidden * size :]
     return rest[hidden : 2 * hidden].reshape(1, hidden) @ np.tanh(w1 @ x + rest[:hidden]) + rest[2 * hidden :]
 
 
 def closed_loop_loss(xs, us, weight=0.01):
-    """Of the end, of the way and of the inputs, so that every part of the gradient has something to pass on."""
+    """Return a loss of the end, the trajectory and the inputs, on which every part of the gradient depends."""
     return (xs[-1] ** 2).sum() + 0.1 * (xs**2).sum() + weight * (us**2).sum()
 
 
@@ -38,10 +38,10 @@ def central_differences(f, p, size=1e-5):
 
 
 def check_gradients(model, policy, x0, num_steps, parameters=(), tolerance=1e-6):
-    """`differentiate_rollout` through the closed loop against central differences of `rollout`, every input of it.
+    """Check `differentiate_rollout` through the closed loop against central differences of `rollout`.
 
-    1e-6 of the largest entry is what central differences of step 1e-5 leave: 1e-10 of truncation and 1e-11 of
-    rounding, times what some thirty steps magnify.
+    The error of central differences with step 1e-5 is 1e-6 of the largest entry: 1e-10 of truncation and 1e-11 of
+    rounding, magnified by some thirty steps.
     """
     x0 = np.asarray(x0, dtype=float)
     policy_values = np.array(policy_parameters(policy))
@@ -62,18 +62,18 @@ def check_gradients(model, policy, x0, num_steps, parameters=(), tolerance=1e-6)
     assert np.array_equal(g.us, motion.us)
     assert g.loss == pytest.approx(loss_at(), rel=1e-12)
     pairs = [(g.by_policy, central_differences(lambda p: loss_at(p=p), policy_values))] if len(policy_values) else []
-    if not tangent_space(model).quaternions:  # a quaternion off the unit sphere is no state to take a difference at
+    if not tangent_space(model).quaternions:  # a displaced quaternion would not have unit norm
         pairs.append((g.by_x0, central_differences(lambda x: loss_at(x=x), x0)))
     if model_values:
         values = np.array(list(model_values.values()))
         pairs.append((g.by_parameters, central_differences(lambda v: loss_at(values=v), values)))
     for found, expected in pairs:
-        assert np.abs(expected).max() > 1e-3  # zero would agree with a loop that was never closed
+        assert np.abs(expected).max() > 1e-3  # zero would agree with a loop that is not closed
         assert found == pytest.approx(expected, rel=tolerance, abs=tolerance * np.abs(expected).max())
 
 
 def riccati(A, B, Q, R, P, num_steps):
-    """K_0 and P_0, by completing the square in [x; u] rather than by the textbook formula."""
+    """Compute K_0 and P_0 by completing the square in [x; u], not by the textbook formula."""
     for _ in range(num_steps):
         AB = np.hstack([A, B])
         H = AB.T @ P @ AB
@@ -82,7 +82,7 @@ def riccati(A, B, Q, R, P, num_steps):
         H[nx:, nx:] += R
         K = np.linalg.inv(H[nx:, nx:]) @ H[nx:, :nx]
         P = H[:nx, :nx] - K.T @ H[nx:, nx:] @ K
-        P = (P + P.T) / 2  # without it the rounding grows
+        P = (P + P.T) / 2  # avoids growth of rounding errors
     return K, P
 
 
@@ -90,7 +90,7 @@ def riccati(A, B, Q, R, P, num_steps):
 
 
 def test_lqr_of_the_double_integrator_is_known(write_urdf):
-    """The discrete algebraic Riccati equation's P and K, eight digits."""
+    """P and K of the discrete algebraic Riccati equation are known to eight digits."""
     lqr = LQR(write_urdf(), [0, 0], [0], Q, R)
     assert lqr.cost_to_go == pytest.approx(np.array([[12.82704933, 2.58530726], [2.58530726, 4.31618637]]), abs=1e-8)
     assert lqr.gain == pytest.approx(np.array([[2.58530726, 3.31618637]]), abs=1e-8)
@@ -99,7 +99,7 @@ def test_lqr_of_the_double_integrator_is_known(write_urdf):
 
 
 def test_lqr_gain_is_the_limit_of_the_riccati_recursion_and_drakes_own(load):
-    """Cart-pole upright, mass and time step other than the oracle's."""
+    """The model is the upright cart-pole, with another mass and time step than the reference solution."""
     model, weight = load("cart_pole.urdf", time_step=0.02), np.diag([1.0, 10.0, 0.1, 0.5])
     lqr = LQR(model, UPRIGHT, [0.0], weight, 0.3 * np.eye(1))
     d = dd.differentiate_step(model, UPRIGHT, [0.0])
@@ -110,9 +110,9 @@ def test_lqr_gain_is_the_limit_of_the_riccati_recursion_and_drakes_own(load):
 
 
 def test_lqr_spends_its_cost_to_go(write_urdf):
-    """sum d'Qd + u'Ru along the closed loop is x0' P x0."""
+    """The sum of d'Qd + u'Ru along the closed loop is d0' P d0."""
     model = write_urdf(mass=2.0)
-    lqr = LQR(model, [0.5, 0.0], [0.0], Q, R)  # anywhere at rest is a fixed point
+    lqr = LQR(model, [0.5, 0.0], [0.0], Q, R)  # every state at rest is a fixed point
     motion = dd.rollout(model, [1.5, -0.3], policy=lqr, num_steps=400)
     d = motion.xs - [0.5, 0.0]
     assert (d**2).sum() + 0.1 * (motion.us**2).sum() == pytest.approx(d[0] @ lqr.cost_to_go @ d[0], rel=1e-10)
@@ -123,7 +123,7 @@ def test_lqr_refuses_what_is_no_fixed_point(load, write_urdf):
         LQR(load("pendulum.urdf"), [0.3, 0.0], [0.0], Q, R)
     with pytest.raises(InputError, match="fixed point"):
         LQR(write_urdf(), [0.0, 1e-3], [0.0], Q, R)
-    held = LQR(load("pendulum.urdf"), [0.3, 0.0], [9.81 * 0.5 * math.sin(0.3)], Q, R)  # the torque that holds it
+    held = LQR(load("pendulum.urdf"), [0.3, 0.0], [9.81 * 0.5 * math.sin(0.3)], Q, R)  # the static torque
     assert held([0.3, 0.0], 0.0) == pytest.approx([9.81 * 0.5 * math.sin(0.3)])
 
 
@@ -134,7 +134,7 @@ def test_lqr_refuses_weights_it_cannot_use(write_urdf):
             LQR(model, [0, 0], [0], *weights)
     with pytest.raises(ShapeError, match="x_ref"):
         LQR(model, [0, 0, 0], [0], Q, R)
-    with pytest.raises(InputError, match="Q that weights all unstable directions"):  # where Drake ends the process
+    with pytest.raises(InputError, match="Q that weights all unstable directions"):  # Drake would end the process
         LQR(model, [0, 0], [0], np.zeros((2, 2)), R)
     model = floating_arm()
     with pytest.raises(InputError, match="stabilize"):
@@ -145,7 +145,7 @@ def test_lqr_refuses_weights_it_cannot_use(write_urdf):
 
 
 def test_tvlqr_of_the_double_integrator_is_known(write_urdf):
-    """N = 20, Qf = 10 I, x0 = (1, 0): P0, K0 and J*."""
+    """P0, K0 and the optimal cost are known for N = 20, Qf = 10 I and x0 = (1, 0)."""
     model, count = write_urdf(), 20
     tvlqr = TVLQR(model, np.zeros((count + 1, 2)), np.zeros((count, 1)), Q, R, 10 * Q)
     assert tvlqr.gains.shape == (count, 1, 2)
@@ -160,7 +160,7 @@ def test_tvlqr_of_the_double_integrator_is_known(write_urdf):
 
 
 def test_tvlqr_follows_a_trajectory_that_open_loop_loses(load):
-    """The pendulum pushed over the top and around: a wrong start is forgotten; at step k its own gain acts."""
+    """The pendulum is pushed over the top. The effect of a wrong start vanishes, and step k uses its own gain."""
     model, count = load("pendulum.urdf", time_step=0.02), 150
     us = 5.0 * np.ones((count, 1))
     xs = dd.rollout(model, [0.0, 0.0], us).xs
@@ -171,12 +171,12 @@ def test_tvlqr_follows_a_trajectory_that_open_loop_loses(load):
     assert np.abs(dd.rollout(model, start, us).xs[-1] - xs[-1]).max() > 0.1
     for k in (0, 7, count - 1):
         assert tvlqr(start, k * 0.02) == pytest.approx(us[k] - tvlqr.gains[k] @ (start - xs[k]), rel=1e-14)
-    assert np.array_equal(tvlqr(start, 99.0), tvlqr(start, (count - 1) * 0.02))  # held after the end
+    assert np.array_equal(tvlqr(start, 99.0), tvlqr(start, (count - 1) * 0.02))  # the last gain acts afterwards
     assert np.array_equal(tvlqr(start, -1.0), tvlqr(start, 0.0))
 
 
 def floating_arm():
-    """A free ball with an actuated bob on a hinge; no gravity."""
+    """Build a free ball with an actuated bob on a hinge, without gravity."""
     plant = Plant(0.02, gravity=0.0)
     ball = plant.plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(2.0, 0.3))
     bob = plant.plant.AddRigidBody("bob", SpatialInertia(0.5, [0.0, 0.0, -0.4], UnitInertia(0.17, 0.17, 0.01)))
@@ -186,7 +186,7 @@ def floating_arm():
 
 
 def test_tvlqr_of_a_floating_base_lives_in_the_tangent_space():
-    """Its gains are those of Jacobians from differences of plus, step and minus: 14 numbers for 15 coordinates."""
+    """The gains equal those of Jacobians from differences of plus, step and minus: 14 columns for 15 coordinates."""
     model, random, count = floating_arm(), np.random.default_rng(3), 6
     space = tangent_space(model)
     assert (model.nx, space.size) == (15, 14)
@@ -225,7 +225,7 @@ def test_tvlqr_refuses_arrays_that_do_not_fit(write_urdf):
 
 
 def test_one_closed_loop_step_of_the_pendulum_under_pd_has_its_closed_form(load):
-    """Of u = kp (q_ref - q) + kd (w_ref - w): A + B K, K = (-kp, -kd), and d x+ / d(kp, kd) = B (e_q, e_w)."""
+    """For u = kp e_q + kd e_w, the derivatives are A + B K with K = (-kp, -kd), and d x+ / d(kp, kd) = B (e_q, e_w)."""
     model, x, ref = load("pendulum.urdf"), np.array([0.7, -1.2]), np.array([1.0, 0.2])
     kp, kd, h, inertia = 3.0, 0.4, 0.01, 0.25
     s = 1 / (1 + h * 0.1 / inertia)
@@ -239,7 +239,7 @@ def test_one_closed_loop_step_of_the_pendulum_under_pd_has_its_closed_form(load)
 
 
 def test_pd_of_a_floating_robot_reads_the_joint_behind_the_quaternion():
-    """The joint is position 7 and velocity 6 of the 15 coordinates, so 7 and 14 of x."""
+    """The joint has position 7 and velocity 6, which are entries 7 and 14 of the 15 coordinates of x."""
     x = np.arange(15.0)
     assert PD(floating_arm(), 3.0, 0.5)(x, 0.0) == pytest.approx([-3.0 * 7 - 0.5 * 14], rel=1e-14)
 
@@ -279,7 +279,7 @@ def random_network(model):
     ],
 )
 def test_the_gradient_through_a_policy_is_that_of_rollouts(load, file, policy_of, x0, steps, parameters):
-    """The last has no parameters: by the initial state and the model's parameters alone."""
+    """The last policy has no parameters, so only the initial state and the model's parameters are checked."""
     model = load(f"{file}.urdf", time_step=0.01 if file == "pendulum" else 0.02)
     check_gradients(model, policy_of(model), x0, steps, parameters)
 
@@ -354,7 +354,7 @@ def test_parameters_must_be_a_flat_vector_of_numbers():
         ParametricPolicy(network, [1.0, np.inf])
     parameters = np.ones(3)
     policy = ParametricPolicy(network, parameters)
-    parameters[0] = 5.0  # the policy keeps its own
+    parameters[0] = 5.0  # the policy has a copy
     assert np.array_equal(policy_parameters(policy), np.ones(3))
 
 
@@ -371,7 +371,7 @@ def test_a_policy_cannot_change_the_state_it_is_given():
 
 @pytest.mark.solve
 def test_a_long_tvlqr_is_differentiated_by_the_gains_that_act(write_urdf):
-    """5000 steps: only two of the 10000 parameters carry derivatives at a time."""
+    """With 5000 steps, only two of the 10000 parameters carry derivatives at a time."""
     model, count = write_urdf(), 5000
     xs, us = np.zeros((count + 1, 2)), np.zeros((count, 1))
     tvlqr = TVLQR(model, xs, us, Q, R)
@@ -383,7 +383,7 @@ def test_a_long_tvlqr_is_differentiated_by_the_gains_that_act(write_urdf):
 
 @each_row("u", [0.0, 1e-3, 1e4])
 def test_another_value_is_told_from_rounding_at_every_size_of_the_input(u):
-    """To 1e-9 of the input, or of 1 where that is more: what a sum in another order leaves is far below."""
+    """The tolerance is 1e-9 times the larger of 1 and the input. Rounding of a sum in another order is far below."""
     allowed = 1e-9 * max(1.0, u)
     _check(InitializeAutoDiff([u + 0.5 * allowed]), np.zeros((1, 1)), np.array([u]))
     with pytest.raises(GradientError, match="with floats at the same x and t"):

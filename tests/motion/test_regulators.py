@@ -1,4 +1,4 @@
-"""TVLQR along motions of acrobot and cart-pole against Drake's own finite-horizon regulator of the discrete plant."""
+"""TVLQR along motions of acrobot and cart-pole equals Drake's finite-horizon regulator of the discrete plant."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from drake_diff.motion import TVLQR
 
 
 def gains_of_drake(model, xs, us, Q, R, Qf):
-    """(N, nu, nx), by Drake's linearization and Drake's recursion."""
+    """Compute the gains (N, nu, nx) with Drake's linearization and Drake's recursion."""
     context, options = model.plant.CreateDefaultContext(), FiniteHorizonLinearQuadraticRegulatorOptions()
     port = model.plant.get_actuation_input_port()
     port.FixValue(context, np.zeros(1))
@@ -30,7 +30,7 @@ def gains_of_drake(model, xs, us, Q, R, Qf):
 @pytest.mark.solve
 @each_row("file, h, push", [("cart_pole.urdf", 0.02, 5.0), ("acrobot.xml", 0.05, 3.0)])
 def test_our_gains_are_drakes_on_the_discrete_plant(load, file, h, push):
-    """1e-9 of the largest: 80 steps of rounding in two Riccati recursions, along a motion that turns its poles."""
+    """The gains agree to 1e-9 of the largest, due to rounding in two Riccati recursions over 80 steps."""
     model, weights = load(file, time_step=h), (np.diag([1.0, 10.0, 0.1, 0.5]), np.array([[0.3]]), 5 * np.eye(4))
     us = push * np.sin(0.2 * np.arange(80))[:, None]
     xs = dd.rollout(model, [0.0, 0.4, 0.0, 0.0], us).xs

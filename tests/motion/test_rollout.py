@@ -1,4 +1,4 @@
-"""Rollouts: what is measured along them, in closed form where there is one."""
+"""Quantities measured along rollouts equal their closed forms."""
 
 import math
 from dataclasses import replace
@@ -18,7 +18,7 @@ from drake_diff.optimize.replay import energy_check
 
 @pytest.fixture
 def oscillator(tmp_path):
-    """The mass on its spring, without damper or rest length."""
+    """Load the mass on its spring, without damping and with a rest length of 0."""
     text = (MODELS / "mass_spring_damper.sdf").read_text()
     text = text.replace("<damping>1.5", "<damping>0").replace("<spring_reference>0.1", "<spring_reference>0")
     (tmp_path / "oscillator.sdf").write_text(text)
@@ -26,7 +26,7 @@ def oscillator(tmp_path):
 
 
 def test_symplectic_euler_conserves_a_modified_energy(oscillator):
-    """v^2 + w^2 x^2 - h w^2 x v is constant, w = 5."""
+    """The conserved energy is v^2 + w^2 x^2 - h w^2 x v with w = 5."""
     motion = dd.rollout(oscillator, [0.2, 0.0], np.zeros((5000, 1)))
     x, v = motion.xs.T
     modified = v**2 + 25 * x**2 - 0.01 * 25 * x * v
@@ -34,7 +34,7 @@ def test_symplectic_euler_conserves_a_modified_energy(oscillator):
 
 
 def test_a_motion_of_no_steps_is_a_state(oscillator):
-    """As a closed loop leaves that ends before its first step: k x^2 / 2 with k = 25 N/m of 1 kg and w = 5 1/s."""
+    """A closed loop that ends before its first step has this motion. Its energy is k x^2 / 2 with k = 25 N/m per kg."""
     meter = Meter(oscillator)
     set_state(oscillator.double, np.array([0.2, 0.0]))
     meter.measure_state(np.array([0.2, 0.0]))
@@ -45,7 +45,7 @@ def test_a_motion_of_no_steps_is_a_state(oscillator):
 
 @pytest.mark.parametrize("h", [0.02, 0.005])
 def test_the_oscillators_frequency_and_power_of_its_jacobian(oscillator, h):
-    """A^N = (sin(N a) A - sin((N - 1) a) I) / sin a, cos a = 1 - h^2 w^2 / 2."""
+    """A^N = (sin(N a) A - sin((N - 1) a) I) / sin a with cos a = 1 - h^2 w^2 / 2."""
     model = dd.load_model(oscillator.source, time_step=h)
     A = dd.differentiate_step(model, [0.2, 0.0], [0.0]).A
     count, angle = 100, math.acos(1 - (5 * h) ** 2 / 2)
@@ -55,7 +55,7 @@ def test_the_oscillators_frequency_and_power_of_its_jacobian(oscillator, h):
 
 
 def test_free_fall_drifts_as_symplectic_euler_must(load):
-    """Of a thrown body E_N - E_0 = -m g^2 h T / 2, a drift and no oscillation."""
+    """For a thrown body E_N - E_0 = -m g^2 h T / 2, which is a drift without oscillation."""
     model = load("projectile.sdf", time_step=0.01)
     motion = dd.rollout(model, model.default_state, num_steps=100)
     assert motion.energy_drift == pytest.approx(-0.5 * 9.81**2 * 0.01, rel=1e-9)
@@ -65,18 +65,18 @@ def test_free_fall_drifts_as_symplectic_euler_must(load):
 @pytest.mark.solve
 @pytest.mark.parametrize("approximation", ["lagged", "similar", "sap"])
 def test_what_slides_to_a_stop_loses_mu_m_g_d_to_contact_and_no_energy_is_unexplained(load, approximation):
-    """A block of 2 kg on four spheres, mu = 0.4, from 1 m/s: all of m v^2 / 2 = mu m g d is what friction did."""
+    """Friction, mu = 0.4, dissipates m v^2 / 2 = mu m g d of a block of 2 kg on four spheres that starts at 1 m/s."""
     model = load("sliding_block.sdf", time_step=0.001, contact_approximation=approximation)
     x = np.array(model.default_state)
     x[6], x[10] = 0.05 - 2 * 9.81 / 4 / 1e4, 1.0
     motion = dd.rollout(model, x, num_steps=600)
     way = motion.xs[-1, 4] - motion.xs[0, 4]
     assert abs(motion.xs[-1, 10]) < 1e-3
-    assert motion.contact_work[-1] == pytest.approx(-1.0, abs=2e-4)  # it creeps on by the regularization's 1e-4 m/s
-    assert motion.contact_work[-1] == pytest.approx(-0.4 * 2 * 9.81 * way, rel=0.01)  # Euler: v h / 2 of the way
+    assert motion.contact_work[-1] == pytest.approx(-1.0, abs=2e-4)  # regularized friction lets it creep at 1e-4 m/s
+    assert motion.contact_work[-1] == pytest.approx(-0.4 * 2 * 9.81 * way, rel=0.01)  # Euler's error is v h / 2
     assert abs(motion.energy_drift) < 1e-4
     assert energy_check(motion).passes
-    # Without the contact's own work a joule would be missing, and told of.
+    # Without the work of contact, a joule is missing, and the check reports it.
     unexplained = replace(motion, contact_work=np.zeros(601))
     assert (energy_check(unexplained).where, energy_check(unexplained).verdict) == ("lost", "fail")
     doubled = replace(motion, contact_work=2 * motion.contact_work)
@@ -84,7 +84,7 @@ def test_what_slides_to_a_stop_loses_mu_m_g_d_to_contact_and_no_energy_is_unexpl
 
 
 def test_what_a_joint_limit_takes_is_the_limits_work(load):
-    """A cart runs into its limit at 2 m/s, its pole upright: what is lost is the limit's, but for the time stepping."""
+    """A cart hits its limit at 2 m/s. The lost energy is the work of the limit, up to the error of time stepping."""
     model = load("cart_pole.urdf")
     motion = dd.rollout(model, [1.8, np.pi, 2.0, 0.0], np.zeros((100, 1)))
     assert np.all(motion.contact_work == 0)
@@ -105,7 +105,7 @@ def test_a_policy_gives_what_its_inputs_give(load):
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_step_under_an_input_that_is_not_finite_is_refused(load, value):
-    """A solver's trial may be such a one, and Drake would end the whole process there."""
+    """A solver may try such an input, and Drake would end the whole process."""
     with pytest.raises(SimulationError, match="an input is not finite"):
         advance(load("cart_pole.urdf").double, np.zeros(4), np.array([value]))
 

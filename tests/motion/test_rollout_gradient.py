@@ -1,4 +1,4 @@
-"""Gradients of whole rollouts: closed forms, invariants of contact, and what they must refuse."""
+"""Gradients of rollouts agree with closed forms and invariants of contact. Unsuitable losses are refused."""
 
 import math
 
@@ -14,7 +14,7 @@ from drake_diff.exceptions import GradientError, InputError
 
 
 def test_the_double_integrators_gradient_and_norms_have_their_closed_form(write_urdf):
-    """x_N = x_0 + N h v_0 + h^2 / m sum_k (N - k) u_k; d x_N / d x_k = (1, (N - k) h)."""
+    """As x_N = x_0 + N h v_0 + h^2 / m sum_k (N - k) u_k, d x_N / d x_k is (1, (N - k) h)."""
     h, m, count = 0.1, 2.0, 7
     model = write_urdf(mass=m, time_step=h)
     us = np.random.default_rng(0).standard_normal((count, 1))
@@ -30,7 +30,7 @@ def test_the_double_integrators_gradient_and_norms_have_their_closed_form(write_
 
 
 def test_a_loss_of_the_whole_motion_is_differentiated_too(write_urdf):
-    """sum_k x_k + 3 sum_k u_k^2 on one step: x_1 = x_0 + h v_0 + h^2 u_0 / m."""
+    """The loss is sum_k x_k + 3 sum_k u_k^2 over one step, x_1 = x_0 + h v_0 + h^2 u_0 / m."""
     model = write_urdf(mass=2.0, time_step=0.1)
     g = dd.differentiate_rollout(model, [0.5, -1.0], [[0.7]], lambda xs, us: xs[:, 0].sum() + 3 * (us**2).sum())
     assert g.by_x0 == pytest.approx([2.0, 0.1], rel=1e-12)
@@ -38,7 +38,7 @@ def test_a_loss_of_the_whole_motion_is_differentiated_too(write_urdf):
 
 
 def test_a_long_loss_is_differentiated_in_blocks_without_changing_it(load):
-    """300 variables and more go through AutoDiffXd 128 at a time."""
+    """AutoDiffXd differentiates the 300 variables and more in blocks of 128."""
     model = load("pendulum.urdf")
     us = 0.1 * np.random.default_rng(1).standard_normal((150, 1))
     g = dd.differentiate_rollout(model, [0.1, 0.0], us, lambda xs, us: (xs**2).sum() + np.sin(us).sum())
@@ -47,7 +47,7 @@ def test_a_long_loss_is_differentiated_in_blocks_without_changing_it(load):
 
 
 def test_reverse_accumulation_is_the_product_of_the_steps(load):
-    """v' Phi, Phi the product of the steps' Jacobians; 1e-10 is the rounding of 25 products."""
+    """The gradient is v' Phi with the product Phi of the steps' Jacobians. Rounding of 25 products is 1e-10."""
     model, random = load("acrobot.xml"), np.random.default_rng(2)
     x0, us, v = random.standard_normal(4), random.standard_normal((25, 1)), random.standard_normal(4)
     product = np.eye(4)
@@ -58,7 +58,7 @@ def test_reverse_accumulation_is_the_product_of_the_steps(load):
 
 
 def test_the_projectiles_jacobian_is_exact(load):
-    """d p_N / d v_0 = N h I, d p_N / d p_0 = I."""
+    """The exact derivatives are d p_N / d v_0 = N h I and d p_N / d p_0 = I."""
     model = load("projectile.sdf")
     for i in range(3):
         g = dd.differentiate_rollout(model, model.default_state, None, lambda x, i=i: x[4 + i], num_steps=100)
@@ -70,7 +70,7 @@ def test_the_projectiles_jacobian_is_exact(load):
 @each_row("masses", [(1.0, 1.0), (1.0, 2.0)])
 @each_row("approximation", ["lagged", "sap"])
 def test_momentum_invariants_of_a_collision(masses, approximation):
-    """Of any contact law: sum_i m_i dv_i/dv_j = m_j, dv/dx -> 0, dx/dx -> m_j, dx/dv -> m_j T."""
+    """Any contact law has sum_i m_i dv_i/dv_j = m_j, and in the same way dv/dx -> 0, dx/dx -> m_j, dx/dv -> m_j T."""
     h, count = 1e-3, 1000
     plant = Plant(h, approximation, gravity=0.0)
     for name, mass in zip("ab", masses, strict=True):
@@ -81,7 +81,7 @@ def test_momentum_invariants_of_a_collision(masses, approximation):
     for d in steps:
         product = d.A @ product
     m = np.array(masses)
-    assert steps[-1].x_next[3] > 0.1  # they did collide
+    assert steps[-1].x_next[3] > 0.1  # the balls collided
     assert m @ product[2:, 2:] == pytest.approx(m, rel=1e-9)
     assert m @ product[2:, :2] == pytest.approx([0, 0], abs=1e-8)
     assert m @ product[:2, :2] == pytest.approx(m, rel=1e-9)
@@ -98,18 +98,18 @@ def bouncing_ball(k):
 @pytest.mark.slow
 @pytest.mark.parametrize(("k", "at_least"), slow_after(1, [(1e3, 0.05), (1e4, 0.5)]))
 def test_a_compliant_bounce_does_not_have_the_rigid_gradient(k, at_least):
-    """A bounce off the ground without loss has dy/dy0 = dy/dv0 = -1. That of Drake's discrete contact is
-    10 to 400 % off, the more the stiffer, although differences confirm it: not to be optimized with."""
+    """A lossless bounce off the ground has dy/dy0 = dy/dv0 = -1. The gradient of Drake's discrete contact is wrong by
+    10 to 400 %, more for stiffer contact, although differences confirm it. It is useless for optimization."""
     model = bouncing_ball(k)
     start = [1.001, -2.0]
     g = dd.differentiate_rollout(model, start, None, lambda x: x[0], num_steps=480)
-    assert g.loss == pytest.approx(1.2, rel=0.35)  # the motion is near the rigid one's, y(T) = 1.2
-    assert np.abs(g.by_x0 + 1).max() > at_least  # the gradient is not
+    assert g.loss == pytest.approx(1.2, rel=0.35)  # the motion is close to the rigid one, y(T) = 1.2
+    assert np.abs(g.by_x0 + 1).max() > at_least  # the gradient is not close
     dd.certify_rollout(model, start, None, lambda x: x[0], num_steps=480).require()
 
 
 def test_gradient_by_parameters_is_accumulated(write_urdf, load):
-    """x_N of the double integrator by its mass: -h^2 / m^2 sum_k (N - k) u_k."""
+    """The derivative of x_N with respect to the mass is -h^2 / m^2 sum_k (N - k) u_k."""
     h, m, count = 0.1, 2.0, 5
     us = np.ones((count, 1))
     g = dd.differentiate_rollout(

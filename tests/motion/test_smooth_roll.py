@@ -1,4 +1,4 @@
-"""The compiled form of smooth steps against Drake's own; and that what a search tells is Drake's."""
+"""Compiled smooth steps equal Drake's steps, and the results of a search are from Drake's rollout."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def in_the_middle(model):
 
 
 def stays(model):
-    """x0, and what else a roll without feedback, gaps and bounds is asked."""
+    """Return x0 and the other arguments of a roll without feedback, gaps and bounds."""
     free = np.full(model.nu, np.inf)
     zeros = np.zeros((12, model.nu, model.nx))
     return in_the_middle(model), np.zeros((13, model.nx)), np.zeros((12, model.nx)), zeros, (-free, free, -free, free)
@@ -38,7 +38,7 @@ def stays(model):
 @each_row("time_step", [0.002, 0.02])
 @each_row("seed", [0, 1])
 def test_it_moves_as_drake_does(file, time_step, seed):
-    """Gravity, damping and reflected inertia included; 1e-11 of the largest state after 12 steps."""
+    """12 steps with gravity, damping and reflected inertia agree to 1e-11 of the largest state."""
     model, random = arm(file, time_step), np.random.default_rng(seed)
     x0, old, gaps, gains, bounds = stays(model)
     x0 = x0 + 0.05 * random.standard_normal(model.nx)
@@ -83,7 +83,7 @@ def test_what_it_leaves_out_it_does_not_move(write_urdf):
 
 
 def reach(model):
-    """That of `tests/benchmarks/ilqr.py`."""
+    """Return the reaching problem of `tests/benchmarks/ilqr.py`."""
     goal = np.array([0.5, -1.2, 1.0, -0.8, 0.6, 0.3, 0, 0, 0, 0, 0, 0])
     weights = np.repeat([0.1, 0.01], 6), np.repeat([1000.0, 10.0], 6)
     effort, final = (dd.QuadraticCost(Q=np.diag(q), R=1e-3 * np.eye(6), x_ref=goal) for q in weights)
@@ -98,7 +98,7 @@ def searched(problem):
 
 
 def test_what_is_told_is_drakes_own_rollout():
-    """Bit by bit, and the cost of the last row is its cost."""
+    """The states are equal to the last bit, and the last iteration has the cost of this rollout."""
     problem = reach(arm("ur5_robot.urdf"))
     result, xs, us = searched(problem)
     assert result.outcome is Outcome.SOLVED
@@ -109,7 +109,7 @@ def test_what_is_told_is_drakes_own_rollout():
 @pytest.mark.slow
 @pytest.mark.parametrize("wrong", [1 + 1e-6, 1.01])
 def test_a_form_that_moves_otherwise_is_found_out(wrong, monkeypatch):
-    """A search that tries motions with other masses ends where Drake's own does, 1e-9 of its cost."""
+    """A search whose trial rolls have wrong masses ends at the same solution, to 1e-9 of its cost."""
     problem = reach(arm("ur5_robot.urdf"))
     expected, _, right = searched(problem)
     plain = smooth_roll.SmoothRoll.__call__

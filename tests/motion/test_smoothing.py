@@ -1,4 +1,4 @@
-"""Randomized smoothing against closed forms and quadrature, within 5 standard errors."""
+"""Randomized smoothing agrees with closed forms and quadrature within 5 standard errors."""
 
 import math
 from itertools import pairwise
@@ -19,12 +19,12 @@ SAMPLES = 25000
 
 
 def within(estimate, truth, variance, errors=5.0):
-    """Whether all entries lie within so many standard errors of the truth."""
+    """Return whether all entries lie within `errors` standard errors of the truth."""
     return bool(np.all(np.abs(np.asarray(estimate) - truth) <= errors * np.sqrt(variance) + 1e-15))
 
 
 def integral(f, breaks, panels=20, order=20):
-    """Gauss-Legendre between `breaks`; f takes an array."""
+    """Integrate f, a function of an array, by Gauss-Legendre quadrature between `breaks`."""
     nodes, weights = np.polynomial.legendre.leggauss(order)
     edges = np.concatenate([np.linspace(a, b, panels + 1)[:-1] for a, b in pairwise(breaks)])
     edges = np.append(edges, breaks[-1])
@@ -37,7 +37,7 @@ def density(t):
 
 
 def ball(theta, g, d, height):
-    """J = -x_f^2 and dJ/dtheta of a ball thrown at `theta` with 1 m/s at a wall at d."""
+    """Return J = -x_f^2 and dJ/dtheta of a ball thrown at the angle `theta` with 1 m/s at a wall at d."""
     reach = np.sin(2 * theta) / g
     at_the_wall = d * np.tan(theta) - g * d**2 / (2 * np.cos(theta) ** 2)
     blocked = (reach >= d) & (at_the_wall < height)
@@ -45,7 +45,7 @@ def ball(theta, g, d, height):
 
 
 def ball_breaks(g, d, height):
-    """(where J jumps, where it has a kink)."""
+    """Return the angles at which J jumps, and the angles at which it has a kink."""
     a = g * d**2 / 2
     root = math.sqrt(d**2 - 4 * a * (a + height))
     jumps = [math.atan((d - root) / (2 * a)), math.atan((d + root) / (2 * a))]
@@ -54,7 +54,7 @@ def ball_breaks(g, d, height):
 
 
 def exact_ball(theta, g, d, height, sigma):
-    """F, dF/dtheta, E[first], and the variances of one sample of first, zeroth and first - zeroth."""
+    """Compute F, dF/dtheta, E[first], and the variances of one sample of first, zeroth and first - zeroth."""
     jumps, kinks = ball_breaks(g, d, height)
     low, high = theta - 10 * sigma, theta + 10 * sigma
     breaks = [low, *sorted(b for b in jumps + kinks if low < b < high), high]
@@ -80,7 +80,7 @@ def exact_ball(theta, g, d, height, sigma):
 
 
 def one_ball(theta, g, d, height):
-    """`ball` of one number, without NumPy, for which so many calls take a second."""
+    """Evaluate `ball` at one number without NumPy, which would take a second for the calls of a test."""
     reach = math.sin(2 * theta) / g
     at_the_wall = d * math.tan(theta) - g * d**2 / (2 * math.cos(theta) ** 2)
     if reach >= d and at_the_wall < height:
@@ -106,7 +106,7 @@ def smooth_ball(theta, g, d, height, sigma, **options):
     ),
 )
 def test_ball_with_wall(case, published):
-    """First order is biased by -sum over the jumps b of [J(b+) - J(b-)] times the density of b, where there are any."""
+    """The bias of first order is the sum of -[J(b+) - J(b-)] times the density of b over all jumps b."""
     found, exact, sigma, jumps = smooth_ball(*case, seed=3), exact_ball(*case), case[-1], 0.0
     assert published is None or exact["truth"] == pytest.approx(published, abs=1e-11)
     for b in ball_breaks(*case[1:-1])[0]:
@@ -125,7 +125,7 @@ def test_ball_with_wall(case, published):
 
 @pytest.mark.slow
 def test_the_reported_variances_are_those_of_one_sample_divided_by_their_number():
-    """7.7544e-6 and 5.60554e-3; the estimates of the variances scatter by about 1 % themselves."""
+    """The variances are 7.7544e-6 and 5.60554e-3. Their estimates scatter by about 1 %."""
     found, exact = smooth_ball(0.7, *SUH), exact_ball(0.7, *SUH)
     assert exact["first_variance"] == pytest.approx(7.7544e-6, rel=1e-4)
     assert exact["zeroth_variance"] == pytest.approx(5.60554e-3, rel=1e-5)
@@ -143,7 +143,7 @@ def heaviside(theta, sigma, **options):
 @pytest.mark.slow
 @each_row("theta, sigma", [(0.0, 0.05), (0.02, 0.05), (-0.3, 0.4), (7.0, 11.0)])
 def test_heaviside_is_biased_and_the_blend_follows_zeroth_order(theta, sigma):
-    """First order is 0 always, the truth is the normal density of theta, F its distribution function."""
+    """First order is always 0. The truth is the normal density of theta, and F is its distribution function."""
     truth = density(theta / sigma) / sigma
     found = heaviside(theta, sigma, samples=5000)
     assert not found.first.any()
@@ -152,7 +152,7 @@ def test_heaviside_is_biased_and_the_blend_follows_zeroth_order(theta, sigma):
     assert within(found.zeroth, truth, found.zeroth_variance)
     assert found.biased.all()
     assert within(found.jacobian, truth, found.variance)
-    # a^2 (b^2 + e^2), e being that of a bias whose farthest sample came three times.
+    # The value is a^2 (b^2 + e^2), with the error e of a bias whose farthest sample is counted three times.
     assert found.bias_square >= found.weight**2 * (found.bias**2 + found.bias_error**2)
     assert found.bias_square == pytest.approx(found.weight**2 * (found.bias**2 + found.bias_error**2), rel=1e-3)
     assert heaviside(theta, sigma, samples=5000, method="first").jacobian == 0
@@ -160,7 +160,7 @@ def test_heaviside_is_biased_and_the_blend_follows_zeroth_order(theta, sigma):
 
 @pytest.mark.slow
 def test_quadratic_function():
-    """f = x^2: F = x^2 + sigma^2, dF/dx = 2 x; one sample of zeroth order varies by 8 x^2 + 15 sigma^2."""
+    """For f = x^2, F = x^2 + sigma^2, dF/dx = 2 x, and a zeroth-order sample has the variance 8 x^2 + 15 sigma^2."""
     x, sigma, count = 0.7, 0.3, 30000
     found = smooth(lambda z: z[0] ** 2, [x], lambda z: 2 * z, noise=Gaussian(sigma), samples=count)
     assert within(found.value, x**2 + sigma**2, found.value_variance)
@@ -170,8 +170,8 @@ def test_quadratic_function():
     assert count * found.first_variance == pytest.approx(4 * sigma**2, rel=0.05)
     assert count * found.zeroth_variance == pytest.approx(8 * x**2 + 15 * sigma**2, rel=0.05)
     assert not found.biased.any()
-    # Of samples 2 (x + w) and, corrected by the line 2 x w, w^3 / sigma^2 + 2 x: 4, 15 and 6 sigma^2 in variance and
-    # covariance, so e^2 is 7, and a = (15 - 6) / (2 * 7) where b is chance: E[b^2] = e^2 makes it less, 9 / 21.
+    # Samples 2 (x + w) and, corrected by the line 2 x w, w^3 / sigma^2 + 2 x have variances of 4 and 15 sigma^2 and a
+    # covariance of 6 sigma^2. So e^2 is 7 sigma^2, and a is 9 / 14 for b = 0, or 9 / 21 for the expected b^2, e^2.
     assert count * found.bias_error**2 == pytest.approx(7 * sigma**2, rel=0.1)
     assert 9 / 28 < found.weight < 9 / 14
 
@@ -187,12 +187,11 @@ ROUGH = (lambda z: z[0] + 0.1 * math.sin(1e4 * z[0])), (lambda z: [1 + 1e3 * mat
 @pytest.mark.slow
 @pytest.mark.parametrize(("samples", "least"), [(30, 0.8), pytest.param(100, 0.9, marks=pytest.mark.slow)])
 def test_three_standard_errors_of_a_blend_cover_the_truth(samples, least):
-    """How often, over seeds: of a normal estimate 99.7 %, of few samples of which some are rare and large, less.
+    """The coverage over seeds is 99.7 % for normal estimates, and less for few samples with rare large values.
 
-    The least is beside the kink, 87 and 94 %; 200 runs know it to 2 %, and the bounds are three of these below. All
-    others are above 89 and 95 %. Closed forms: the density of a
-    step, 2 Phi - 1 of |x|, 2 x, exp(-sigma^2 / 2) cos x; what oscillates fast averages to 0. The error that is stated
-    is that which there is, to a half.
+    The lowest fractions, 87 and 94 %, are next to the kink. 200 runs give them to 2 %, and the bounds are three
+    times this below. All others are above 89 and 95 %. The closed forms are the density of a step, 2 Phi - 1 for |x|,
+    2 x, and exp(-sigma^2 / 2) cos x. Fast oscillations average to 0. The reported variance is correct to a half.
     """
     sigma, runs = 0.5, 200
     cases = {
@@ -214,7 +213,7 @@ def test_three_standard_errors_of_a_blend_cover_the_truth(samples, least):
 
 
 def test_the_variance_of_a_blend_says_more_than_that_of_first_order_where_f_jumps():
-    """First order is 0 and varies by 0: a blend that believed it would be off by the whole density, and state 0."""
+    """First order is 0 with variance 0. A blend that trusted it would be wrong by the density, with an error of 0."""
     found = heaviside(0.0, 0.5, samples=30, seed=4)
     assert (found.first, found.first_variance) == (0, 0)
     assert found.bias_square > 0
@@ -224,7 +223,7 @@ def test_the_variance_of_a_blend_says_more_than_that_of_first_order_where_f_jump
 
 
 def test_vector_function_of_which_one_entry_jumps():
-    """Rows sin x0 + x1, x0 x1 and sign(x1): only d sign / d x1 is biased, by minus 2 normal densities."""
+    """For sin x0 + x1, x0 x1 and sign(x1), only d sign(x1) / d x1 is biased, by minus 2 normal densities."""
     x, sigma = np.array([0.4, 0.1]), np.array([0.2, 0.3])
 
     def f(z):
@@ -249,7 +248,7 @@ def test_vector_function_of_which_one_entry_jumps():
 
 
 def test_a_wrong_derivative_is_seen():
-    """The Jacobian of f is off by a factor of 1.1."""
+    """The given Jacobian of f is wrong by a factor of 1.1."""
     found = smooth(lambda z: 2 * z[0], [1.0], lambda z: [2.2], noise=Gaussian(0.1), samples=20000)
     assert found.biased.all()
     assert smooth(lambda z: 2.0, [1.0], lambda z: [2.2], noise=Gaussian(0.1), samples=2).weight == 0
@@ -258,7 +257,7 @@ def test_a_wrong_derivative_is_seen():
 @pytest.mark.slow
 @each_row("u, c", [(0.1, 0.04), (5.0, 30.0)])
 def test_barrier_noise_makes_the_log_barrier(u, c):
-    """First by quadrature in w = sqrt(c) tan t, which makes the density cos(t) / 2; then sampled."""
+    """The reference is quadrature in w = sqrt(c) tan t, for which the density is cos(t) / 2."""
     root, edge = math.sqrt(c), math.atan(-u / math.sqrt(c))
     step, value = (1 + u / math.sqrt(u**2 + c)) / 2, (u + math.sqrt(u**2 + c)) / 2
     assert integral(lambda t: np.cos(t) / 2, [edge, math.pi / 2]) == pytest.approx(step, rel=1e-14)
@@ -368,13 +367,13 @@ def test_what_is_not_finite_is_refused(f, jacobian, message):
         smooth(f, [0.0], jacobian, noise=Gaussian(0.1), samples=10)
 
 
-H, K, TAU, RADIUS = 0.01, 1e4, 0.002, 0.1  # of the pair; see models/sphere_on_ground.sdf
-CONTACT = 1 / (1 + H * K * (H + TAU))  # a step in contact leaves this share of the free velocity of 1 kg
+H, K, TAU, RADIUS = 0.01, 1e4, 0.002, 0.1  # values of the pair; see models/sphere_on_ground.sdf
+CONTACT = 1 / (1 + H * K * (H + TAU))  # fraction of the free velocity of 1 kg after a step in contact
 
 
 @pytest.fixture
 def ball_over_ground():
-    """The ball of sphere_on_ground.sdf on a vertical slide: x = [z, v]."""
+    """Build the ball of sphere_on_ground.sdf on a vertical slide, with x = [z, v]."""
     plant, properties = Plant(H), contact_properties(2 * K, 1.0, 0.5, TAU / 2)
     plant.ball("ball", 1.0, RADIUS, properties, "z")
     plant.ground(properties)
@@ -382,7 +381,7 @@ def ball_over_ground():
 
 
 def test_smoothing_a_touching_ball_lies_between_the_two_sides(ball_over_ground):
-    """With v = g h the step has a kink at touchdown but no jump: half of each side, and first order is right."""
+    """With v = g h the step has a kink at touchdown, but no jump. The smoothed derivative is the mean of both sides."""
     v = 9.81 * H
     above = dd.differentiate_step(ball_over_ground, [RADIUS + 1e-6, v]).A
     below = dd.differentiate_step(ball_over_ground, [RADIUS - 1e-6, v]).A
@@ -398,7 +397,7 @@ def test_smoothing_a_touching_ball_lies_between_the_two_sides(ball_over_ground):
 
 
 def test_a_landing_balls_jump_is_seen_as_bias(ball_over_ground):
-    """At v = -1 the next velocity jumps at touchdown by 1 - CONTACT of itself: first order does not see it."""
+    """At v = -1 the next velocity changes at touchdown by the fraction 1 - CONTACT, which first order misses."""
     sigma, free = 1e-3, -1 - 9.81 * H
     density = 1 / (sigma * math.sqrt(2 * math.pi))
     truth = -H * K * CONTACT / 2 + free * (1 - CONTACT) * density

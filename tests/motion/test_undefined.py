@@ -1,4 +1,4 @@
-"""Columns in which a motion's loss has no slope: told where there is none, and nowhere else."""
+"""A column of a gradient is reported as undefined if the loss has no slope there, and only then."""
 
 import warnings
 
@@ -17,7 +17,7 @@ from drake_diff.motion.undefined import Undefined
 def ball(
     *, gravity=0.0, stiffness=1e4, dissipation=0.2, friction=0.3, approximation="lagged", relaxation=0.0, motor=False
 ):
-    """1 kg, radius 0.1 m, on rails along x and z over the ground."""
+    """Build a ball of 1 kg and radius 0.1 m on rails along x and z over the ground."""
     plant = Plant(0.01, approximation, gravity=gravity)
     properties = contact_properties(2 * stiffness, dissipation, friction, relaxation / 2)
     plant.ball("ball", 1.0, 0.1, properties, "x", "z")
@@ -28,7 +28,7 @@ def ball(
 
 
 def gradient(model, x0, loss, steps, **more):
-    """It, and the names of the columns that are undefined; which are warned of, or nothing is."""
+    """Return the gradient and the names of its undefined columns. Check that a warning is issued for these only."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", GradientWarning)
         g = dd.differentiate_rollout(model, x0, None, loss, num_steps=steps, method="continuous", **more)
@@ -51,7 +51,7 @@ def test_a_clean_bounce_and_a_pendulum_are_defined():
 
 
 def test_a_curve_that_is_steep_is_defined():
-    """Thrice around: sin of 30 times the angle differs by 1.5 % over +-1e-2, by the square of the width."""
+    """The slope of sin(30 x) over +-1e-2 differs by 1.5 %, in proportion to the square of the width."""
     model = ball(gravity=9.81)
     _, undefined = gradient(model, [0.3, 1.0, 0.5, 0], lambda x: np.sin(30 * x[0]), 20)
     assert undefined == []
@@ -61,7 +61,7 @@ def test_a_curve_that_is_steep_is_defined():
     ("gap", "is_smooth"), [(-1e-4, False), (1e-4, False), (-3e-3, False), (3e-3, False), (3e-2, True)]
 )
 def test_a_ball_that_passes_another_has_a_slope_only_far_from_touching(gap, is_smooth):
-    """The way of the ball is by `gap` [m] too far aside to touch, or not far enough."""
+    """The path of the ball misses the other ball by `gap` [m], or hits it if `gap` is negative."""
     plant = Plant(0.01, "lagged", gravity=0.0)
     properties = contact_properties(2e4, 0.2, 0.3)
     plant.ball("ball", 1.0, 0.1, properties, "x", "z")
@@ -69,11 +69,11 @@ def test_a_ball_that_passes_another_has_a_slope_only_far_from_touching(gap, is_s
     _, undefined = gradient(plant.model(), [-0.5, 0.2 + gap, 1.5, 0], lambda x: x[3], 80)
     assert ("ball_z_x[0]" in undefined) == (not is_smooth)
     assert ("ball_z_v[0]" in undefined) == (not is_smooth)
-    assert "ball_x_x[0]" not in undefined  # only when, not how
+    assert "ball_x_x[0]" not in undefined  # it changes the time of contact only
 
 
 def test_what_the_entry_says_is_what_the_loss_does():
-    """Slopes of the closed form: in free flight z - v t, after touching at the same speed the other way."""
+    """In closed form, the ball moves as z - v t before contact, and afterwards with the opposite velocity."""
     model, speed, gap = ball(stiffness=1e6, dissipation=0.0), 1.0, 2e-4
     x0 = [0, 0.1 + 0.2 * speed + gap, 0, -speed]
     g, undefined = gradient(model, x0, lambda x: x[3], 20)
@@ -87,7 +87,7 @@ def test_what_the_entry_says_is_what_the_loss_does():
 
 
 def test_columns_of_parameters_inputs_and_policies_are_judged():
-    """The motor holds the ball so that it touches at the end, or not."""
+    """The motor slows the fall of the ball, which may reach the ground at the end."""
     model = ball(gravity=9.81, motor=True)
     fall = 0.1 + 1e-5 + 9.81 * 0.2**2 / 4
     x0, half = [0, fall, 0, 0], [[9.81 / 2]] * 20
@@ -97,11 +97,11 @@ def test_columns_of_parameters_inputs_and_policies_are_judged():
         )
     names = [one.column for one in g.undefined]
     assert "lift at all times" in names
-    assert "ball.stiffness" not in names  # it does not touch
+    assert "ball.stiffness" not in names  # there is no contact
     policy = ParametricPolicy(lambda x, t, p: [p[0] + 50 * p[1] * x[1]], [9.81 / 2, 0.0])
     _, undefined = gradient(model, x0, lambda x: x[3], 20, policy=policy)
     assert {"policy[0]", "policy[1]"} <= set(undefined)
-    touching = [0, 0.1 - 1e-5, 0, 1e-4]  # a touch that is hardly one: of stiffness nothing depends smoothly
+    touching = [0, 0.1 - 1e-5, 0, 1e-4]  # a marginal contact: the loss is not smooth
     g, undefined = gradient(ball(), touching, lambda x: x[3], 20, parameters=("ball.stiffness",))
     assert "ball_z_x[0]" in undefined
 
@@ -122,7 +122,7 @@ def test_where_a_motion_a_little_away_has_no_end_is_told():
 
 @pytest.mark.solve
 def test_a_derivative_that_is_not_the_slope_that_there_is_is_not_called_undefined(monkeypatch):
-    """Steps that are too long for the derivative: taken again at a hundredth of the tolerance; then it is named."""
+    """Derivatives of too long steps are computed again at 1/100 of the tolerance. A remaining error is reported."""
     model, x0 = ball(gravity=9.81), [0, 0.5, 0.3, 0]
     right = gradient(model, x0, lambda x: x[1], 60)[0]
     real = FlowSteps.differentiate
@@ -148,9 +148,9 @@ def test_a_derivative_that_is_not_the_slope_that_there_is_is_not_called_undefine
 
 @pytest.mark.slow
 def test_a_smoothed_step_has_the_slope_of_its_closed_form_where_first_order_has_none():
-    """Whether the ball has turned by the end: half a period after it touches. Derivatives are 0 on both sides.
+    """The loss is 1 if the ball has reversed its velocity by the end, else 0. Its derivatives are 0.
 
-    E[1(z + w < z1)] changes by z at -density(z1 - z) of the noise.
+    The derivative of E[1(z + w < z1)] with respect to z is -density(z1 - z) of the noise w.
     """
     model, speed, duration, stiffness = ball(stiffness=1e6, dissipation=0.0), 1.0, 0.05, 1e6
     turns = 0.1 + speed * (duration - np.pi / 2 / np.sqrt(stiffness))
@@ -170,7 +170,7 @@ def test_a_smoothed_step_has_the_slope_of_its_closed_form_where_first_order_has_
 
 @pytest.mark.solve
 def test_where_no_width_has_a_slope_there_is_no_number():
-    """|x - 0.3| at 0.3: it falls as often as it rises."""
+    """|x - 0.3| at 0.3 decreases as often as it increases."""
     g, undefined = gradient(ball(), [0.3, 1.0, 0, 0], lambda x: abs(x[0] - 0.3), 5)
     assert undefined == ["ball_x_x[0]", "ball_x_v[0]"]
     with pytest.raises(

@@ -1,4 +1,4 @@
-"""What a solve that is no success says to try: nothing that it has just tried, and only what the problem takes."""
+"""Tests of the advice after a failed solve: nothing that was just tried, and only what the problem accepts."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 @pytest.mark.parametrize("method", ["collocation", "shooting"])
 def test_a_tolerance_that_no_solver_reaches_is_judged_by_our_own_measures(method):
-    """1e-17: IPOPT stops at an acceptable level, at the optimum."""
+    """With a tolerance of 1e-17 IPOPT stops at an acceptable level, and the plan is at the optimum."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
     problem = dd.Problem(model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=60, running_cost=EFFORT)
     exact = dd.solve(problem, method=method)
@@ -29,7 +29,7 @@ def test_a_tolerance_that_no_solver_reaches_is_judged_by_our_own_measures(method
 @pytest.mark.slow
 @each_row("outcome", ["FAILED", "ITERATION_LIMIT", "INACCURATE", "NO_GRADIENT"])
 def test_what_a_solver_says_of_an_optimum_is_measured_again(outcome):
-    """The words are false of an optimum; a plan that keeps all, and is the optimum of another cost, is none."""
+    """Check that a failure status is overruled at an optimum, but not for a feasible plan optimal for another cost."""
     from drake_diff.optimize.program import NlpResult, Outcome
     from drake_diff.optimize.verification import judged
 
@@ -66,7 +66,7 @@ def test_infeasible_stays_where_something_asked_is_not_kept():
 
 
 def test_what_limits_a_verified_plan_is_noted():
-    """A horizon on its bound, inputs that could do anything in the least time, and the only guess that was tried."""
+    """Check the notes on a horizon at its bound, on least time without input limits, and on a single initial guess."""
     block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
     ends = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 10}
     longest = dd.solve(dd.Problem(block, **ends, horizon=(0.5, 2.0), running_cost=dd.QuadraticCost(R=[[1.0]])))

@@ -1,4 +1,4 @@
-"""Collocation leaves contact out: where links went through each other, the motion is sought with them kept apart."""
+"""Collocation ignores contact. Where links overlap, the problem is solved again with the links kept apart."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ iyz="0"/></inertial><collision><geometry><sphere radius="0.2"/></geometry></coll
 
 @pytest.fixture
 def crossing(tmp_path):
-    """Two balls on rails that cross: one goes along x, the other one, seen from above, along y."""
+    """Build two balls on crossing rails: `a` moves along x and `b`, seen from above, along y."""
 
     def build(height=0.0):
         path = tmp_path / f"rails_{height:g}.urdf"
@@ -66,6 +66,6 @@ def test_balls_that_do_not_meet_are_left_alone(crossing):
 
 def test_links_that_are_near_at_an_end_are_not_kept_apart(crossing):
     problem = dd.Problem(crossing().model, x0=[-0.3, -0.27, 0, 0], x_goal=[1, 1, 0, 0], num_steps=30)
-    assert distance(np.array([problem.x0]), 0)[0] > 0.4  # they do not touch
+    assert distance(np.array([problem.x0]), 0)[0] > 0.4  # the balls do not touch
     assert not kept_apart(problem).constraints
     assert len(kept_apart(crossing()).constraints) == 1

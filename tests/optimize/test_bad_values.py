@@ -1,4 +1,4 @@
-"""Values that are no numbers, or none that can be: refused early, with what was expected and what was given."""
+"""Invalid values are refused early, with an error that states the expected and the given value."""
 
 import datetime
 from decimal import Decimal
@@ -145,7 +145,7 @@ def test_a_ground_of_such_friction_is_refused(model, value):
     refused(lambda m, v: dd.example_model("hopper", ground=v), model, value)
 
 
-# Functions that give no number where one is wanted, or two, and what the error says of each.
+# Functions that do not return one number where one is expected, and the error message for each.
 BAD = {
     "its ndarray: expected shape .*, got shape \\(2, 2\\)": lambda *_: np.eye(2),
     "its result: expected .*number.*, got NoneType None": lambda *_: None,
@@ -177,7 +177,7 @@ CALLED = {
 def test_a_function_that_gives_no_number_is_named_with_its_file_and_line(model, name):
     for words, function in BAD.items():
         if name == "jacobian" and "ndarray" in words:
-            continue  # which is one
+            continue  # an ndarray is the right type for a Jacobian
         with pytest.raises(InputError, match=rf"<lambda> \(test_bad_values\.py:\d+\):? {words}"):
             CALLED[name](model, function)
 

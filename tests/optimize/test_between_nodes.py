@@ -1,4 +1,4 @@
-"""What a plan forbids between its nodes: walls of any width, by seed, that no motion can keep from."""
+"""Tests of constraint violations between the nodes, with walls of random width that no motion can avoid."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def pushed():
 
 
 def wall(random):
-    """A wall of 1 mm to 10 cm on the only way from 0 to 1 m, written in one of four ways."""
+    """Return a wall of 1 mm to 10 cm on the only way from 0 to 1 m, in one of four forms, and its half width."""
     half, at = 10 ** random.uniform(-3.3, -1.3), random.uniform(0.2, 0.8)
     forms = (
         (lambda x: (x[0] - at) ** 2, half**2),
@@ -49,7 +49,7 @@ def test_a_wall_between_start_and_goal_is_not_crossed_between_two_nodes(seed):
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("method", ["ilqr", "shooting"])
 def test_steps_do_not_jump_over_a_wall(method, seed):
-    """1 kg on a rail, whose knots may lie on both sides of a wall that is thinner than a step."""
+    """Move 1 kg on a rail whose knots may lie on both sides of a wall that is thinner than a step."""
     constraint, half = wall(np.random.default_rng(100 + seed))
     effort = dd.QuadraticCost(R=[[0.5]])
     problem = dd.Problem(block(), x0=[0, 0], x_goal=[1, 0], num_steps=10, running_cost=effort, constraints=constraint)
@@ -58,7 +58,7 @@ def test_steps_do_not_jump_over_a_wall(method, seed):
 
 
 def test_what_is_kept_beside_a_disk_holds_between_the_nodes():
-    """Around a disk of 0.2 m by 40 intervals the dense motion is out of it by less than a thousandth of its way."""
+    """With 40 intervals the dense motion enters a disk of 0.2 m by less than a thousandth of its way."""
     point = dd.Dynamics(lambda x, u: [x[2], x[3], u[0], u[1]], nx=4, nu=2)
     disk = dd.Constraint(lambda x: (x[0] - 0.5) ** 2 + (x[1] - 0.01) ** 2, lower=0.04, name="disk")
     problem = dd.Problem(
@@ -78,7 +78,7 @@ def test_what_is_kept_beside_a_disk_holds_between_the_nodes():
 
 
 def at_rest(us=None, horizon=1.0, mesh=None):
-    """The plan of x' = u, |u| <= 1, that stays at 0 for 20 intervals."""
+    """Return the plan of x' = u, |u| <= 1, that stays at 0 for 20 intervals."""
     drift = dd.Dynamics(lambda x, u: [u[0]], nx=1, nu=1, u_lower=[-1], u_upper=[1])
     problem = dd.Problem(
         drift, x0=[0], num_steps=20, horizon=horizon, running_cost=dd.QuadraticCost(Q=[[1]], R=[[1]]), x_goal=[0]
@@ -88,7 +88,7 @@ def at_rest(us=None, horizon=1.0, mesh=None):
 
 
 def test_a_plan_is_followed_under_feedback_as_in_closed_form():
-    """x' = -3 x decays as exp(-3 t), to 1e-9 by Runge-Kutta steps of 5 ms; at -2 the input's bound is met: -2 + t."""
+    """x' = -3 x decays as exp(-3 t), to 1e-9 by Runge-Kutta steps of 5 ms. From -2 the input's bound gives -2 + t."""
     motion, gains = at_rest(), np.full((20, 1, 1), 3.0)
     times = np.linspace(0, 1, 201)
     led = motion.led_from(np.array([0.3]), gains)[:, 0]
@@ -98,7 +98,7 @@ def test_a_plan_is_followed_under_feedback_as_in_closed_form():
 
 
 def narrow(random):
-    """(f, its area, its place, the rest's speed there): a bump of 0.1 to 10 mm on the way from 0 to 1 m in 1 s."""
+    """Return (f, its area, the speed at f): a bump of 0.1 to 10 mm on a motion from rest to rest, 0 to 1 m in 1 s."""
     width, at = 10 ** random.uniform(-4, -2), random.uniform(0.1, 0.9)
     time = np.roots([-2, 3, 0, -at])
     time = float(np.real(time[(np.real(time) > 0) & (np.real(time) < 1)][0]))
@@ -113,7 +113,7 @@ def narrow(random):
 @pytest.mark.solve
 @pytest.mark.parametrize("seed", slow_after(1, range(8)))
 def test_a_gust_between_two_nodes_is_seen(seed):
-    """The input of a block's move from rest to rest, 6 - 12 t; the gust's work changes its speed in one interval."""
+    """The input of the motion from rest to rest is 6 - 12 t. The gust's work changes the speed within one interval."""
     random = np.random.default_rng(seed)
     gust, work, speed = narrow(random)
     pushed = dd.Dynamics(lambda x, u: [x[1], u[0] + gust(x[0])], nx=2, nu=1)
@@ -146,7 +146,7 @@ def test_a_peak_of_the_cost_between_two_nodes_counts(seed):
 @pytest.mark.solve
 @pytest.mark.parametrize("seed", range(4))
 def test_a_constraint_that_is_broken_within_a_narrow_range_is_seen(seed):
-    """No way from 0 to 1 m leaves out the place, or from rest to 1 m in 1 s the speed, that is forbidden."""
+    """Every path from 0 to 1 m passes the forbidden position, and every move from rest in 1 s the forbidden speed."""
     random = np.random.default_rng(seed)
     i, at, width = int(random.integers(2)), random.uniform(0.2, 0.8), 10 ** random.uniform(-4, -3)
     spike = dd.Constraint(lambda x: np.exp(-(((x[i] - at) / width) ** 2)), upper=0.5, name="spike")
@@ -180,7 +180,7 @@ def test_a_cost_that_jumps_is_reported(what, cost, jump):
 
 @pytest.mark.slow
 def test_a_cost_whose_derivatives_are_of_other_values_is_refused_or_reported():
-    """1 or 2 u^2, by the kind of its numbers: everywhere, and beyond the places at which functions are tried."""
+    """Costs of 1 or 2 u^2, depending on the number type, everywhere or only away from the points that are probed."""
     everywhere = lambda x, u: u[0] ** 2 * (1 + (x.dtype != float))  # noqa: E731
     problem = dd.Problem(pushed(), x0=[0, 0], x_goal=[1, 0], num_steps=9, running_cost=everywhere, horizon=1.0)
     with pytest.raises(GradientError, match=r"running_cost is .* with derivatives and .* with plain numbers"):

@@ -1,4 +1,4 @@
-"""Checks of a plan: values and verdicts by closed forms, the worst first, and nothing that is unknown passes."""
+"""Tests of a plan's checks: values and verdicts by closed forms, the worst first, and unknown values fail."""
 
 import dataclasses
 import functools
@@ -16,7 +16,7 @@ FIELDS = ["what", "where", "plant", "feedback", "value", "tolerance", "unit", "v
 
 @functools.cache
 def moved():
-    """A block that is moved by 1 m in 1 s."""
+    """Solve for a block that moves by 1 m in 1 s."""
     block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
     problem = dd.Problem(block, x0=[0, 0], x_goal=[1, 0], num_steps=10, horizon=1.0, running_cost=EFFORT)
     return dd.solve(problem)

@@ -1,4 +1,4 @@
-"""Parameters as variables of collocation, against closed forms, AutoDiffXd and differences."""
+"""Tests of parameters as variables of collocation, against closed forms, AutoDiffXd and finite differences."""
 
 import dataclasses
 
@@ -35,7 +35,7 @@ def named(name):
 
 
 def movable(model, random, count=5):
-    """Some parameters that collocation moves and that are in no corner of their range."""
+    """Return at most `count` parameters that collocation can optimize and that are at no corner of their range."""
     found = []
     for p in dd.list_parameters(model):
         known = p.kind.source != "finite_difference" and not (p.kind.positive and p.value[0] == 0)
@@ -54,9 +54,9 @@ MODELS_TRIED = ["acrobot.xml", "cart_pole.urdf", "mass_spring_damper.sdf", "ur5_
 
 @each_row("name", MODELS_TRIED)
 def test_an_expression_of_parameters_and_its_derivatives_are_drakes(name):
-    """Any kind of parameter, five at a time: values and Jacobian by AutoDiffXd, the Hessian by CasADi's own.
+    """Check values and Jacobian by AutoDiffXd and the Hessian by CasADi, for five parameters of any kind at a time.
 
-    1e-9 of the largest entry: the mass matrices' condition.
+    The tolerance of 1e-9 of the largest entry allows for the condition number of the mass matrices.
     """
     model, random = named(name), np.random.default_rng(7)
     vector = select(model, movable(model, random))
@@ -83,7 +83,7 @@ def test_an_expression_of_parameters_and_its_derivatives_are_drakes(name):
 
 
 def test_the_gear_ratio_of_least_time_is_the_root_of_the_inertias():
-    """A limited motor turns a load by 1 rad: t = 2 sqrt(J / torque), least where n^2 = J_load / J_motor."""
+    """A limited motor turns a load by 1 rad in t = 2 sqrt(J / torque), which is least where n^2 = J_load / J_motor."""
     load, motor, torque = 2.0, 0.01, 0.5
 
     def rates(x, u, p):
@@ -106,11 +106,11 @@ def test_the_gear_ratio_of_least_time_is_the_root_of_the_inertias():
     assert solution.vector.to_dict()["ratio"] == pytest.approx([np.sqrt(load / motor)], rel=1e-6)
     ratio = np.sqrt(load / motor)
     whole = 2 * np.sqrt((load + ratio**2 * motor) / (ratio * torque))
-    assert solution.horizon == pytest.approx(whole, rel=1e-3)  # the switch takes one of 40 intervals
+    assert solution.horizon == pytest.approx(whole, rel=1e-3)  # the input switches within one of 40 intervals
 
 
 def test_the_spring_of_an_oscillator_that_arrives_in_time():
-    """m x'' = -k x + u from rest at 1 is at 0 without any input after a quarter of its period: k = m (pi / 2T)^2."""
+    """From rest at 1, m x'' = -k x + u is at 0 without input after a quarter period, so that k = m (pi / 2T)^2."""
     springs = dd.Dynamics(lambda x, u, p: [x[1], -p[0] / 2.0 * x[0] + u[0]], 2, 1, parameters={"stiffness": 1.0})
     time = 0.8
     problem = dd.Problem(
@@ -125,15 +125,15 @@ def test_the_spring_of_an_oscillator_that_arrives_in_time():
     )
     solution = dd.solve(problem)
     assert solution.success, solution.message
-    assert solution.parameters == pytest.approx([2.0 * (np.pi / 2 / time) ** 2], rel=1e-4)  # of order 4 in 1/30
+    assert solution.parameters == pytest.approx([2.0 * (np.pi / 2 / time) ** 2], rel=1e-4)  # error of order 4 in 1/30
     assert solution.cost == pytest.approx(0.0, abs=1e-6)
 
 
 @each_row("method, steps, close", [("collocation", 20, 1e-6), ("shooting", 20, 1e-5)])
 def test_a_block_whose_lightness_has_its_price(method, steps, close):
-    """Moving m by d in T costs 12 m^2 d^2 / T^3 in effort; with w (m0 - m)^2 beside it m = w m0 / (w + 12 d^2 / T^3).
+    """Moving m by d in T takes the effort 12 m^2 d^2 / T^3. With the price w (m0 - m)^2, m = w m0 / (w + 12 d^2 / T^3).
 
-    A discrete step's effort is 12 / (1 - 1/N^2) instead of 12.
+    The effort of discrete steps has the factor 12 / (1 - 1/N^2) instead of 12.
     """
     price, heaviest, way, time = 8.0, 2.0, 1.0, 2.0
     problem = dd.Problem(
@@ -155,12 +155,12 @@ def test_a_block_whose_lightness_has_its_price(method, steps, close):
     assert solution.cost == pytest.approx(effort * mass**2 + price * (heaviest - mass) ** 2, rel=close)
 
 
-# ------------------------------------------------------------------------------ the length of a step
+# ------------------------------------------------------------------------------ the time step
 
 
 @each_row("name", ["pendulum.urdf", "cart_pole.urdf", "quadrotor.urdf", "acrobot.xml", "mass_spring_damper.sdf"])
 def test_a_smooth_steps_derivative_by_its_length_is_exact(name):
-    """Against central differences of models with other steps, whose error of 1e-5 of h leaves 1e-9."""
+    """Check against central differences over the time step, where a change of 1e-5 h leaves an error of 1e-9."""
     model, random = named(name), np.random.default_rng(3)
     x = model.default_state + 0.1 * random.standard_normal(model.nx)
     u, h = random.standard_normal(model.nu), model.time_step
@@ -172,7 +172,7 @@ def test_a_smooth_steps_derivative_by_its_length_is_exact(name):
 
 
 def sliding(mass, force, tmp_path):
-    """A block of that mass on a rail, pushed by at most that force, in a file: a diagram has one step only."""
+    """Load a block of `mass` on a rail with inputs up to `force`, from a file, as a diagram has a fixed time step."""
     path = tmp_path / "block.urdf"
     path.write_text(BLOCK.format(mass=mass, force=force))
     return dd.load_model(path, time_step=0.05)
@@ -190,9 +190,9 @@ BLOCK = """<robot name="block"><link name="rail"/><link name="block"><inertial><
 @pytest.mark.slow
 @each_row("method, solver, steps", [("ilqr", None, 20), ("shooting", None, 6)])
 def test_a_block_in_least_time_by_discrete_steps(method, solver, steps, tmp_path):
-    """T = 2 sqrt(m d / F): with an even number of held inputs the switch is at a knot, and the steps are exact.
+    """T = 2 sqrt(m d / F). With an even number of steps the input switches at a knot, and the steps are exact.
 
-    x_N of N semi-implicit steps differs from the time-continuous one by h v: over a way from rest to rest by nothing.
+    x_N of N semi-implicit steps differs from continuous time by h v, which is 0 for a motion from rest to rest.
     """
     mass, force, way = 1.3, 2.0, 1.0
     problem = dd.Problem(
@@ -209,7 +209,7 @@ def test_a_block_in_least_time_by_discrete_steps(method, solver, steps, tmp_path
 
 @pytest.mark.slow
 def test_a_mass_that_pushes_through_contact_is_where_its_price_meets_what_it_saves():
-    """The slope of the least effort by the mass, from plans with masses on both sides, against that of the price."""
+    """Compare the least effort's slope with respect to the mass, by plans at two near masses, with the price's."""
     model = dd.load_model(MODELS / "two_spheres.sdf", time_step=0.01)
     price, first, asked = 0.05, 0.5, {"num_steps": 40, "running_cost": dd.QuadraticCost(R=[[1e-3]])}
     asked |= {"x0": [0, 0.2, 0, 0], "x_goal": [np.nan, 0.6, np.nan, np.nan]}
@@ -345,7 +345,7 @@ def test_a_record_has_the_parameters_and_a_forged_value_is_refused(tmp_path):
 
 
 def test_a_plans_derivative_with_a_parameter_that_follows_it():
-    """The lightest price of a block: the cost is that of the closed form, whose mass is another for another goal."""
+    """Check the derivative of the optimal cost by the closed form, in which the best mass depends on the goal."""
     price, heaviest, way, time = 8.0, 2.0, 1.0, 2.0
     block_of = dd.Dynamics(lambda x, u, p: [x[1], u[0] / p[0]], 2, 1, parameters={"mass": 1.5})
     problem = dd.Problem(
@@ -378,7 +378,7 @@ def test_a_plans_derivative_with_a_parameter_that_follows_it():
     ],
 )
 def test_what_is_linearized_has_the_parameters_that_are_applied(name, parameters):
-    """By AutoDiffXd too, whose plant has a gravity and springs of its own: feedback about a plan rests on it."""
+    """Check AutoDiffXd too, whose plant has its own gravity and springs. Feedback about a plan depends on it."""
     model = named(name)
     xs, us = np.full((2, model.nx), 0.3), np.full((2, model.nu), 0.2)
     wanted = dd.differentiate_step(model, xs[0], us[0], parameters=parameters, method="finite_difference").A
@@ -391,7 +391,7 @@ def test_what_is_linearized_has_the_parameters_that_are_applied(name, parameters
 
 
 def test_parameters_are_near_a_plan_where_the_nearest_motion_in_steps_is_searched(monkeypatch):
-    """Where refining finds nothing, the mass of the collocated plan is nearly that of the plan in steps."""
+    """If the refinement fails, the mass of the discrete plan is close to the mass of the collocated plan."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
     problem = dd.Problem(
         model,
@@ -408,7 +408,7 @@ def test_parameters_are_near_a_plan_where_the_nearest_motion_in_steps_is_searche
     mass = plan.parameters[0]
     searched = closest_to(problem, plan)
     assert searched.cost_of_parameters(np.array([mass])) == 0.0
-    assert searched.cost_of_parameters(np.array([1.1 * mass])) == pytest.approx(0.01 * 0.6)  # the horizon
+    assert searched.cost_of_parameters(np.array([1.1 * mass])) == pytest.approx(0.01 * 0.6)  # the horizon is 0.6 s
     damped = dataclasses.replace(problem, parameters=("hinge.damping",), parameter_bounds=None)
     without = closest_to(damped, dataclasses.replace(plan, problem=damped, parameters=np.zeros(1)))
     assert [without.cost_of_parameters(np.array([d])) for d in (0.0, 0.1)] == [0, pytest.approx(0.01 * 0.6)]

@@ -1,4 +1,4 @@
-"""Collocation against closed forms and a dense solve of the same transcription, and what it refuses."""
+"""Tests of collocation against closed forms and a dense solve of the same transcription, and of its refusals."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 
 def move(count=10, *, model=None, **changes):
-    """Min. effort from rest at 0 to rest at 1 within 1 s."""
+    """Return the problem of least effort from rest at 0 to rest at 1 within 1 s."""
     fields = {"x0": [0, 0], "x_goal": [1, 0], "running_cost": EFFORT, "num_steps": count}
     return dd.Problem(model or block(time_step=1 / count), **{**fields, **changes})
 
@@ -34,7 +34,7 @@ def collocate(problem, **options):
 
 
 def dense_block(count, h, Q, R, Qf, target):
-    """xs, us (knots) of min trapezoid(x'Qx + R u^2) + (x_N - target)'Qf(x_N - target), by least squares."""
+    """Return the knots xs, us of min trapezoid(x'Qx + R u^2) + (x_N - target)'Qf(x_N - target), by least squares."""
     steps = np.zeros((count + 1, 2, count + 1))  # x_k = steps[k] @ u, exact for linear u
     for k in range(count):
         steps[k + 1] = [[1, h], [0, 1]] @ steps[k]
@@ -77,7 +77,7 @@ def test_nothing_to_control_is_refused():
 @pytest.mark.slow
 @each_row("row, column", [(2, 1), (2, 3), (3, 1), (3, 3), (2, 4), (3, 4)])
 def test_a_derivative_that_is_one_percent_off_is_named(row, column, monkeypatch):
-    """Every entry of [A B] of the accelerations that is not zero by itself, the guess being a moving one."""
+    """Test every entry of the accelerations' [A B] that is not identically zero, with an initial guess that moves."""
     from drake_diff.model.equations import EquationsOfMotion
 
     honest = EquationsOfMotion.autodiff
@@ -102,7 +102,7 @@ def test_a_derivative_that_is_one_percent_off_is_named(row, column, monkeypatch)
 
 @pytest.mark.parametrize(("row", "column"), [(2, 1), (3, 3), (3, 4)])
 def test_an_expressions_derivative_that_is_one_percent_off_is_named(row, column, monkeypatch):
-    """The same of the expressions that CasADi gets."""
+    """Repeat the check for the expressions of CasADi."""
     import casadi as ca
 
     from drake_diff.optimize.transcription import expressions as knot_functions

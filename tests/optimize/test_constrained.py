@@ -1,4 +1,4 @@
-"""Waypoints and constraints by iLQR and by shooting, against closed forms."""
+"""Tests of waypoints and constraints with iLQR and shooting, against closed forms."""
 
 import dataclasses
 
@@ -26,13 +26,13 @@ def solved(problem, method, **options):
 
 
 def move(count=20, **fields):
-    """A block of 1 kg, 1 m in 1 s from rest to rest with the least effort."""
+    """Return the problem of moving a block of 1 kg by 1 m in 1 s from rest to rest with the least effort."""
     fields = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": count, "running_cost": EFFORT, **fields}
     return dd.Problem(block(time_step=1 / count), **fields)
 
 
 def double_integrator(count):
-    """xs = S us, (N+1, 2, N), of symplectic Euler from rest at 0 over 1 s."""
+    """Return S (N+1, 2, N) with xs = S us, for symplectic Euler from rest at 0 over 1 s."""
     h = 1 / count
     S = np.zeros((count + 1, 2, count))
     for k in range(count):
@@ -42,7 +42,7 @@ def double_integrator(count):
 
 
 def least_effort(count, rows, values):
-    """us (N,) of the KKT system of min h sum u^2, rows @ us = values."""
+    """Return us (N,) from the KKT system of min h sum u^2 subject to rows @ us = values."""
     n, m = count, len(rows)
     kkt = np.block([[2 / count * np.eye(n), rows.T], [rows, np.zeros((m, m))]])
     return np.linalg.solve(kkt, np.concatenate([np.zeros(n), values]))[:n]
@@ -50,7 +50,7 @@ def least_effort(count, rows, values):
 
 @by_each_method
 def test_a_waypoint_is_the_kkt_systems_solution(method):
-    """1.5 m at half the time, at whatever speed; the solvers meet it to 1e-8, which the inverse of h^2 magnifies."""
+    """The waypoint is 1.5 m at half the time, at any velocity. The solvers meet it to 1e-8, which 1 / h^2 magnifies."""
     count = 20
     S = double_integrator(count)
     us = least_effort(count, np.vstack([S[count], S[10, :1]]), np.array([1, 0, 1.5]))
@@ -65,9 +65,9 @@ def test_a_waypoint_is_the_kkt_systems_solution(method):
 @by_each_method
 @pytest.mark.parametrize("unit", [1e3, 1e-3])
 def test_the_unit_of_a_constraint_does_not_matter(method, unit):
-    """The same limit of speed in mm/s and km/s, beside a goal in metres.
+    """Check the same velocity limit in mm/s and km/s, together with a goal in metres.
 
-    IPOPT meets 1.2e-3 km/s to 1e-8, which is 1e-5 m/s, and the limit's price is 40 N: 4e-4 of 15.5.
+    IPOPT meets 1.2e-3 km/s to 1e-8, which is 1e-5 m/s. With a multiplier of 40 N this is 4e-4 of the cost 15.5.
     """
     plain = solved(move(constraints=dd.Constraint(lambda x: x[1], upper=1.2)), method)
     other = solved(move(constraints=dd.Constraint(lambda x: unit * x[1], upper=unit * 1.2)), method)
@@ -79,7 +79,7 @@ def test_the_unit_of_a_constraint_does_not_matter(method, unit):
 @pytest.mark.slow
 @by_each_method
 def test_a_force_and_a_power_are_limited(method):
-    """|u| <= 5 N as a constraint of (x, u), and |u v| <= 3.3 W, where 3.46 W and 6 N would be best."""
+    """Limit |u| to 5 N by a constraint on (x, u), and |u v| to 3.3 W. Without limits 6 N and 3.46 W are optimal."""
     power = dd.Constraint(lambda x, u: u[0] * x[1], lower=-3.3, upper=3.3, name="power")
     force = dd.Constraint(lambda x, u: u[0], lower=-5, upper=5, name="force")
     solution = solved(move(constraints=[power, force]), method)
@@ -96,7 +96,7 @@ def test_a_force_and_a_power_are_limited(method):
 @pytest.mark.solve
 @by_each_method
 def test_a_pendulums_tip_reaches_a_height(method):
-    """0.3 m below the hinge, at rest: cos q = 0.6."""
+    """At rest 0.3 m below the hinge, cos q = 0.6."""
     height = dd.Constraint(lambda x: -0.5 * np.cos(x[0]), lower=-0.3, upper=-0.3, knots=-1, name="height")
     stop = dd.Constraint(lambda x: x[1], lower=0, upper=0, knots=-1)
     problem = dd.Problem(
@@ -116,7 +116,7 @@ def test_a_pendulums_tip_reaches_a_height(method):
 @pytest.mark.solve
 @by_each_method
 def test_a_point_goes_around_a_disc(method):
-    """From (-1, 0.1) to (1, 0) around a disc of 0.5 m: it touches at some knot, enters at none, and passes above."""
+    """From (-1, 0.1) to (1, 0) the point passes above a disc of 0.5 m. It touches the disc and no knot is inside."""
     model = block(time_step=0.1, blocks=2, actuated=2)
     clear = dd.Constraint(lambda x: x[0] ** 2 + x[1] ** 2, lower=0.25, name="disc")
     problem = dd.Problem(
@@ -128,7 +128,7 @@ def test_a_point_goes_around_a_disc(method):
         constraints=clear,
     )
     t = np.linspace(0, 2, 21)[:, None]
-    us = np.hstack([1.5 - 1.5 * t, np.cos(np.pi * t / 2)])[:-1]  # straight on, and up
+    us = np.hstack([1.5 - 1.5 * t, np.cos(np.pi * t / 2)])[:-1]  # straight ahead and up
     solution = solved(problem, method, initial_guess=(dd.rollout(model, problem.x0, us).xs, us))
     distance = np.linalg.norm(solution.xs[:, :2], axis=1)
     assert distance.min() == pytest.approx(0.5, abs=1e-6)
@@ -137,7 +137,7 @@ def test_a_point_goes_around_a_disc(method):
 
 
 def test_a_constraint_that_never_acts_leaves_one_full_step():
-    """J* = 12.948481280713864 in one step, as without it."""
+    """Check that J* = 12.948481280713864 is found in one step, as without the constraint."""
     never = dd.Constraint(lambda x, u: u[0] + x[0], upper=1e6)
     solution = dd.solve(lqr(*DOUBLE_INTEGRATOR, constraints=never), method="ilqr")
     assert solution.success, solution.message
@@ -148,7 +148,7 @@ def test_a_constraint_that_never_acts_leaves_one_full_step():
 
 @pytest.mark.parametrize("free", [False, True])
 def test_the_augmented_lagrangians_derivatives_are_differences(free):
-    """Every row pushes or is an equality, so that value is smooth here; Gauss-Newton is exact for linear rows."""
+    """Every row is active or an equality, so that the value is smooth. Gauss-Newton is exact for linear rows."""
     random = np.random.default_rng(0)
     fields = {"optimize": ("controls", "initial_state")} if free else {}
     constraints = [
@@ -175,7 +175,7 @@ def test_the_augmented_lagrangians_derivatives_are_differences(free):
 @pytest.mark.solve
 @pytest.mark.parametrize("knot", [3, 10, 20])
 def test_a_motion_that_breaks_a_constraint_is_told(knot):
-    """Of v <= 1.2 with one velocity set to 1.3, and of a waypoint moved by a thousandth."""
+    """Check v <= 1.2 with one velocity set to 1.3, and a waypoint moved by a thousandth."""
     problem = move(constraints=dd.Constraint(lambda x: x[1], upper=1.2, name="speed"), waypoints={10: [0.5, np.nan]})
     solution = solved(problem, "ilqr")
     assert not solution.plan_checks.failing

@@ -1,4 +1,4 @@
-"""Constraints: what is refused, where they hold, their values and derivatives."""
+"""Tests of constraints: refused input, the knots at which they apply, their values and derivatives."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Which foot stands when: the soles, the forces and the guess by closed form, what a schedule refuses, and plans."""
+"""Tests of contact schedules: soles, forces and initial guess by closed forms, refused schedules, and plans."""
 
 import json
 
@@ -33,7 +33,7 @@ def standing(solo):
 
 
 def posed(model, seed):
-    """A posture at random, the base turned any way."""
+    """Return a random state with a random orientation of the base."""
     random = np.random.default_rng(seed)
     x = np.array(model.default_state)
     x[:4] = random.standard_normal(4)
@@ -44,7 +44,7 @@ def posed(model, seed):
 
 
 def test_a_schedule_comes_back_from_what_a_record_tells_of_it():
-    """So that `verify` can make the run of a robot on legs again; what is no schedule is refused by name."""
+    """`verify` can repeat the run of a legged robot by its record. Invalid data raise an error that names the field."""
     schedule = dd.optimize.ContactSchedule(HOP, feet=SOLO_FEET, clearance=0.01, slip=0.3, touch=0.004)
     told = json.loads(json.dumps(schedule.to_dict()))
     again = rebuild_goal(told)
@@ -72,7 +72,7 @@ def test_soles_move_as_differences_say(solo, seed):
     turns = soles.turns[0].swapaxes(1, 2)
     velocities, by_posture = soles.velocities(x[None, nq:])[0], soles.slopes(x[None, nq:])[0].swapaxes(1, 2)
     assert np.allclose(velocities, moves @ x[nq:], atol=1e-12)
-    assert np.allclose(by_posture, np.moveaxis([s[1] for s in slopes], 0, -1), atol=1e-7)  # of differences of 1e-6
+    assert np.allclose(by_posture, np.moveaxis([s[1] for s in slopes], 0, -1), atol=1e-7)  # differences over 1e-6
     height = np.moveaxis([s[0] for s in slopes], 0, -1)[:, 2]
     assert np.allclose(moves[:, 2], height, atol=1e-7)
     assert np.allclose(turns[:, :, :3], np.eye(3), atol=1e-12)  # a turn of the base turns every foot
@@ -88,7 +88,7 @@ def test_where_no_foot_stands_the_centre_of_mass_flies():
     before = np.vstack([np.zeros(3), velocity[:-1]])
     assert np.allclose((velocity - before) / H, forces.sum(axis=1) / 3.0 + G, atol=1e-4)  # [m/s^2] Newton's law
     assert np.all(forces[20:30] == 0)
-    # From its last step on the ground to its first it falls as a stone does, by the steps' own rule.
+    # Between the last and the first step on the ground the robot is in free fall, by the rule of the time steps.
     assert np.allclose(
         at[20:31, 2] - at[20, 2], H * velocity[19, 2] * np.arange(11) - 9.81 * H**2 * np.cumsum(range(11)), atol=1e-6
     )
@@ -122,7 +122,7 @@ def test_a_guess_keeps_its_schedule_and_nearly_the_steps(solo, standing):
     ends = np.array([advance(solo.double, x, u) for x, u in zip(xs[:-1], us, strict=True)])
     gaps = np.array([tangent_space(solo).minus(a, b) for a, b in zip(ends, xs[1:], strict=True)])
     base = gaps[:, [0, 1, 2, 3, 4, 5, 18, 19, 20, 21, 22, 23]]
-    assert np.max(np.abs(base)) < 0.05  # rad, m and their rates, where the robot flies at 0.8 m/s
+    assert np.max(np.abs(base)) < 0.05  # [rad, m and their rates], while the robot flies at 0.8 m/s
     assert np.max(xs[:, 6]) > standing[6] + 0.02  # g T^2 / 8 = 0.03 m
 
 
@@ -135,7 +135,7 @@ def test_what_does_not_keep_the_schedule_is_told(solo, standing):
     low[6] -= 0.08
     dragged[solo.nq + 3] += 0.5
     stands, clear, slips = problem.kept_goals
-    assert stands.miss(lifted) == pytest.approx(0.02 - 1.25e-3, abs=5e-4)  # it sinks by 1.25 mm as it stands
+    assert stands.miss(lifted) == pytest.approx(0.02 - 1.25e-3, abs=5e-4)  # a standing foot sinks by 1.25 mm
     assert clear.miss(low) > clear.tolerance
     assert slips.miss(dragged) > slips.tolerance
     assert slips.miss(xs[10]) < slips.tolerance
@@ -148,11 +148,11 @@ def test_rows_of_a_schedule_have_the_derivative_of_differences(solo, standing):
     x, u, step = posed(solo, 5), np.zeros(solo.nu), 1e-6
     for constraint in problem.kept_goals:
         found = constraint.differentiate(x, u)[1][:, : solo.nx]
-        assert np.allclose(found[:, :4] @ x[:4], 0.0, atol=1e-9)  # of a quaternion's length nothing depends
+        assert np.allclose(found[:, :4] @ x[:4], 0.0, atol=1e-9)  # the norm of a quaternion has no effect
         units = step * np.eye(solo.nx)
         along = np.array([(constraint(x + d, u) - constraint(x - d, u)) / (2 * step) for d in units]).T
         assert np.allclose(found, along, atol=1e-6)
-        states = np.array([posed(solo, 6), x, posed(solo, 7)])  # x among others, which must not mix with it
+        states = np.array([posed(solo, 6), x, posed(solo, 7)])  # x among other states, which must not affect it
         assert np.allclose(constraint.slopes(states, np.zeros((3, solo.nu)))[1, :, : solo.nx], along, atol=1e-6)
         values = constraint.along(states, np.zeros((3, solo.nu)))
         assert np.allclose(values, [constraint(state, u) for state in states], rtol=0, atol=1e-14)  # rounding
@@ -195,7 +195,7 @@ def test_solo_hops_and_lands(solo, standing):
     problem = dd.Problem(solo, x0=standing, num_steps=48, goals=[schedule, place], **schedule.follow(solo, guess))
     solution = dd.solve(problem, method="ilqr", initial_guess=guess, options=Options(tolerance=1e-4))
     assert solution.success, solution.message
-    # A referee of its own: every foot is in the air in the middle of the flight, by Drake's own numbers.
+    # An independent check by Drake's own poses: every foot is in the air in the middle of the flight.
     context = solo.plant.CreateDefaultContext()
     solo.plant.SetPositions(context, solution.xs[24, : solo.nq])
     feet = [solo.plant.GetBodyByName(foot) for foot in SOLO_FEET]
@@ -205,7 +205,7 @@ def test_solo_hops_and_lands(solo, standing):
 
 @pytest.fixture(scope="module", params=range(2))
 def lifted(solo, request):
-    """A foot lifted for half a second, solved: its problem, the steps of its schedule, and the solution."""
+    """Solve for a motion that lifts a foot for half a second. Return the problem and the solution."""
     problem, guess = _lift(solo, request.param)
     return problem, dd.solve(
         problem, method="ilqr", initial_guess=guess, options=Options(tolerance=1e-4), max_iterations=20
@@ -230,7 +230,7 @@ def test_solo_lifts_a_foot(solo, lifted):
         xs.append(advance(solo.double, xs[-1], u))
     heights = legs.soles([legs.read(x) for x in xs]).places[..., 2]
     assert heights[37, 0] > 0.01
-    assert np.max(heights[:, 1:]) < 1e-5  # 0 is kept to the tolerance of a search
+    assert np.max(heights[:, 1:]) < 1e-5  # 0 to the tolerance of a search
     assert np.max(np.abs(xs[-1][solo.nq : solo.nq + 6])) < 0.3
 
 
@@ -245,7 +245,7 @@ def test_a_lift_that_is_not_what_was_asked_is_refused(solo, lifted):
     slippery = dd.load_model(
         robot_on_feet("solo12", 0.02), time_step=0.02, base="free", actuators="all", ground=0.03, near_rigid=0.1
     )
-    strength = np.full(solo.nu, 0.6 * np.max(np.abs(us)))  # a standing robot's knees need more than that
+    strength = np.full(solo.nu, 0.6 * np.max(np.abs(us)))  # the knees of a standing robot need more
     limits = dd.Bounds(u_lower=-strength, u_upper=strength)
     other = dd.optimize.ContactSchedule([(25, SOLO_FEET), (25, SOLO_FEET[:3]), (15, SOLO_FEET)])
     there = dd.FrameGoal("base_link", base, tolerance=0.05)

@@ -1,4 +1,4 @@
-"""Minimization across the jumps that contact makes: what is held, on which side, and what is claimed."""
+"""Tests of optimization across the jumps at contact: the fixed distances, their sides, and the messages."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def separation(model, x):
     ],
 )
 def test_a_distance_has_its_slope_and_a_mobility(load, name, x):
-    """Central differences with steps of 1e-6 are right to 1e-9 here."""
+    """Central differences with steps of 1e-6 are accurate to 1e-9."""
     model, x, d = load(name), np.array(x, dtype=float), 1e-6
     found = separation(model, x)
     for i, slope in enumerate(found.gradient):
@@ -40,17 +40,17 @@ def test_a_distance_has_its_slope_and_a_mobility(load, name, x):
         )
     assert (found.distance < 0) == (x[3] == -0.19)
     mass = model.double.plant.CalcMassMatrix(model.double.context)
-    rate = found.gradient  # of hinges and slides, by the velocities too
+    rate = found.gradient  # also the slope with respect to the velocities, as all joints are hinges and slides
     assert found.mobility == pytest.approx(rate @ np.linalg.solve(mass, rate), rel=1e-10)
 
 
 def test_beginnings_are_where_a_distance_turns_negative(two_spheres):
-    """Gaps 0.1, -0.01, 0.02, 0.01, -0.02, -0.03: touches begin at knots 1 and 4; nothing acts on the last state."""
+    """Contact begins at knots 1 and 4 for these gaps. No step follows the last state."""
     gaps = np.array([0.1, -0.01, 0.02, 0.01, -0.02, 0.05, -0.03])
     problem = push(two_spheres(), gap=0.1, goal=1.0, num_steps=6)
     xs = np.stack([0 * gaps, 0.2 + gaps, 0 * gaps, 0 * gaps], axis=1)
     found = beginnings(problem, xs)
-    assert [(h.knot, h.apart) for h in found] == [(1, False), (3, True), (4, False)]  # knot 0 is given
+    assert [(h.knot, h.apart) for h in found] == [(1, False), (3, True), (4, False)]  # the state at knot 0 is given
     assert str(found[1]) == "pusher and ball apart at knot 3"
     for hold in found:
         rows = hold.constraint(problem.model).differentiate(xs[hold.knot], np.zeros(1))
@@ -80,7 +80,7 @@ def test_pushes_converge(two_spheres, gap, goal, fields):
 
 @pytest.fixture
 def elastic(two_spheres, monkeypatch, tmp_path):
-    """Spheres that rebound: steps of 0.02 s do not resolve it, and every touch is a large jump."""
+    """Build spheres that rebound. Steps of 0.02 s do not resolve the impacts, so that each contact is a large jump."""
 
     def build(**fields):
         two_spheres(**fields)
@@ -101,9 +101,9 @@ def at_a_jump(elastic):
 
 @pytest.mark.slow
 def test_a_minimum_at_a_jump_meets_the_conditions_of_one_on_its_side(elastic):
-    """Least effort: u is a combination of the slopes of goal and held distance by u, the latter's sign as its side.
+    """For least effort u combines the slopes of the goal and the fixed distance, the latter with the sign of its side.
 
-    The slopes are the product of Drake's step Jacobians; the search ends at 1e-8 of the cost's scale.
+    The slopes with respect to u are products of Drake's step Jacobians. The search ends at 1e-8 of the cost's scale.
     """
     problem = at_a_jump(elastic)
     solution = dd.solve(problem, method="ilqr", options=Options(continuation="auto"))
@@ -126,7 +126,7 @@ def test_a_minimum_at_a_jump_meets_the_conditions_of_one_on_its_side(elastic):
     assert np.abs(slopes @ multipliers - u).max() < 1e-5 * np.abs(u).max()
     assert multipliers[1] > 0 if apart else multipliers[1] < 0
     alone = slopes[:, :1]
-    assert np.abs(alone @ np.linalg.lstsq(alone, u)[0] - u).max() > 1e-2 * np.abs(u).max()  # the row does hold it
+    assert np.abs(alone @ np.linalg.lstsq(alone, u)[0] - u).max() > 1e-2 * np.abs(u).max()  # the row is needed
 
 
 @pytest.mark.parametrize("goal", [0.3, -1.0])

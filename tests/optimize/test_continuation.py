@@ -1,4 +1,4 @@
-"""Through contact from a guess that does not touch: the stages, and what the true plant does in the end."""
+"""Tests of continuation from an initial guess without contact: the stages, and the result on the true plant."""
 
 import math
 
@@ -17,9 +17,9 @@ pytestmark = pytest.mark.solve
 
 
 def test_a_push_from_a_distance_arrives_and_keeps_momentum(two_spheres):
-    """Without damping the momentum of both is what the motor gave: sum of h u, all on Drake's own plant.
+    """Without damping the momentum of both bodies is the motor's impulse, the sum of h u, on Drake's own plant.
 
-    SAP solves its impulses to 1e-6 of the largest, but applies each to both bodies alike: the balance is rounding.
+    SAP solves impulses to 1e-6 of the largest but applies each to both bodies, so that only rounding is left.
     """
     problem = push(two_spheres(damping=0), gap=0.4, goal=1.0)
     solution = dd.solve(problem, options=Options(continuation="auto"), max_iterations=100)
@@ -39,14 +39,14 @@ def test_auto_finds_contact_that_its_guess_does_not_make(two_spheres):
 
 
 def test_before_touching_the_push_is_the_closed_form_of_least_effort(two_spheres):
-    """The pusher alone is a double integrator: whatever it is to do at touching, least effort is linear in time."""
+    """The pusher alone is a double integrator, so that its least effort until contact is linear in time."""
     solution = dd.solve(
         push(two_spheres(damping=0), gap=0.4, goal=1.0), options=Options(continuation="auto"), max_iterations=100
     )
     first = next(k for k, contacts in enumerate(solution.replay.contacts) if contacts)
     bend = np.diff(solution.us[:first, 0], 2)
     assert first > 10
-    assert np.abs(bend).max() < 1e-4 * np.abs(solution.us).max()  # the gradient is met to 1e-8 of the cost's scale
+    assert np.abs(bend).max() < 1e-4 * np.abs(solution.us).max()  # the gradient is 0 to 1e-8 of the cost's scale
 
 
 def test_a_soft_final_cost_is_reached_too(two_spheres):
@@ -54,11 +54,11 @@ def test_a_soft_final_cost_is_reached_too(two_spheres):
     assert dd.solve(problem, method="ilqr").status is Status.NO_GRADIENT
     solution = dd.solve(problem, options=Options(continuation="auto"), max_iterations=100)
     assert solution.success, solution.message
-    assert abs(solution.replay.xs[-1][1] - 1.0) < 1e-3  # effort 1e-3 against 10: the miss is of their ratio
+    assert abs(solution.replay.xs[-1][1] - 1.0) < 1e-3  # the miss has the order of the ratio of effort to cost, 1e-4
 
 
 def test_the_default_schedule_is_read_off_the_model(two_spheres):
-    """L = 0.45, h = 0.02, N = 50: L/3 and L/9, as L/27 < 4 L / 50; the reduced mass of 1 and 0.5 is 1/3."""
+    """L = 0.45, h = 0.02, N = 50 give L/3 and L/9, as L/27 < 4 L / 50. The reduced mass of 1 and 0.5 is 1/3."""
     stages = default_schedule(push(two_spheres(), gap=0.45, goal=1.0))
     assert [s.distance for s in stages] == pytest.approx([0.15, 0.05], rel=1e-12)
     nudge = 10 * 2 / 3 * 0.45 / 1.0**2 / (0.15 * math.log1p(math.exp(-3)))
@@ -67,7 +67,7 @@ def test_the_default_schedule_is_read_off_the_model(two_spheres):
 
 
 def test_blindness_names_what_stays_apart(two_spheres):
-    """The pusher moves towards the ball from 0.3 m and is 0.12 m away at the last knot: h^2 u N (N + 1) / 2 = 0.18."""
+    """The pusher moves from 0.3 m to 0.12 m from the ball at the last knot, as h^2 u N (N + 1) / 2 = 0.18."""
     us = np.full((20, 1), 0.18 / (0.02**2 * 20 * 21 / 2))
     problem = push(two_spheres(), gap=0.3, goal=1.0, num_steps=20)
     xs = dd.rollout(problem.model, problem.x0, us).xs
@@ -80,7 +80,7 @@ def test_blindness_names_what_stays_apart(two_spheres):
 
 
 def test_a_stage_that_is_refused_is_told_and_the_schedule_goes_on(two_spheres):
-    """h^2 k / m = 1e9: the first stage throws the ball out of every number."""
+    """With h^2 k / m = 1e9 the ball's state diverges in the first stage."""
     problem = push(two_spheres(damping=0), gap=0.4, goal=1.0)
     given = [dd.model.SoftContact(1.0, 1e12), *default_schedule(problem)]
     solution = dd.solve(problem, options=Options(continuation=given), max_iterations=100)
@@ -91,7 +91,7 @@ def test_a_stage_that_is_refused_is_told_and_the_schedule_goes_on(two_spheres):
 
 
 def test_the_time_limit_is_that_of_all_stages(two_spheres, monkeypatch):
-    monkeypatch.setattr("drake_diff.optimize.run.GRACE", 1e6)  # else it ends before the first stage
+    monkeypatch.setattr("drake_diff.optimize.run.GRACE", 1e6)  # otherwise the solve ends before the first stage
     solution = dd.solve(push(two_spheres(), gap=0.4, goal=1.0), options=Options(continuation="auto"), time_limit=0.05)
     assert solution.status is Status.TIME_LIMIT
     assert "in stage 1" in repr(solution)
@@ -116,7 +116,7 @@ def test_only_ilqr_takes_a_continuation(two_spheres, load):
 @pytest.mark.slow
 @pytest.mark.parametrize("wanted", [[0.4, 0.1], [0.4, 0.1, 0.3]])
 def test_a_box_is_pushed_to_its_goal(load, wanted):
-    """The pusher starts 0.15 m away from the box; its goal is a place in the plane, with the yaw free or given."""
+    """The pusher starts 0.15 m away from the box. The goal is a position in the plane, with the yaw free or given."""
     goal = np.full(10, FREE)
     goal[: len(wanted)] = wanted
     problem = dd.Problem(

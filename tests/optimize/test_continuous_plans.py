@@ -1,4 +1,4 @@
-"""Rollouts and plans in continuous time: closed forms, and another integration of the same law."""
+"""Tests of rollouts and plans in continuous time, against closed forms and another integration of the same law."""
 
 import shutil
 
@@ -14,11 +14,11 @@ from drake_diff.optimize import Options, optimality
 
 pytestmark = pytest.mark.solve
 
-ENERGY = 1e-7  # [J] of a few: steps of 1e-9 each, some hundred of them in contact
+ENERGY = 1e-7  # [J] of a few J: some hundred steps in contact, with an error of 1e-9 each
 
 
 def ball_on_rails(*, stiffness=1e4, dissipation=0.0, friction=0.0, gravity=0.0, time_step=0.01, motors=()):
-    """1 kg, radius 0.1 m, on rails along x and z above the ground; `stiffness` is that of the pair."""
+    """Return a ball of 1 kg and radius 0.1 m on rails along x and z above the ground. `stiffness` is the pair's."""
     plant = Plant(time_step, "lagged", gravity=gravity)
     properties = contact_properties(2 * stiffness, dissipation, friction)
     plant.ball("ball", 1.0, 0.1, properties, "x", "z")
@@ -29,7 +29,7 @@ def ball_on_rails(*, stiffness=1e4, dissipation=0.0, friction=0.0, gravity=0.0, 
 
 
 def test_an_elastic_bounce_between_two_ends_is_where_its_closed_form_is():
-    """Half a period pi / omega in contact, V / omega deep, and no energy is lost: contact took it and gave it back."""
+    """The contact lasts half a period, pi / omega, is V / omega deep, and returns all of its energy."""
     stiffness, speed = 1e4, 2.0
     model, omega = ball_on_rails(stiffness=stiffness), np.sqrt(1e4)
     motion = dd.rollout(model, [0, 1.005, 0, -speed], num_steps=100, method="continuous")
@@ -40,7 +40,7 @@ def test_an_elastic_bounce_between_two_ends_is_where_its_closed_form_is():
     assert np.max(np.abs(motion.xs[away, 1] - expected[away])) < 1e-7
     assert np.max(motion.penetration) == pytest.approx(speed / omega, rel=1e-2)
     assert np.max(np.abs(motion.energy_error)) < ENERGY
-    stored = np.where(away, 0.0, 2.0 * np.sin(omega * (t - touch)) ** 2)  # [J] of the 2 J that it comes with
+    stored = np.where(away, 0.0, 2.0 * np.sin(omega * (t - touch)) ** 2)  # [J] of the initial 2 J
     assert np.max(np.abs(motion.contact_work + stored)) < 1e-6
     assert [i for i, c in enumerate(motion.contacts) if c] == [45, 46, 47, 48]
 
@@ -60,7 +60,7 @@ def test_a_slide_stops_where_coulomb_says_and_friction_took_its_energy():
 
 @pytest.mark.parametrize(("name", "seed"), [("bolt.urdf", 0), pytest.param("solo12.urdf", 2, marks=pytest.mark.slow)])
 def test_the_work_on_a_robot_in_contact_accounts_for_its_energy(name, seed):
-    """Energies are Drake's, the motion and the powers are not; another integration is where it is."""
+    """Drake computes the energies, but not the motion and the powers. Another integration gives the same motion."""
     model, random = example_robot(name, feet=True, friction=0.6), np.random.default_rng(seed)
     x0 = state_in_contact(model, random)
     us = 0.3 * random.standard_normal((8, model.nu))
@@ -73,7 +73,7 @@ def test_the_work_on_a_robot_in_contact_accounts_for_its_energy(name, seed):
     assert np.max(np.abs(other.energy_error)) < 1e-6 * exchanged
     for measure in ("work", "dissipation", "contact_work"):
         assert np.allclose(getattr(other, measure), getattr(motion, measure), atol=1e-4 * exchanged), measure
-    assert np.allclose(other.penetration, motion.penetration, atol=1e-5)  # of 1e-3, each at its own steps
+    assert np.allclose(other.penetration, motion.penetration, atol=1e-5)  # of 1e-3, each with its own steps
     touched = [{(c.body_a, c.body_b) for c in contacts} for contacts in motion.contacts]
     assert touched == [{(c.body_a, c.body_b) for c in contacts} for contacts in other.contacts]
 
@@ -107,7 +107,7 @@ def test_stiffer_contact_is_another_motion_and_other_parameters_are_refused():
 
 
 def thrown(model, **more):
-    """A ball that is thrown down and is to be at (1, 0.6) after 0.8 s: its first velocity is free."""
+    """Return the problem of throwing a ball down so that it is at (1, 0.6) after 0.8 s. Its first velocity is free."""
     bounds = dd.Bounds(x_lower=[-np.inf, -np.inf, -10, -8], x_upper=[np.inf, np.inf, 10, 20])
     mask = np.array([False, False, True, True])
     asked = {"x0": [0, 1, 0.5, -0.5], "x_goal": [1, 0.6, np.nan, np.nan], "num_steps": 40, "bounds": bounds}
@@ -116,7 +116,7 @@ def thrown(model, **more):
 
 @pytest.mark.slow
 def test_a_ball_is_thrown_to_bounce_into_its_target():
-    """Down at v it comes to the ground at V, is there for 2 (pi - atan(omega V / g)) / omega, and leaves at V."""
+    """A ball thrown at v reaches the ground at V, stays for 2 (pi - atan(omega V / g)) / omega, and leaves at V."""
     low = dd.Constraint(lambda x, u: x[3:], lower=[-np.inf], upper=[2.0], knots=[0], name="no lob over the ground")
     solution = dd.solve(thrown(ball_on_rails(gravity=9.81, time_step=0.02), constraints=[low]))
     assert solution.status is dd.Status.CONVERGED, solution.message
@@ -133,7 +133,7 @@ def test_a_ball_is_thrown_to_bounce_into_its_target():
 
 
 def struck(model, speed, **more):
-    """One ball is pushed for 0.2 s, and the other is to leave at `speed`."""
+    """Return the problem of pushing one ball for 0.2 s so that the other one leaves at `speed`."""
     free = dd.Constraint(lambda x, u: u, lower=[0.0], upper=[0.0], knots=range(10, 60), name="let go")
     asked = {"x0": [0, 0.5, 0, 0], "x_goal": [np.nan, np.nan, np.nan, speed], "num_steps": 60, "constraints": [free]}
     return dd.Problem(model, running_cost=dd.QuadraticCost(R=[[1e-3]]), motion="continuous", **asked | more)
@@ -148,7 +148,7 @@ def two_balls(masses=(1.0, 0.5), stiffness=2e4):
 
 
 def test_a_ball_strikes_another_which_leaves_as_two_bodies_do():
-    """v_b = 2 m_a / (m_a + m_b) v_a; the guess touches nothing, and others are tried."""
+    """v_b = 2 m_a / (m_a + m_b) v_a. The initial guess has no contact, and others are tried."""
     problem = struck(two_balls(), 1.2)
     solution = dd.solve(problem)
     assert solution.status is dd.Status.CONVERGED, solution.message
@@ -186,7 +186,7 @@ def test_a_plan_in_continuous_time_is_refused_what_it_has_not():
 
 
 def thrown_from_a_file(**more):
-    """The throw of a model that a run can name."""
+    """Return the throw for a model from a file, which a record can refer to."""
     model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.02, contact_approximation="lagged")
     x0, goal, free = np.array(model.default_state), np.full(13, np.nan), np.zeros(13, dtype=bool)
     x0[[4, 6, 10, 12]], goal[[4, 6]], free[[10, 12]] = [0.0, 1.0, 1.2, -0.8], [1.0, 0.5], True
@@ -211,7 +211,7 @@ def test_a_run_in_continuous_time_comes_out_again_and_its_page_says_what_was_che
 
 
 def moved(folder):
-    """Thrown by another 1 mm/s."""
+    """Change the initial velocity by 1 mm/s."""
     with np.load(folder / "plan.npz") as plan:
         parts = dict(plan)
     parts["xs"] = parts["xs"].copy()
@@ -229,7 +229,7 @@ def of_less_penetration(folder):
 @pytest.mark.slow
 @pytest.mark.parametrize("forge", [moved, of_less_penetration])
 def test_a_forged_run_in_continuous_time_is_refused(thrown_run, tmp_path, forge):
-    """All hashes are right."""
+    """Check that the run is refused although all hashes are correct."""
     folder = tmp_path / "forged"
     shutil.copytree(thrown_run, folder)
     dd.load_record(folder).model_copy(update=forge(folder)).write(folder)
@@ -238,7 +238,7 @@ def test_a_forged_run_in_continuous_time_is_refused(thrown_run, tmp_path, forge)
 
 @pytest.mark.slow
 def test_a_derivative_that_another_integration_does_not_have_is_no_plans(monkeypatch):
-    """2 % off at every width, which nothing explains; and slopes that do not settle, as where a body tumbles."""
+    """Test a derivative 2 % off at every step width, and slopes that do not converge, as for a tumbling body."""
     model = ball_on_rails(gravity=9.81, time_step=0.02)
     right = optimality.final_sensitivity
     monkeypatch.setattr(optimality, "final_sensitivity", lambda *at: 1.02 * right(*at))

@@ -1,4 +1,4 @@
-"""Costs: a QuadraticCost is its formula, a function is differentiated exactly, what has no gradient is refused."""
+"""Tests of costs: formulas, exact derivatives of functions, and refusal of costs without a gradient."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def test_a_cost_to_gos_derivatives_are_those_of_autodiff_through_it():
 
 
 def test_a_functions_gradient_is_the_closed_form():
-    """sin(x0) exp(u0) + x1^2 u1."""
+    """The function is sin(x0) exp(u0) + x1^2 u1."""
     x, u = np.array([0.4, -1.3]), np.array([0.2, 0.9])
     value, by_x, by_u = differentiate_cost(lambda x, u: np.sin(x[0]) * np.exp(u[0]) + x[1] ** 2 * u[1], x, u)
     assert value == pytest.approx(np.sin(0.4) * np.exp(0.2) + 1.69 * 0.9, rel=1e-14)
@@ -54,7 +54,7 @@ def test_a_functions_gradient_is_the_closed_form():
 
 
 def test_a_gradient_by_hundreds_of_variables_is_whole():
-    """AutoDiffXd takes 128 directions at a time: 300 variables are three rounds, the last one not full."""
+    """AutoDiffXd takes 128 directions at a time, so that 300 variables need three rounds, the last one not full."""
     weights = np.arange(1.0, 301.0)
     x, u = np.linspace(-1, 1, 200), np.linspace(2, 3, 100)
     _, by_x, by_u = differentiate_cost(lambda x, u: weights[:200] @ (x * x) + weights[200:] @ (u * u), x, u)
@@ -63,7 +63,7 @@ def test_a_gradient_by_hundreds_of_variables_is_whole():
 
 
 def test_a_functions_hessian_is_the_closed_form():
-    """cosh(x0) + x1^2 u0^2 + u0^4 is convex near (0.5, 1, 1); a central difference of 1e-5 leaves about 1e-9."""
+    """cosh(x0) + x1^2 u0^2 + u0^4 is convex near (0.5, 1, 1). A central difference of 1e-5 leaves about 1e-9."""
     x, u = np.array([0.5, 1.0]), np.array([1.0])
     hessian = running_cost_hessian(lambda x, u: np.cosh(x[0]) + x[1] ** 2 * u[0] ** 2 + u[0] ** 4, x, u)
     expected = np.array([[np.cosh(0.5), 0, 0], [0, 2, 4], [0, 4, 14]])
@@ -71,7 +71,7 @@ def test_a_functions_hessian_is_the_closed_form():
 
 
 def test_an_indefinite_hessian_keeps_its_positive_part():
-    """x0 x1 has the eigenvalues +1 along (1, 1) and -1 along (1, -1): what is left is [[1, 1], [1, 1]] / 2."""
+    """x0 x1 has the eigenvalues +1 along (1, 1) and -1 along (1, -1). The positive part is [[1, 1], [1, 1]] / 2."""
     hessian = final_cost_hessian(lambda x: x[0] * x[1], np.array([0.3, -0.2]))
     assert hessian == pytest.approx(np.full((2, 2), 0.5), abs=1e-8)
 
@@ -114,7 +114,7 @@ def test_a_cost_that_is_no_scalar_is_refused():
 
 
 def test_a_quadratic_cost_along_a_motion_is_the_sum_of_its_calls():
-    """1e-14 relative: products of two and three numbers."""
+    """The tolerance of 1e-14 allows for rounding in products of two and three numbers."""
     random = np.random.default_rng(0)
     xs, us = random.standard_normal((5, 3)), random.standard_normal((5, 2))
     xs[3, 0] = np.nan

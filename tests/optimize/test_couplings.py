@@ -1,4 +1,4 @@
-"""Constraints that join several knots: they hold, their derivatives are exact, and what takes none of them says so."""
+"""Tests of constraints that couple several knots: they are met, have exact derivatives, or are refused."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ BOTH = ("controls", "initial_state")
 
 
 def swing(**more):
-    """Over the middle of its period the pendulum is on the other side."""
+    """Return a periodic pendulum problem with a waypoint on the other side at half of the period."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
     given = {"optimize": BOTH, "initial_state_mask": [False, True], "waypoints": {20: [0.8, np.nan]}}
     given |= {"couplings": Periodic(), "running_cost": EFFORT}
@@ -24,7 +24,7 @@ def swing(**more):
 
 
 def test_a_forced_oscillator_finds_its_own_steady_state():
-    """x'' + c x' + k x = cos(w t) has one periodic motion: Re(exp(i w t) / (k - w^2 + i c w))."""
+    """The only periodic motion of x'' + c x' + k x = cos(w t) is Re(exp(i w t) / (k - w^2 + i c w))."""
     c, k, w, count = 0.3, 4.0, 1.7, 60
     oscillator = dd.Dynamics(lambda x, u: [x[1], u[0] - c * x[1] - k * x[0]], nx=2, nu=1)
     problem = dd.Problem(
@@ -78,7 +78,7 @@ def test_a_motion_that_does_not_repeat_is_refused():
         xs = np.array(solution.xs)
         xs[-1] += random.choice([-1, 1], 2) * 10 ** random.uniform(-4, -1, 2)
         planted = replace(solution, xs=xs)
-        assert planted.constraint_excess["periodic"][0] > 5e-5  # of the smallest that is planted, 1e-4
+        assert planted.constraint_excess["periodic"][0] > 5e-5  # the smallest change is 1e-4
 
 
 def test_what_takes_no_couplings_says_so():

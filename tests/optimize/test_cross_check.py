@@ -1,4 +1,4 @@
-"""A plan followed in other plants: closed forms for what it becomes there, and plans that must not hold."""
+"""Tests of plans in other plants, against closed forms of the resulting motion, and plans that must fail."""
 
 import math
 import re
@@ -33,7 +33,7 @@ PLANTS = "continuous time", "mujoco"
 
 
 def given(model, x0, us, **fields):
-    """The motion of the model's own steps, as a solution."""
+    """Return the motion of the model's own steps as a solution."""
     us = np.asarray(us, dtype=float)
     xs = dd.rollout(model, x0, us).xs
     asked = {"final_cost": lambda x: x[0], "optimize": ("controls",) if model.nu else "initial_state", **fields}
@@ -42,7 +42,7 @@ def given(model, x0, us, **fields):
 
 
 def slide(tmp_path, speed=1.0, **fields):
-    """It slides to rest within v^2 / (2 mu g) and v / (mu g), on a spring that its weight presses by m g / k."""
+    """Return a slide to rest over v^2 / (2 mu g) in v / (mu g), on a contact spring that is compressed by m g / k."""
     model = ball_on_ground(tmp_path, time_step=0.01, stiffness=STIFF, relaxation_time=0.01, friction=MU)
     x0 = [0, 0.1 - G * 1.001 / (STIFF / 2), speed, 0]
     distance, count = speed**2 / (2 * MU * G), round(1.2 * speed / (MU * G) / 0.01)
@@ -50,21 +50,21 @@ def slide(tmp_path, speed=1.0, **fields):
 
 
 def in_plant(found, plant):
-    """The replays of a solution in a plant."""
+    """Return the replays of a solution in `plant`."""
     rows = [row for row in found.cross_checks if row.variant.startswith(f"in {plant}")]
     assert rows
     return rows
 
 
 def holds(found):
-    """By plant, whether a replay holds there."""
+    """Return for every plant whether one of its replays holds."""
     return {plant: any(row.holds for row in in_plant(found, plant)) for plant in PLANTS}
 
 
 def test_a_block_under_a_constant_force_ends_where_the_sums_say(write_urdf):
-    """x = u T (T + h) / 2 in steps of h, u T^2 / 2 in continuous time: 3 % of 1.05 are allowed, 10 % in MuJoCo."""
+    """x = u T (T + h) / 2 for steps of h, u T^2 / 2 in continuous time. 3 % of 1.05 are allowed, 10 % in MuJoCo."""
     h, count, u = 0.05, 20, 2.0
-    fixed = dd.Bounds(u_lower=[u], u_upper=[u])  # feedback cannot help
+    fixed = dd.Bounds(u_lower=[u], u_upper=[u])  # feedback has no effect
     for goal, expected in ((1.02, [True, True]), (1.1, [False, True])):
         problem = {"x_goal": [goal, FREE], "bounds": fixed}
         found = cross_check(given(write_urdf(time_step=h), [0, 0], np.full((count, 1), u), **problem))
@@ -81,7 +81,7 @@ def test_a_block_under_a_constant_force_ends_where_the_sums_say(write_urdf):
 
 
 def test_a_smooth_plan_holds_everywhere():
-    """A swing-up in steps of 0.02 s."""
+    """Check a swing-up in steps of 0.02 s."""
     solution = dd.solve(
         pendulum(running_cost=dd.QuadraticCost(R=[[1.0]]), final_cost=None, x_goal=[np.pi, 0]), method="shooting"
     )
@@ -92,7 +92,7 @@ def test_a_smooth_plan_holds_everywhere():
 
 
 def test_a_slide_ends_where_friction_says_in_every_plant(tmp_path):
-    """v^2 / (2 mu g) = 0.127 m: the steps are O(h) off, and MuJoCo's friction has the same number."""
+    """The distance is v^2 / (2 mu g) = 0.127 m. Steps have an error of O(h), and MuJoCo has the same friction."""
     solution, distance = slide(tmp_path)
     found = cross_check(solution)
     assert holds(found) == dict.fromkeys(PLANTS, True), found.cross_checks
@@ -101,7 +101,7 @@ def test_a_slide_ends_where_friction_says_in_every_plant(tmp_path):
 
 @each_row("quantity, speed, ends", [("friction", 1.0, 1 / 0.8), ("mass", 1.0, 1.0)])
 def test_a_simulator_with_a_number_that_is_20_percent_off_is_told(tmp_path, quantity, speed, ends):
-    """Friction of 0.8 mu lets it slide 1 / 0.8 times as far; its mass does not matter to where it stops."""
+    """With a friction of 0.8 mu the ball slides 1 / 0.8 times as far. Its mass does not change where it stops."""
     solution, distance = slide(tmp_path, speed)
     follower, model = follower_of(solution.plan), solution.problem.model
     path = tmp_path / "other.xml"
@@ -123,7 +123,7 @@ def test_a_simulator_with_a_number_that_is_20_percent_off_is_told(tmp_path, quan
 
 
 def test_a_plan_that_lives_by_its_coarse_step_is_told_where_it_does_not_hold(tmp_path):
-    """A spring without loss throws a ball back to where it fell from; a step that is longer than the blow stops it."""
+    """An elastic contact returns a ball to its initial height. A time step longer than the impact stops the ball."""
     h, fall = 0.02, 0.1
     model = ball_on_ground(tmp_path, time_step=h, stiffness=1e6, relaxation_time=0.0, friction=MU)
     count = round(2 * math.sqrt(2 * fall / G) / h)
@@ -143,13 +143,13 @@ def test_without_a_motion_in_continuous_time_steps_of_a_tenth_of_a_millisecond_a
         ("mujoco", "has PD gains"),
     ):
         rows = in_plant(found, plant)
-        assert all(row.motion is None for row in rows)  # a diagram allows no other step either
+        assert all(row.motion is None for row in rows)  # a diagram has no other time step either
         assert {c.verdict for row in rows for c in row.checks} == {"undecided"}
         assert why in str(rows[0])
 
 
 def test_a_plan_that_reaches_a_joint_limit_is_followed_in_short_steps_instead(tmp_path):
-    """Pushed against the stop of its rail, of which there is no motion in continuous time."""
+    """The block is pushed against the stop of its rail, which continuous time does not support."""
     path = tmp_path / "stop.urdf"
     path.write_text(STOP)
     model = dd.load_model(path, time_step=0.01)
@@ -162,7 +162,7 @@ def test_a_plan_that_reaches_a_joint_limit_is_followed_in_short_steps_instead(tm
 
 
 def test_where_only_offsets_keep_off_a_joint_limit_all_are_followed_in_short_steps(tmp_path, monkeypatch):
-    """The inputs and gains alone reach it: with them the plan is judged in one plant."""
+    """Without offsets the motion reaches the limit, so that all controllers are replayed in the same plant."""
     path = tmp_path / "stop.urdf"
     path.write_text(STOP)
     model = dd.load_model(path, time_step=0.01)
@@ -223,7 +223,7 @@ def test_bad_input_is_refused(write_urdf):
 
 @pytest.fixture(scope="module")
 def pushed(tmp_path_factory):
-    """A block that is pushed to 1 m in two steps a second holds in its own steps, and not where the sums are others."""
+    """Return a block pushed to 1 m with steps of 0.05 s. The plan holds with its own steps, but not in other plants."""
     path = tmp_path_factory.mktemp("plants") / "stop.urdf"
     path.write_text(STOP.replace('upper="0.5"', 'upper="2"'))
     model = dd.load_model(path, time_step=0.05)
@@ -269,7 +269,7 @@ def test_what_a_simulator_said_that_is_not_installed_stands_unchecked(pushed, tm
     with monkeypatch.context() as without:
         if there:
             no_mujoco(without)
-        found = verify_own(tmp_path / "run")  # in this process, in which it is not installed
+        found = verify_own(tmp_path / "run")  # in this process, in which MuJoCo may be missing
     assert found.verdict == "holds", found
     assert any(words in line for line in found.unchecked), found.unchecked
 

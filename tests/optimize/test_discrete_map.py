@@ -1,4 +1,4 @@
-"""Maps x_(k+1) = f(x_k, u_k, k) as systems of a Problem: against Riccati, against the map itself, and refused."""
+"""Tests of maps x_(k+1) = f(x_k, u_k, k) as the system of a Problem, against Riccati and against the map itself."""
 
 import numpy as np
 import pytest
@@ -17,13 +17,13 @@ def block(x, u):
 
 
 def kicked(x, u, k):
-    """A block on a bent track that is stopped and thrown back at step 10: the event is at a known step."""
+    """Step a block on a bent track, which is stopped and thrown back at step 10. The step of the event is known."""
     position, speed = x[0] + 0.1 * x[1] + 0.05 * np.sin(x[0]), x[1] + 0.1 * u[0]
     return [position, -0.5 * speed if k == 10 else speed]
 
 
 def branching(x, u, k):
-    """The same by a function that no expression can be made of."""
+    """Return the same step by a function that cannot be traced to an expression."""
     return kicked(x, u, k) if x[0] < 100 else [x[0], x[1]]
 
 
@@ -87,7 +87,7 @@ def test_a_planted_defect_is_found():
 
 
 def test_a_wrong_derivative_of_one_step_is_found():
-    """A function with derivatives of its own that are wrong: the certificate says so."""
+    """Check that the certificate reports wrong derivatives that a function provides itself."""
 
     class Wrong:
         def values(self, knots):
@@ -123,6 +123,6 @@ def test_a_map_is_warm_started_and_its_sensitivity_is_that_of_re_solves():
     first = dd.solve(problem)
     again = dd.solve(problem, initial_guess=first)
     assert again.success
-    assert again.iterations[0].objective == pytest.approx(first.cost, rel=1e-9)  # it begins where the first ended
+    assert again.iterations[0].objective == pytest.approx(first.cost, rel=1e-9)  # it begins where the first one ended
     assert again.iterations[0].primal_infeasibility < 1e-12
     assert dd.sensitivity(first, "goal").verdict == "agree"

@@ -1,4 +1,4 @@
-"""The dynamics' curvature along a motion: of a pendulum by hand, of a free body by differences of Drake's steps."""
+"""Tests of the dynamics' curvature along a motion, by hand for a pendulum and by differences of Drake's steps."""
 
 import casadi
 import numpy as np
@@ -18,9 +18,9 @@ def motion_of(problem, us):
 
 
 def test_of_a_pendulum_by_hand():
-    """Of a damped pendulum w' = s (w + h (u / I - g / l sin q)), q' = q + h w' only d2/dq2 is not 0: s h g / l sin q.
+    """For a damped pendulum w' = s (w + h (u / I - g / l sin q)), q' = q + h w' only d2/dq2 = s h g / l sin q is not 0.
 
-    1e-6 of a step is 1e-6 of the derivative.
+    A difference over 1e-6 has a relative error of 1e-6.
     """
     random = np.random.default_rng(0)
     problem = pendulum(num_steps=30, x0=[0.7, -1.2])
@@ -50,7 +50,7 @@ def assert_second_differences(model, motion, v, found):
 @pytest.mark.solve
 @pytest.mark.parametrize("file", ["cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "panda"])
 def test_of_hinges_and_slides_by_differences(file):
-    """Second differences of Drake's own steps by 1e-4, as of the body below; no limit acts."""
+    """Check by second differences of Drake's own steps over 1e-4, as for the body below. No limit is active."""
     random = np.random.default_rng(2)
     model = dd.example_model("panda") if file == "panda" else dd.load_model(MODELS / file, time_step=0.02)
     middle = np.clip(np.mean(np.clip(model.position_limits, -3.0, 3.0), axis=0), -2.0, 2.0)
@@ -64,7 +64,7 @@ def test_of_hinges_and_slides_by_differences(file):
 
 @pytest.mark.solve
 def test_of_a_floating_body_with_wheels_by_differences():
-    """Second differences of Drake's own steps by 1e-4, of entries up to 1: rounding of 1e-16 leaves 1e-8 of them."""
+    """Check by second differences of Drake's own steps over 1e-4. Rounding of 1e-16 leaves 1e-8 of entries up to 1."""
     model = craft()
     random = np.random.default_rng(1)
     x0 = tilted(model)
@@ -73,11 +73,11 @@ def test_of_a_floating_body_with_wheels_by_differences():
     motion, v = motion_of(problem, random.standard_normal((3, 3))), random.standard_normal((3, model.nx))
     found, _ = curvature_along(problem, motion, v)
     assert_second_differences(model, motion, v, found)
-    assert np.abs(found[:, : model.nx, model.nx :]).max() > 1e-3  # the inputs' part with the states is seen
+    assert np.abs(found[:, : model.nx, model.nx :]).max() > 1e-3  # states and inputs have mixed derivatives
 
 
 def cart_poles_by_hand(h, x, u, v):
-    """(5, 5) the second derivative of v' x', by CasADi, of the equations of Kelly, SIAM Review 59(4), 2017, sec. 6."""
+    """Return the Hessian (5, 5) of v' x' by CasADi, for the equations of Kelly, SIAM Review 59(4), 2017, sec. 6."""
     symbols = casadi.SX.sym("z", 5)
     angle, turning, force = symbols[1], symbols[3], symbols[4]
     sin, cos = casadi.sin(angle), casadi.cos(angle)
@@ -90,9 +90,9 @@ def cart_poles_by_hand(h, x, u, v):
 
 @pytest.mark.parametrize("exact", [True, False])
 def test_no_step_at_a_joint_limit_has_one(exact, monkeypatch):
-    """The slide's stop is at 2 m, and Drake's pushes from where it would be passed within two steps.
+    """The slide's stop is at 2 m. Drake's stop acts where the slide would pass it within two steps.
 
-    Differences between a Jacobian with the stop and one without, over 1e-6, would be 6e7 where the truth is 20.
+    Differences over 1e-6 between a Jacobian with the stop and one without would be 6e7, where the truth is 20.
     """
     if not exact:
         monkeypatch.setattr(analytic.SmoothStep, "curvature", lambda *_: None)
@@ -114,7 +114,7 @@ def test_no_step_at_a_joint_limit_has_one(exact, monkeypatch):
 
 
 def test_it_is_refused_where_spheres_touch(two_spheres):
-    """And is had of the same model where they are apart."""
+    """The same model has a curvature where the spheres are apart."""
     cost = dd.QuadraticCost(R=[[1.0]])
     for gap, touches in ((0.1, False), (-0.001, True)):
         problem = dd.Problem(two_spheres(), x0=[0, 0.2 + gap, 0, 0], num_steps=3, running_cost=cost)

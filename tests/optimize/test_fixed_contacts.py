@@ -1,4 +1,4 @@
-"""Points that the world holds: against Drake's own matrices, its constraints, closed forms, and refused by name."""
+"""Tests of fixed contacts against Drake's matrices and constraints and closed forms, and of refused contacts."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ RAILS = "".join(
 
 
 def drake_says(path, frame, point, axes, x, u):
-    """x' and the holding forces from pydrake's own matrices in continuous time."""
+    """Return x' and the contact forces from pydrake's own matrices in continuous time."""
     plant = MultibodyPlant(0.0)
     Parser(plant).AddModels(str(path))
     plant.Finalize()
@@ -119,9 +119,9 @@ def test_an_impact_stops_the_foot_and_keeps_the_momentum_of_the_rest():
     after = contacts.impact(x)
     np.testing.assert_allclose(after[:4], x[:4])
     np.testing.assert_allclose(contacts.speeds(after), 0, atol=1e-12)
-    # The leg slides freely along z: a massless motor passes no impulse on, so that the body keeps its speed.
+    # The leg slides freely along z. A massless motor passes no impulse on, so that the body keeps its speed.
     assert after[5] == pytest.approx(-2.0, abs=1e-9)
-    np.testing.assert_allclose(contacts.impact(after), after, atol=1e-12)  # what stands is not hit again
+    np.testing.assert_allclose(contacts.impact(after), after, atol=1e-12)  # a second impact changes nothing
     locked = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.01)
     rod = dd.optimize.FixedContacts(locked, {"pole": [0, 0, -0.5]}, axes="x")
     hit = rod.impact([0.0, 0.4, 1.0, 0.0])
@@ -148,7 +148,7 @@ def test_a_hopper_jumps_to_its_height():
         assert up >= -1e-6
         assert abs(along) <= 0.7 * up + 1e-6
         np.testing.assert_allclose(stance.places(x), [0.0, 0.0], atol=1e-3)
-    # In the air the centre of mass falls freely: its height at take-off and its speed there decide the top.
+    # In flight the centre of mass falls freely. Its height and speed at take-off determine the height at the end.
     mass = {"body": 1.001, "foot": 0.2}
     whole = sum(mass.values())
 
@@ -165,7 +165,7 @@ def test_a_hopper_jumps_to_its_height():
 @pytest.mark.solve
 @pytest.mark.parametrize("seed", range(4))
 def test_a_start_that_slides_or_a_place_that_is_missed_is_refused(seed):
-    """By its own equations the motion is right in both: only what a stance keeps says that the foot does not stand."""
+    """Both motions satisfy the dynamics. Only the constraints of the stance show that the foot does not stand."""
     model = dd.load_model(MODELS / "hopper.sdf", time_step=0.01, contact=False)
     stance = dd.optimize.FixedContacts(model, {"foot": [0, 0, -0.05]})
     random = np.random.default_rng(seed)
@@ -174,7 +174,7 @@ def test_a_start_that_slides_or_a_place_that_is_missed_is_refused(seed):
     x0[[1, 5][seed % 2]] += off
     kept, effort = stance.kept(at=0.0, tolerance=1e-3), dd.QuadraticCost(R=1e-3 * np.eye(2))
     problem = dd.Problem(stance, x0=x0, num_steps=5, horizon=0.1, running_cost=effort, constraints=kept)
-    guess = np.tile(x0, (6, 1)), np.zeros((5, 2))  # one that is given is the only one
+    guess = np.tile(x0, (6, 1)), np.zeros((5, 2))  # a given guess is the only one that is tried
     solution = dd.solve(problem, initial_guess=guess, max_iterations=30)
     assert not solution.success
     assert solution.constraint_violation > 0.5 * abs(off) - 1e-3
@@ -182,7 +182,7 @@ def test_a_start_that_slides_or_a_place_that_is_missed_is_refused(seed):
 
 @pytest.mark.solve
 def test_a_force_that_leaves_its_cone_is_refused():
-    """A hopper that is pushed sideways on ice: the plan of a rough ground breaks the smooth one's cone."""
+    """Push a hopper sideways. The plan for rough ground violates the friction cone of smooth ground."""
     model = dd.load_model(MODELS / "hopper.sdf", time_step=0.01, contact=False)
     stance = dd.optimize.FixedContacts(model, {"foot": [0, 0, -0.05]})
     x0 = np.array([0, 0.3, 0, 0.25, 0, 0, 0, 0.0])

@@ -1,4 +1,4 @@
-"""Goals and obstacles as they are drawn: where, how large, and on which body."""
+"""Tests of the drawings of goals: their positions, sizes and bodies."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def test_what_is_free_is_a_long_side_of_a_box(model):
 
 
 def test_a_rotation_is_three_axes_turned_so(model):
-    """A half turn about y: x points back, z down; each shaft's middle is half of the 0.1 m from the origin."""
+    """After half a turn about y, x points back and z down. The middle of a shaft of 0.1 m is 0.05 m from the origin."""
     marks = drawn(model, dd.FrameGoal("pole", rotation=[0, 0, 1, 0]))
     middles = np.array([mark.pose.translation() for mark in marks])
     np.testing.assert_allclose(middles, [[-0.05, 0, 0], [0, 0.05, 0], [0, 0, -0.05]], atol=1e-15)

@@ -1,4 +1,4 @@
-"""Goals in a robot's own words: what they check, what they come to, and that the motions found keep them."""
+"""Tests of task-space goals: their checks, their values and derivatives, and motions that satisfy them."""
 
 import shutil
 
@@ -50,7 +50,7 @@ def tip(**changes):
 
 
 def reach(model, **changes):
-    """From hanging bent to the target of `tip`, at rest."""
+    """Return the problem of moving from a bent posture to the target of `tip`, at rest."""
     start, stop = {"shoulder": 0.3, "elbow": 0.4}, {"shoulder_w": 0, "elbow_w": 0}
     given = {"x0": start, "x_goal": stop, "num_steps": 20, "goals": tip(), "running_cost": EFFORT}
     return dd.Problem(model, **given | changes)
@@ -114,7 +114,7 @@ def test_an_unknown_name_lists_those_that_exist(arm, goal, words):
     "goals, words",
     [
         (dd.Constraint(lambda x: x[0], upper=1), "a goal such as FrameGoal"),
-        (dd.FrameGoal("lower", [0.1, 0.2, -0.5]), "entry 1 is 0 wherever"),  # it swings in x and z
+        (dd.FrameGoal("lower", [0.1, 0.2, -0.5]), "entry 1 is 0 wherever"),  # the arm swings in x and z
         (dd.FrameGoal("lower", [0.1, 0, -0.5], knots=21), "from -21 to 20"),
         (dd.KeepLevel("upper", tolerance=0.2), "upper level is 0.3 rad off"),  # x0 leans by 0.3 rad
         (dd.JointGoal({"elbow": 1.0, "elbow_q": 1.0}), "both are the same coordinate"),
@@ -159,11 +159,11 @@ def test_a_two_link_arm_ends_at_the_angles_of_the_law_of_cosines(arm, method, op
     x, z = -0.6, -0.7
     bend = np.arccos((x**2 + z**2 - UPPER**2 - LOWER**2) / (2 * UPPER * LOWER))
     found = []
-    for elbow in (bend, -bend):  # a hinge about +y swings what hangs down to -x
+    for elbow in (bend, -bend):  # a hinge about +y turns a hanging link towards -x
         inner = np.arctan2(LOWER * np.sin(elbow), UPPER + LOWER * np.cos(elbow))
         found.append([np.arctan2(-x, -z) - inner, elbow])
     off = min(np.max(np.abs(solution.xs[-1][:2] - angles)) for angles in found)
-    # The plan may use a tenth of 5 mm; an angle changes by at most 1 / (0.5 sin bend) rad a metre.
+    # The plan may be off by a tenth of 5 mm. An angle changes by at most 1 / (0.5 sin bend) rad per metre.
     assert off < AIMED * 5e-3 / (LOWER * np.sin(bend))
     assert solution.constraint_violation < 1e-5
 
@@ -188,7 +188,7 @@ def test_a_goal_out_of_reach_is_named(arm):
 
 
 def test_a_weight_makes_a_goal_a_cost(arm):
-    """The plan is that of the same cost written out."""
+    """Check that the plan is equal to the plan for the same cost as a function."""
     where = dd.quantities.frame_position(arm, "lower", [0, 0, -LOWER])
 
     def written_out(x):
@@ -252,7 +252,7 @@ def test_states_and_bounds_by_name_are_those_by_place(arm):
 
 
 def quantities_of(model, random):
-    """One of each kind, of the body that is last in the tree."""
+    """Return one quantity of each kind, for the last body in the tree."""
     body = model.plant.get_body(BodyIndex(model.plant.num_bodies() - 1)).name()
     R = RollPitchYaw(random.uniform(-1, 1, 3)).ToRotationMatrix().matrix()
     q, point = dd.quantities, random.standard_normal(3)
@@ -264,11 +264,11 @@ def quantities_of(model, random):
 
 
 def check_symbols(model, states, random):
-    """Symbols have the values and Jacobians of AutoDiffXd, and these are those of differences."""
+    """Check that traced functions have the values and Jacobians of AutoDiffXd, and check these by differences."""
     knots = np.hstack([states, np.zeros((len(states), model.nu))])
     for f in quantities_of(model, random):
         wanted = np.array([f(x) for x in states])
-        function = Traced(trace(lambda x, u, f=f: f(x), model.nx, knots, wanted))  # values to 1e-10, or it refuses
+        function = Traced(trace(lambda x, u, f=f: f(x), model.nx, knots, wanted))  # raises unless values agree to 1e-10
         constraint = dd.Constraint(f, lower=0.0)
         for x, knot in zip(states, knots, strict=True):
             jacobian = constraint.differentiate(x, knot[model.nx :])[1]
@@ -284,7 +284,7 @@ def check_symbols(model, states, random):
 
 @pytest.mark.parametrize("name", ["ur5_robot.urdf", "solo12.urdf"])
 def test_goals_have_the_same_derivatives_by_symbols_and_by_autodiff(name):
-    """A fixed and a floating base, whose quaternion is of another length than 1 in one of the states."""
+    """Test a fixed and a floating base, whose quaternion has a norm other than 1 in one of the states."""
     model, random = example_robot(name), np.random.default_rng(0)
     states = np.array([state_in_range(model, random) for _ in range(3)])
     if name == "solo12.urdf":
@@ -293,7 +293,7 @@ def test_goals_have_the_same_derivatives_by_symbols_and_by_autodiff(name):
 
 
 def test_joints_of_every_kind_are_placed_as_drake_does():
-    """A chain of all kinds with turned frames; the last joint is met from its child."""
+    """Test a chain of all kinds of joints with rotated frames. The last joint is traversed from its child."""
     builder, random = DiagramBuilder(), np.random.default_rng(3)
     plant, _ = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.01, use_sampled_output_ports=False), builder)
     weight = SpatialInertia(1.0, [0.1, 0.2, 0.3], UnitInertia.SolidSphere(1.0))
@@ -320,7 +320,7 @@ def _frames(plant, name, parent, on_parent, child, on_child):
 
 
 def test_half_a_turn_away_is_no_gap_in_the_derivatives(pendulum):
-    """From hanging to upright is half a turn, where a rotation's axis may have either sign."""
+    """From hanging to upright is half a turn, at which a rotation's axis may have either sign."""
     f = dd.quantities.frame_rotation_error(pendulum, "pole", np.diag([-1.0, 1.0, -1.0]))
     probe = np.array([[0.3, 0, 0.0], [1.0, 0, 0], [2.0, 0, 0]])
     function = Traced(trace(lambda x, u: f(x), 2, probe, np.array([f(k[:2]) for k in probe])))
@@ -331,9 +331,9 @@ def test_half_a_turn_away_is_no_gap_in_the_derivatives(pendulum):
 
 @pytest.mark.slow
 def test_a_satellite_turns_by_every_method_whatever_the_sign_of_its_goal(tmp_path):
-    """By 90 degrees at rest: the least of two forces' squares is 24 I^2 angle^2 / T^3, in steps of T / 20 nearly so.
+    """The least cost of two forces that turn by 90 degrees is 24 I^2 angle^2 / T^3, and nearly so with steps of T / 20.
 
-    The discrete step lets a quaternion's length grow by 0.5 % on the way, so that no state has the goal's entries.
+    The discrete step lets a quaternion's norm grow by 0.5 % on the way, so that no state has the goal's entries.
     """
     (tmp_path / "sat.sdf").write_text(
         '<sdf version="1.9"><model name="sat"><link name="bus"><inertial><mass>10</mass><inertia><ixx>0.4</ixx>'
@@ -356,7 +356,7 @@ def test_a_satellite_turns_by_every_method_whatever_the_sign_of_its_goal(tmp_pat
         assert problem.goal_error(solution.xs[-1]) == pytest.approx(np.zeros(model.nx), abs=1e-5)
         costs.append(solution.cost)
     assert costs == pytest.approx([costs[0]] * 3, rel=1e-6)
-    assert least < costs[0] < 1.01 * least  # as many steps take 1 / (1 - 1/20^2) of it where nothing turns
+    assert least < costs[0] < 1.01 * least  # 20 steps cost 1 / (1 - 1/20^2) of it for a translation
     dd.save(solution, tmp_path / "run")
     assert dd.verify(tmp_path / "run").holds
     assert list(odd_metrics(dd.load_record(tmp_path / "run"), dict(np.load(tmp_path / "run" / "plan.npz")))) == []
@@ -376,7 +376,7 @@ ARMS = [
 @pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
 @pytest.mark.parametrize(("name", "frame", "options"), ARMS)
 def test_robots_reach_with_a_hand_or_a_foot_by_default_and_verify_holds(name, frame, options, tmp_path):
-    """To where the frame is at other angles, so that it can be reached; at rest in the end."""
+    """Reach the position that the frame has at other angles, so that it can be reached, and end at rest."""
     model = dd.load_model(robot_file(name), time_step=0.02, actuators="all", base="weld", **options)
     random, (lower, upper) = np.random.default_rng(0), model.position_limits
     lower, upper = np.maximum(lower, -2.0), np.minimum(upper, 2.0)
@@ -394,7 +394,7 @@ def test_robots_reach_with_a_hand_or_a_foot_by_default_and_verify_holds(name, fr
     solution = dd.solve(problem, progress=False)
     assert solution.success, solution.message
     assert any(c.where == f"{frame} position" and c.passes for c in solution.checks)
-    # The box in which the plan ends: a tenth of 5 mm each way; the distance is measured by Drake.
+    # The plan ends in a box of a tenth of 5 mm each way. Drake measures the distance.
     assert np.linalg.norm(where(solution.xs[-1]) - where(there)) <= AIMED * 5e-3 + 1e-5
     dd.save(solution, tmp_path / "run")
     assert dd.verify(tmp_path / "run", models="/").require().verdict == "holds"
@@ -425,8 +425,8 @@ def test_verify_binds_the_goals_again_and_holds(run):
     slow_after(
         2,
         [
-            {"position": [-0.26, None, None]},  # where the hand does not end
-            {"tolerance": 0.5},  # what would take anything: the search then ends elsewhere
+            {"position": [-0.26, None, None]},  # the hand does not end at this position
+            {"tolerance": 0.5},  # any end is within this tolerance, and the search then ends at another one
             {"frame": "nowhere"},
             {"knots": [3]},
         ],

@@ -1,4 +1,4 @@
-"""A guess may be any motion: a solution on other knots, of another time or method, or trajectories of Drake."""
+"""Tests of initial guesses: solutions on other knots, of another duration or method, and Drake's trajectories."""
 
 import re
 
@@ -19,7 +19,7 @@ EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 
 def block(count=10, horizon=1.0, **asked):
-    """A block of 1 kg from 0 to 1 m, at rest at both ends: u = 6 - 12 t at least effort, of cost 12."""
+    """Return the problem of moving 1 kg by 1 m from rest to rest. The optimum is u = 6 - 12 t with a cost of 12."""
     push = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
     ends = {"x0": [0, 0], "x_goal": [1, 0]} | asked
     return dd.Problem(push, num_steps=count, horizon=horizon, running_cost=EFFORT, **ends)
@@ -37,7 +37,7 @@ def test_a_collocated_solution_as_drakes_trajectories_is_its_motion(scheme):
     assert (state.start_time(), state.end_time(), held.end_time()) == (0.0, 1.0, 1.0)
     at = np.linspace(0, 1, 57)
     xs, us = solution.transcribed.at(at)
-    np.testing.assert_allclose(state.vector_values(at).T, xs, atol=1e-9)  # where the defects are 1e-10
+    np.testing.assert_allclose(state.vector_values(at).T, xs, atol=1e-9)  # the defects are 1e-10
     np.testing.assert_allclose(held.vector_values(at).T, us, atol=1e-9)
 
 
@@ -62,7 +62,7 @@ def test_a_solution_that_is_not_finite_has_no_trajectory(write_urdf):
 @each_row("method", ["collocation", "ilqr", "shooting"])
 @each_row("count", [7, 10, 25])
 def test_a_solution_of_any_method_and_length_is_a_guess(write_urdf, method, count):
-    """The guess on the new knots is the line of the old one; the search ends where it does without."""
+    """The guess interpolates the old solution at the new knots. The solve ends at the same optimum as without it."""
     first = plant(write_urdf)
     found = dd.solve(first, method=method)
     problem = plant(write_urdf, count, h=1.0 / count)
@@ -91,7 +91,7 @@ def test_held_inputs_on_other_knots_have_the_same_integral(write_urdf):
 
 
 def test_drakes_trajectories_are_a_guess(write_urdf):
-    """The closed form as Drake's polynomials: iLQR needs a single step from there, as from anywhere."""
+    """The guess is the closed form as Drake's polynomials. iLQR needs a single step from it, as from any guess."""
     t = np.linspace(0, 1, 5)
     state = PiecewisePolynomial.CubicHermite(t, [3 * t**2 - 2 * t**3, 6 * t - 6 * t**2], [6 * t - 6 * t**2, 6 - 12 * t])
     held = PiecewisePolynomial.FirstOrderHold([0, 1], [[6.0, -6.0]])
@@ -126,11 +126,11 @@ def test_a_solution_of_another_system_is_refused(write_urdf):
         dd.solve(dd.Problem(cart, x0=[0, 0, 0, 0], x_goal=[0, 0.1, 0, 0], num_steps=10), initial_guess=found)
 
 
-# ------------------------------------------------------------------------------ other first guesses
+# ------------------------------------------------------------------------------ other initial guesses
 
 
 def limited_pendulum(limit, **asked):
-    """m = l = 1: it hangs by its motor at 9.81 N m, so that less has to swing up."""
+    """For m = l = 1 gravity's torque is up to 9.81 N m, so that a weaker motor has to swing the pendulum up."""
     swing = dd.Dynamics(
         lambda x, u: [x[1], u[0] - 9.81 * np.sin(x[0]) - 0.1 * x[1]], nx=2, nu=1, u_lower=[-limit], u_upper=[limit]
     )
@@ -142,7 +142,7 @@ def limited_pendulum(limit, **asked):
 @each_row("limit", [3.9, 2.5])
 @each_row("method", ["auto", "collocation"])
 def test_a_swing_up_in_least_time_is_found_from_another_first_guess(limit, method):
-    """IPOPT calls it infeasible from a straight line. The motion is integrated here, under the plan's own input."""
+    """IPOPT reports infeasibility from a straight line. The test integrates the motion under the plan's own input."""
     solution = dd.solve(limited_pendulum(limit, horizon=(0.5, 10.0), running_cost=1.0), method=method)
     assert solution.success, solution.message
     chain = solution.options["chain"]
@@ -152,21 +152,21 @@ def test_a_swing_up_in_least_time_is_found_from_another_first_guess(limit, metho
     assert np.abs(solution.us).max() <= limit + 1e-6
     x, parts = np.zeros(2), 4000
     us = solution.transcribed.at(solution.horizon * (np.arange(parts) + 0.5) / parts)[1][:, 0]
-    for u in us:  # the midpoint rule, whose error is 1e-6 in such steps
+    for u in us:  # the midpoint rule, whose error is 1e-6 for these steps
         h = solution.horizon / parts
         middle = x + h / 2 * np.array([x[1], u - 9.81 * np.sin(x[0]) - 0.1 * x[1]])
         x = x + h * np.array([middle[1], u - 9.81 * np.sin(middle[0]) - 0.1 * middle[1]])
-    np.testing.assert_allclose(x, [np.pi, 0], atol=0.06)  # an upright pendulum makes 1e-6 grow e^(3 t)
+    np.testing.assert_allclose(x, [np.pi, 0], atol=0.06)  # near the upright position an error of 1e-6 grows as e^(3 t)
 
 
 def test_what_no_guess_solves_says_how_many_were_tried():
-    """1 m in 1 s from rest to rest needs 4 N at least."""
+    """1 m in 1 s from rest to rest needs at least 4 N."""
     problem = block(bounds=dd.Bounds(u_lower=[-3.9], u_upper=[3.9]))
     solution = dd.solve(problem)
     assert solution.status is dd.Status.INFEASIBLE
     assert "no plan was found from 9 first guesses" in repr(solution)
     assert len(solution.options["chain"]) == 9
-    given = dd.solve(problem, initial_guess=(solution.xs, solution.us))  # what is given is what is tried
+    given = dd.solve(problem, initial_guess=(solution.xs, solution.us))  # only the given guess is tried
     assert len(given.options["chain"]) == 1
 
 
@@ -186,7 +186,7 @@ def test_another_guess_is_inside_all_bounds_and_begins_where_the_motion_does():
 
 
 def test_a_reference_is_the_first_guess_bent_to_the_ends_that_are_given():
-    """Of the first state alone: the second is not followed, and keeps to the straight line."""
+    """Only the first state follows the reference. The second state keeps to the straight line."""
     times = np.linspace(0, 2, 201)
     wanted = np.column_stack([np.sin(3 * times), 0 * times])
     follow = dd.optimize.TrackingCost((times, wanted, np.cos(times)[:, None]), Q=np.diag([1.0, 0.0]), R=[[1.0]])
@@ -194,14 +194,14 @@ def test_a_reference_is_the_first_guess_bent_to_the_ends_that_are_given():
     asked = {"x0": [0.5, 1.0], "x_goal": [np.nan, 3.0], "num_steps": 20, "horizon": 2.0}
     guess = first_guess(dd.Problem(push, running_cost=[EFFORT, follow], **asked), "collocation", None, 0)
     s = np.linspace(0, 1, 21)
-    assert guess.xs[:, 0] == pytest.approx(np.sin(6 * s) + 0.5 * (1 - s), abs=2e-4)  # the table is linear in between
+    assert guess.xs[:, 0] == pytest.approx(np.sin(6 * s) + 0.5 * (1 - s), abs=2e-4)  # linear interpolation in the table
     assert guess.xs[:, 1] == pytest.approx(1 + 2 * s)
     assert guess.us[:, 0] == pytest.approx(np.cos(2 * s[:-1] + 0.05), abs=2e-3)
 
 
 @pytest.mark.slow
 def test_a_car_keeps_to_a_figure_eight_from_beside_it():
-    """From a straight line, which stays at the start, it ended in loops, 0.28 m off the eight."""
+    """The initial guess of a straight line, which stays at the start, led to loops, 0.28 m off the eight."""
     time = 23.0
     times = np.linspace(0, time, 401)
     angle, rate = 2 * np.pi * times / time, 2 * np.pi / time

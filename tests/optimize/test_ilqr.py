@@ -1,4 +1,4 @@
-"""iLQR against the Riccati recursion, its own quadratic case, and against what its optimum must satisfy."""
+"""Tests of iLQR against the Riccati recursion, closed forms, and the conditions of an optimum."""
 
 import itertools
 import signal
@@ -26,7 +26,7 @@ EFFORT = dd.QuadraticCost(R=[[1.0]])
 @each_row("seed", [0, 1, 2])
 @each_row("infeasible", [False, True])
 def test_one_step_from_any_guess_is_the_riccati_recursions_optimum(case, seed, infeasible):
-    """1e-12 relative: a sum of a few hundred rounded terms."""
+    """The relative tolerance of 1e-12 allows for rounding in a sum of a few hundred terms."""
     problem = lqr(*case, x0=(1.0, -0.5))
     random = np.random.default_rng(seed)
     us = 10 * random.standard_normal((case[1], 1))
@@ -59,7 +59,7 @@ def test_the_optimal_costs_gradient_by_the_initial_state_is_twice_p0_x0(case):
 
 
 def pendulum_gradient(us):
-    """dJ/du (N, 1) of SOFT by the hand-made pendulum with m = 1, l = 0.5, b = 0.1 implicit, h = 0.02."""
+    """Return dJ/du (N, 1) of SOFT for a pendulum by hand, with m = 1, l = 0.5, b = 0.1 implicit, h = 0.02."""
     h, g, length, b, inertia = 0.02, 9.81, 0.5, 0.1, 0.25
     s = 1 / (1 + h * b / inertia)
     xs = [np.zeros(2)]
@@ -86,7 +86,7 @@ def test_a_swing_up_without_bounds_leaves_no_slope():
 
 @pytest.mark.slow
 def test_a_swing_up_within_bounds_meets_them_and_the_conditions_of_an_optimum():
-    """Where |u| < 2.5 there is no slope; at a bound the cost pushes outwards. Shooting finds the same cost."""
+    """The gradient is 0 where |u| < 2.5. At a bound the cost pushes outwards. Shooting finds the same cost."""
     problem = pendulum(bounds=dd.Bounds(u_lower=[-2.5], u_upper=[2.5]))
     solution = dd.solve(problem, method="ilqr")
     assert solution.success, solution.message
@@ -103,7 +103,7 @@ def test_a_swing_up_within_bounds_meets_them_and_the_conditions_of_an_optimum():
 def test_the_cost_falls_from_row_to_row():
     solution = dd.solve(pendulum(), method="ilqr")
     costs = [row.objective for row in solution.iterations]
-    assert costs[0] == pytest.approx(50.2 * np.pi**2, rel=1e-12)  # hanging still: 100 * 0.02 * 0.1 pi^2 + 50 pi^2
+    assert costs[0] == pytest.approx(50.2 * np.pi**2, rel=1e-12)  # hanging at rest: 100 * 0.02 * 0.1 pi^2 + 50 pi^2
     assert np.all(np.diff(costs) <= 0)  # the last step may gain less than rounding
     assert len(costs) > 3
     assert costs[-1] == solution.cost
@@ -131,13 +131,13 @@ def test_ctrl_c_ends_it_with_the_motion_so_far():
     before = signal.getsignal(signal.SIGINT)
     solution = dd.solve(pendulum(), method="ilqr", progress=lambda line: signal.raise_signal(signal.SIGINT))
     assert solution.status is Status.INTERRUPTED
-    assert solution.cost < 50.2 * np.pi**2  # that of the guess
+    assert solution.cost < 50.2 * np.pi**2  # the cost of the initial guess
     assert solution.defect < 1e-12
     assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_step_of_size_a_leaves_the_rest_of_each_gap():
-    """A swing-up from a straight line: the largest gap shrinks by 1 - size, and is exactly 0 after a full step."""
+    """Swing up from a straight line. The largest gap is multiplied by 1 - size, and is exactly 0 after a full step."""
     xs = np.linspace(0, 1, 101)[:, None] * np.array([np.pi, 0])
     solution = dd.solve(pendulum(), method="ilqr", initial_guess=(xs, np.full((100, 1), 8.0)))
     rows = solution.iterations
@@ -150,7 +150,7 @@ def test_a_step_of_size_a_leaves_the_rest_of_each_gap():
 
 
 def test_a_hard_goal_of_the_pendulum():
-    """J = 8.826541704941 by an independent program, to 1e-8 of it since the goal is met to 1e-8."""
+    """J = 8.826541704941 by an independent program, to a relative 1e-8, as the goal is met to 1e-8."""
     solution = dd.solve(pendulum(x_goal=[np.pi, 0], running_cost=EFFORT, final_cost=None), method="ilqr")
     assert solution.success, solution.message
     assert solution.cost == pytest.approx(8.826541704941, rel=1e-8)
@@ -159,7 +159,7 @@ def test_a_hard_goal_of_the_pendulum():
 
 
 def test_the_pendulum_of_drake_ddp():
-    """0.225845385916, by an independent program; few steps, as the dynamics' curvature is learned on the way."""
+    """0.225845385916 by an independent program. The solve takes few steps, as it learns the dynamics' curvature."""
     problem = dd.Problem(
         dd.load_model(MODELS / "pendulum.urdf", time_step=0.01),
         x0=[0, 0],
@@ -170,7 +170,7 @@ def test_the_pendulum_of_drake_ddp():
     solution = dd.solve(problem, method="ilqr")
     assert solution.success, solution.message
     assert solution.cost == pytest.approx(0.225845385916, abs=1e-12)
-    assert len(solution.iterations) < 40  # 199 without
+    assert len(solution.iterations) < 40  # 199 without the curvature
 
 
 def move(count=20, goal=(1, 0), **bounds):
@@ -180,9 +180,9 @@ def move(count=20, goal=(1, 0), **bounds):
 
 
 def test_a_velocity_limit_is_met_and_pays():
-    """u_k - u_(k+1) is a constant plus the multiplier of v_(k+1) <= 1.2, which is 0 where v is below.
+    """u_k - u_(k+1) is a constant plus the multiplier of v_(k+1) <= 1.2, which is 0 where v is below the limit.
 
-    IPOPT, whose bounds give by 1e-8, finds the cost.
+    IPOPT, which relaxes bounds by 1e-8, finds the same cost.
     """
     problem = move(x_upper=[np.inf, 1.2])
     solution = dd.solve(problem, method="ilqr")
@@ -200,10 +200,10 @@ def test_a_velocity_limit_is_met_and_pays():
 
 
 def test_cart_pole_swing_up_from_rest():
-    """The optimum of examples/cart_pole_swing_up.py at 50 steps: 58.6088 by SNOPT and IPOPT.
+    """The optimum of examples/cart_pole_swing_up.py at 50 steps is 58.6088 by SNOPT and IPOPT.
 
-    In steps of 0.04 s it is no motion of the plant: in finer ones it needs feedback, under whose gains alone it ends
-    further off than 5 % of a range, and within 10 %.
+    With steps of 0.04 s the plan is no motion of the plant. In finer steps it needs feedback. With the gains alone it
+    ends more than 5 % of a range from the goal, and within 10 %.
     """
     model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04)
     problem = dd.Problem(model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=50, running_cost=EFFORT)
@@ -218,12 +218,12 @@ def test_cart_pole_swing_up_from_rest():
         assert 0.05 < part < 0.1
         assert found.goal_error < 1e-6
         assert found.cost == pytest.approx(58.6088133284, rel=1e-8)
-    assert len(again.iterations) < 12  # a good guess is not left
+    assert len(again.iterations) < 12  # iLQR stays near a good guess
 
 
 @pytest.mark.parametrize("target", [[1, 0, 0, 0], [0, 1, 0, 0]])
 def test_a_floating_bodys_optimum_has_no_slope(target):
-    """By reverse accumulation in Drake's coordinates; without the quaternion's norm, which grows, 1e-3 is left."""
+    """Check by reverse accumulation in Drake's coordinates. Without the quaternion's growing norm 1e-3 is left."""
     model = craft()
     x0, x_ref, Q = tilted(model), np.array(model.default_state), np.zeros((model.nx, model.nx))
     x_ref[:4], Q[:4, :4] = target, np.eye(4)
@@ -253,7 +253,7 @@ def test_a_guess_with_the_other_sign_of_a_quaternion_is_the_same_guess():
 
 
 def test_a_free_initial_velocity_drifts_to_the_goal():
-    """No force is needed at v_0 = 1; where v_0 <= 0.7, v = 0.7 + sum of h u."""
+    """No force is needed for v_0 = 1. With v_0 <= 0.7, v = 0.7 + the sum of h u."""
     fields = {"optimize": ("controls", "initial_state"), "initial_state_mask": [False, True]}
     problem = dd.Problem(block(), x0=[0, 0], num_steps=10, x_goal=[1, np.nan], running_cost=EFFORT, **fields)
     solution = dd.solve(problem, method="ilqr")
@@ -279,7 +279,7 @@ def test_a_free_initial_velocity_drifts_to_the_goal():
     "bounds", [{"x_upper": [np.inf, 0.8]}, {"u_lower": [-3.0], "u_upper": [3.0]}, {"x_upper": [np.inf, 0.99]}]
 )
 def test_a_goal_out_of_reach_is_infeasible(bounds):
-    """1 m in 1 s from rest to rest takes more than 1 m/s, and 4 N."""
+    """1 m in 1 s from rest to rest needs more than 1 m/s, and 4 N."""
     solution = dd.solve(move(**bounds), method="ilqr")
     assert solution.status is Status.INFEASIBLE, solution.message
     assert solution.iterations[-1].primal_infeasibility > 1e-3
@@ -307,17 +307,17 @@ def test_the_box_newton_step_satisfies_the_conditions_of_an_optimum(seed):
 
 
 def test_a_ridge_is_in_the_units_of_what_it_is_added_to():
-    """With one input in other units, 1000 times as many of them, the regularized motion is the same."""
+    """If one input has another unit, with 1000 times the value, the regularized motion is the same."""
     plain, p = [], _around(np.ones(2))
     for scale in (np.ones(2), np.array([1.0, 1000.0])):
         policy = solve_riccati(_around(scale), 0.7)
         plain.append(policy.feedforward * scale)
-    np.testing.assert_allclose(plain[1], plain[0], rtol=1e-9)  # a Cholesky factor's rounding
+    np.testing.assert_allclose(plain[1], plain[0], rtol=1e-9)  # rounding of a Cholesky factorization
     assert np.abs(solve_riccati(p, 0.0).feedforward - plain[0]).max() > 1e-3
 
 
 def _around(scale):
-    """A linear-quadratic problem of three states, whose two inputs are in units of `scale`."""
+    """Return a linear-quadratic problem with three states and two inputs in units of `scale`."""
     random = np.random.default_rng(4)
     F, g = random.standard_normal((5, 3, 5)), random.standard_normal((6, 5))
     H = np.tile(np.eye(5), (6, 1, 1))
@@ -337,7 +337,7 @@ def _around(scale):
 
 
 def without_derivatives(monkeypatch, refuses, error=GradientError):
-    """Every motion of which `refuses(xs)` holds has no Jacobians; gives the list of those that were asked for."""
+    """Raise `error` for the Jacobians of motions with `refuses(xs)`, and return the list of requested motions."""
     from drake_diff.optimize.ilqr import ilqr
 
     true, seen = ilqr.jacobians_along, []
@@ -354,7 +354,7 @@ def without_derivatives(monkeypatch, refuses, error=GradientError):
 
 @pytest.mark.parametrize("error", [GradientError, SimulationError])
 def test_a_motion_without_a_derivative_is_a_step_that_was_too_long(monkeypatch, error):
-    """A swing-up whose motions on the way go faster than guess and optimum ever do: halfway there derivatives end."""
+    """The iterates of a swing-up are faster than its guess and optimum. Derivatives fail above half of this excess."""
     limit = [np.inf]
     seen = without_derivatives(monkeypatch, lambda xs: np.abs(xs[:, 1]).max() > limit[0], error)
     problem = pendulum(running_cost=dd.QuadraticCost(R=[[1.0]]), final_cost=None, x_goal=[np.pi, 0], num_steps=60)
@@ -383,7 +383,7 @@ def test_where_no_way_goes_on_the_motion_so_far_is_kept_and_the_reason_told(monk
 @pytest.mark.parametrize("name", ["finger_edu.urdf", pytest.param("ur5_robot.urdf", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("approximation", ["sap", "lagged"])
 def test_an_arm_that_starts_beside_a_joint_limit_leaves_it(name, approximation):
-    """10 mrad from a limit, gravity on: the limit acts on the way, and SAP stops early; the arm is to leave it."""
+    """Start 10 mrad from a limit with gravity. The limit acts on the way, SAP stops early, and the arm has to leave."""
     model = example_robot(name, 0.01, approximation=approximation)
     random = np.random.default_rng(3)
     x0 = state_in_range(model, random, 0.0)

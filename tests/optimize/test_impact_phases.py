@@ -1,4 +1,4 @@
-"""Plans in phases through rigid impacts, replayed by SciPy with events, and planted errors that must be refused."""
+"""Tests of phased plans through rigid impacts: replays by SciPy with events, and planted errors that are refused."""
 
 import json
 import warnings
@@ -23,7 +23,7 @@ FOOT = [0, 0, -0.05]
 
 @pytest.fixture(scope="module")
 def thrown():
-    """A ball with two motors is to bounce into a target, least effort."""
+    """Solve for a ball with two motors that bounces into a target with the least effort."""
     plant, properties = Plant(0.01, "lagged"), contact_properties(2e4)
     plant.ball("ball", 1.0, 0.1, properties, "x", "z")
     plant.ground(properties)
@@ -39,7 +39,7 @@ def thrown():
 
 @pytest.fixture(scope="module")
 def landed():
-    """The hopper falls from 0.3 m with 0.4 m/s forwards, lands on its foot and comes to rest."""
+    """Solve for a hopper that falls from 0.3 m at 0.4 m/s forwards, lands on its foot and comes to rest."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
         model = dd.load_model("models/hopper.sdf", time_step=0.01, contact=False)
@@ -55,13 +55,13 @@ def landed():
 
 
 def inputs(phase):
-    """u(t) of a plan, its last value from its end on."""
+    """Return u(t) of a plan, with its last value after its end."""
     return lambda t: phase.transcribed.applied_at(np.array([min(t, phase.horizon)]))[0]
 
 
 @pytest.mark.solve
 def test_a_ball_bounces_into_its_target(thrown):
-    """Free flight and z' -> -e z' at z = r, by SciPy: the floor is met where it is, and not when the plan says."""
+    """SciPy integrates free flight and z' -> -e z' at z = r. The fall ends at the floor, not at the plan's time."""
     assert thrown.success, thrown.message
     down, up = (inputs(phase) for phase in thrown.phases)
 
@@ -84,7 +84,7 @@ def test_a_ball_bounces_into_its_target(thrown):
 
 
 class HopperByHand:
-    """The hopper by Drake's mass matrix, bias and Jacobian; its own impact and its own foot."""
+    """The hopper by Drake's mass matrix, bias and Jacobian, with an impact and a foot constraint of its own."""
 
     def __init__(self, model):
         self.plant, self.context = model.plant, model.plant.CreateDefaultContext()
@@ -140,7 +140,7 @@ def test_a_hopper_lands_where_another_simulation_lands(landed):
 
 
 def test_feedback_is_led_back_through_the_saltation_matrix(thrown):
-    """[[-e, 0], [-(1 + e) z'' / z', -e]] of height and speed, where both phases have their own push at the impact."""
+    """Check [[-e, 0], [-(1 + e) z'' / z', -e]] for height and speed, where the phases have different inputs."""
     motions = [phase.transcribed for phase in thrown.phases]
     xi = _across(thrown.problem.switches[0], *motions)
     v, e = thrown.phases[0].xs[-1, 3], RESTITUTION
@@ -159,7 +159,7 @@ def rejudged(solution, **fields):
 @pytest.mark.solve
 @pytest.mark.parametrize("seed", range(4))
 def test_a_plan_that_the_law_of_impact_does_not_have_is_refused(landed, seed):
-    """The landing said to be on a floor of less friction than its impulse needs, and by another restitution."""
+    """The floor has less friction than the landing's impulse needs, or the impact has another restitution."""
     assert rejudged(landed).success
     random, problem = np.random.default_rng(seed), landed.problem
     reset = problem.switches[0].reset
@@ -176,7 +176,7 @@ def test_a_plan_that_the_law_of_impact_does_not_have_is_refused(landed, seed):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_plan_whose_impact_comes_at_another_time_is_refused(thrown, seed):
-    """Its last stretch is another motion of the same equations: the floor is met earlier or later than it says."""
+    """The moved fall satisfies the same equations, but meets the floor earlier or later than the plan states."""
     shift = np.random.default_rng(seed).choice([-1, 1]) * 10 ** np.random.default_rng(seed).uniform(-3, -1)
     phases = list(thrown.phases)
     xs = np.array(phases[0].xs)
@@ -201,7 +201,7 @@ def test_what_is_no_impact_is_refused_early(landed):
 
 
 def test_the_saltation_matrix_of_a_bounce():
-    """[[-e, 0], [-(1 + e) g / v, -e]] of height and speed, at e = 0.8 and v = -3."""
+    """The matrix is [[-e, 0], [-(1 + e) g / v, -e]] for height and speed, at e = 0.8 and v = -3."""
     plant = Plant(0.01, "lagged")
     plant.ball("ball", 1.0, 0.1, contact_properties(2e4), "x", "z")
     plant.plant.AddJointActuator("push", plant.plant.GetJointByName("ball_x"))
@@ -215,7 +215,7 @@ def test_the_saltation_matrix_of_a_bounce():
 
 @pytest.mark.parametrize("angle", [0.0, 0.4, -1.1])
 def test_a_rod_that_strikes_with_its_end(angle):
-    """Without friction: P = (1 + e) v / (1 / m + r^2 / I), r the horizontal way to the end, I = m L^2 / 12."""
+    """Without friction P = (1 + e) v / (1 / m + r^2 / I), with the horizontal distance r of the end, I = m L^2 / 12."""
     m, length, e, v = 2.0, 1.2, 0.6, np.array([0.3, -1.5, -0.7])
     plant = Plant(0.01, "lagged")
     bodies = [plant.plant.AddRigidBody(name, SpatialInertia.Zero()) for name in ("one", "two")]
@@ -239,7 +239,7 @@ def test_a_rod_that_strikes_with_its_end(angle):
 
 @pytest.mark.slow
 def test_a_landing_is_made_again_and_a_forged_one_is_not(landed, tmp_path):
-    """Its impact is in the record: restitution, friction, point and law."""
+    """The record contains the impact's restitution, friction, point and law."""
     record = dd.save(landed, tmp_path / "run")
     assert record.verdict == "pass", record.sentence
     with warnings.catch_warnings():

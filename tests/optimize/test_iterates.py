@@ -1,4 +1,4 @@
-"""What callbacks get of a search: the motion at which the solver stands, and never an earlier one."""
+"""Tests of the iterates that callbacks get: the current motion of the solver, and never an earlier one."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 @pytest.fixture
 def every_point(monkeypatch):
-    """What is reported a few times a second is reported at once."""
+    """Report every iterate at once instead of a few times a second."""
     monkeypatch.setattr("drake_diff.optimize.program.REPORT_PERIOD", 0.0)
 
 
@@ -28,11 +28,11 @@ def swing():
 
 @pytest.fixture(scope="module")
 def pushed():
-    """A ball of 1 kg on the ground, pushed forward: it is to roll 5 mm."""
+    """Return the problem of pushing a ball of 1 kg on the ground so that it rolls 5 mm."""
     push = dd.model.BodyForce("push", "ball", direction=(1, 0, 0))
     model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.01, body_forces=[push])
     x0 = np.array(model.default_state)
-    x0[6] = 0.0995  # [m] of a radius of 0.1
+    x0[6] = 0.0995  # [m], for a radius of 0.1
     return dd.Problem(model, x0=x0, num_steps=5, running_cost=EFFORT, final_cost=lambda x: 1e4 * (x[4] - 0.005) ** 2)
 
 
@@ -49,13 +49,13 @@ def searched(problem, **options):
     ["ilqr", "shooting"],
 )
 def test_states_are_those_of_the_inputs_whose_cost_is_told(swing, method):
-    """The cost is h sum u^2, and the states are where Drake's steps lead, to the violation that is told."""
+    """The reported cost is h sum u^2, and the states are those of Drake's steps, up to the reported violation."""
     rows, solution = searched(swing, method=method)
     for row in rows:
         assert row.objective == pytest.approx(0.05 * float(np.sum(row.us**2)), rel=1e-12)
         np.testing.assert_allclose(row.times, 0.05 * np.arange(21), atol=1e-15)
         for x, u, after in zip(row.xs, row.us, row.xs[1:], strict=False):
-            # iLQR tries motions by the compiled form of the step, which is Drake's but for rounding
+            # iLQR uses the compiled form of the step, which differs from Drake's step only by rounding
             allowed = max(1e-9, 1.01 * row.primal_infeasibility)
             np.testing.assert_allclose(dd.step(swing.model, x, u), after, atol=allowed)
     assert len({row.us.tobytes() for row in rows}) > 1
@@ -63,7 +63,7 @@ def test_states_are_those_of_the_inputs_whose_cost_is_told(swing, method):
 
 
 def test_contacts_are_what_newton_asks_for_and_reading_them_changes_nothing(pushed):
-    """m (v' - v) / h = the weight, the push along the ball's own x axis, and the forces of contact."""
+    """m (v' - v) / h is the weight, the push along the ball's own x axis, and the contact forces."""
     rows = []
     watched = dd.solve(pushed, method="ilqr", callback=lambda row: rows.append((row, row.contacts)))
     assert len(rows) > 1

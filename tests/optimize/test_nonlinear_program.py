@@ -1,4 +1,4 @@
-"""SNOPT on a program of Drake: outcomes in our vocabulary, limits and Ctrl-C kept, its table read; and the watch."""
+"""Tests of SNOPT on a program of Drake: outcomes, limits, Ctrl-C, its table of iterations, and the watch."""
 
 import math
 import signal
@@ -34,7 +34,7 @@ def rosenbrock(z):
 
 
 def flat_bowl(z):
-    """Its minimum is of fourth order: no tolerance of 1e-30 is ever met there."""
+    """Return a cost with a minimum of fourth order, where a tolerance of 1e-30 is never met."""
     return (z[0] - 1) ** 4 + (z[1] + 2) ** 4
 
 
@@ -43,7 +43,7 @@ def run(p, *, guess=(0.0, 0.0), limits=UNLIMITED, report=None):
 
 
 def test_a_minimum_on_a_circle_is_found():
-    """min -x - y on x^2 + y^2 = 2 is at (1, 1)."""
+    """The minimum of -x - y on x^2 + y^2 = 2 is at (1, 1)."""
     p = program(lambda z: -z[0] - z[1], constraint=lambda z: z[0] ** 2 + z[1] ** 2, lower=2, upper=2)
     result = run(p, guess=(1.5, 0.5))
     assert result.outcome is Outcome.SOLVED, result.message
@@ -74,7 +74,7 @@ def test_the_time_limit_ends_it_at_the_best_point_so_far():
 
 
 def test_the_best_point_is_a_feasible_one_where_there_is_one(monkeypatch):
-    """Ctrl-C a few evaluations in: the guess is feasible, and no infeasible point may win by its lower cost."""
+    """Interrupt after a few evaluations. The guess is feasible, and no infeasible point may win by its lower cost."""
     monkeypatch.setattr("drake_diff.optimize.program.REPORT_PERIOD", 0.0)
     p = program(lambda z: z[0] + z[1], constraint=lambda z: z[0] ** 2 + z[1] ** 2, lower=2, upper=2)
     lines = []
@@ -91,7 +91,7 @@ def test_the_best_point_is_a_feasible_one_where_there_is_one(monkeypatch):
 
 
 def test_a_solve_works_outside_the_main_thread():
-    """Where no signal handler can be set."""
+    """A signal handler can be set only in the main thread."""
     found = []
     thread = threading.Thread(target=lambda: found.append(run(program(bowl))))
     thread.start()
@@ -134,7 +134,7 @@ SNOPT_TABLE = """
 
 
 def test_snopts_rows_are_read_where_their_columns_stand():
-    """The first row leaves Step blank; brackets mark what is within tolerance."""
+    """The first row leaves Step blank. Brackets mark values within tolerance."""
     rows = list(_snopt_rows(SNOPT_TABLE.splitlines()))
     assert [(r.iteration, r.objective, r.primal_infeasibility, r.dual_infeasibility) for r in rows] == [
         (0, 4.9503550e7, 7.1, 2.0),
@@ -156,12 +156,12 @@ def watch(time_limit=math.inf):
 
 
 def test_the_best_iterate_is_feasible_first_and_cheap_second():
-    """By cost + 1e6 * (violation - 1e-8): 5, then 1 + 1e6 (1e-3 - 1e-8), then 4, then 4.5."""
+    """cost + 1e6 * (violation - 1e-8) is 5, then 1 + 1e6 (1e-3 - 1e-8), then 4, then 4.5."""
     seen, z = watch(), np.zeros(1)
     for i, (cost, violation) in enumerate([(5.0, 0.0), (1.0, 1e-3), (4.0, 1e-8), (4.5, 0.0)]):
         z[0] = i
         seen.offer(z, cost, violation)
-    assert seen.best_of(np.array([9.0])).tolist() == [2.0]  # a copy: z itself went on
+    assert seen.best_of(np.array([9.0])).tolist() == [2.0]  # a copy, as z itself has changed
     seen.offer(np.array([7.0]), math.nan, 0.0)
     assert seen.best_of(np.array([9.0])).tolist() == [2.0]
 

@@ -1,4 +1,4 @@
-"""Obstacles: a plan keeps clear of them at its knots and in between, as Drake measures it; what does not is named."""
+"""Tests of obstacles: plans clear them at knots and in between, as measured by Drake, and violations are named."""
 
 import re
 import warnings
@@ -29,16 +29,16 @@ SMOOTH = dd.QuadraticCost(Q=np.diag([0, 0, 1.0, 1.0]), R=1e-2 * np.eye(2))
 
 
 def arm(obstacles, *, num_steps=30, time_step=0.05, **options):
-    """Two rods that swing from one side to the other, with an obstacle below where they would hang."""
+    """Return the problem of two rods that swing to the other side, past an obstacle where they would hang."""
     model = dd.load_model("models/double_pendulum.urdf", time_step=time_step)
     ends = {"x0": [-1.0, 0.1, 0, 0], "x_goal": [1.0, -0.1, 0, 0]}
     return dd.Problem(model, num_steps=num_steps, running_cost=SMOOTH, goals=obstacles, **(ends | options))
 
 
 def depth_by_drake(model, xs, obstacle, parts=1):
-    """[m] how deep the rods, of radius 0.02, are in the obstacle along the straight way between xs, in so many parts.
+    """Return how deep [m] the rods, of radius 0.02, enter the obstacle on `parts` places of each line between xs.
 
-    From Drake's own poses and points on the rods' axes, by no formula of the toolkit.
+    The depth follows from Drake's poses and points on the rods' axes, not from a formula of the toolkit.
     """
     plant, context = model.plant, model.plant.CreateDefaultContext()
     deepest = -np.inf
@@ -83,7 +83,7 @@ def check_that_it_goes_around(name, method):
 
 
 def finely(solution):
-    """The states of a collocated plan at 1 kHz."""
+    """Return the states of a collocated plan at 1 kHz."""
     return solution.transcribed.at(np.linspace(0, solution.horizon, 1 + round(1000 * solution.horizon)))[0]
 
 
@@ -102,14 +102,14 @@ def test_where_a_plan_jumps_through_between_knots_the_mesh_is_refined(monkeypatc
 
 
 def failing(solution, plant):
-    """The clearances that fail in a plant."""
+    """Return the failing clearance checks in a plant."""
     return [c for c in solution.plan_checks.failing if (c.what, c.plant) == ("clearance", plant)]
 
 
 def test_no_obstacle_is_so_thin_that_a_motion_jumps_over_it_unseen():
-    """Balls of 1 mm on the way of the lower rod's end, which moves by half of the rods' width and more between looks.
+    """Put balls of 1 mm on the way of the lower rod's end, which moves by half the rods' width and more between checks.
 
-    How deep the rods are in each is Pythagoras at 10,000 times.
+    The rods' depth in each ball is computed by Pythagoras at 10,000 times.
     """
     ends = {"num_steps": 4, "time_step": 0.4, "x0": [-1.5, 0.1, 0, 0], "x_goal": [1.5, -0.1, 0, 0]}
     plan = dd.solve(arm([], **ends), method="collocation", options=Options(refine=False))
@@ -124,18 +124,18 @@ def test_no_obstacle_is_so_thin_that_a_motion_jumps_over_it_unseen():
         assert nearest < 1e-3
         (found,) = failing(replace(plan, problem=arm([ball], **ends)), "between the nodes")
         assert found.where.startswith("lower and obstacle 'pin' at "), k
-        assert found.value > ball.margin, k  # it is entered
+        assert found.value > ball.margin, k  # the rod enters the ball
 
 
 def test_steps_are_looked_at_as_closely_and_a_motion_too_wild_to_be_seen_is_none():
     constraint = arm([dd.SphereObstacle([0, 0, -1.25], 1e-3, margin=1e-3, name="pin")]).kept_goals[0]
-    for turn in (0.5, 3.0, 40.0):  # in one step, past the pin in its middle
+    for turn in (0.5, 3.0, 40.0):  # in one step, with the pin in its middle
         steps = along_steps(np.array([0.0, 1.0]), np.array([[-turn / 2, 0, 0, 0], [turn / 2 + 0.3, 0, 0, 0]]))
         found = constraint.nearest(*steps, constraint.tolerance)
         assert found.where.startswith("lower and obstacle 'pin' at ")
         assert found.value > constraint.margin
     beside = along_steps(np.array([0.0, 1.0]), np.array([[0.03, 0, 0, 0], [1.0, 0, 0, 0]]))
-    assert constraint.nearest(*beside, constraint.tolerance).passes  # 0.03 of 1.25 m: clear of 21 mm
+    assert constraint.nearest(*beside, constraint.tolerance).passes  # 0.03 rad at 1.25 m, clear of 21 mm
     wild = along_steps(np.array([0.0, 1.0]), np.array([[0.03, 0, 0, 0], [1e9, 0, 0, 0]]))
     assert constraint.nearest(*wild, constraint.tolerance).value > constraint.margin
 
@@ -161,7 +161,7 @@ def test_a_plan_through_an_obstacle_is_refused_and_says_by_how_much_and_when():
     assert found.status is dd.Status.CONVERGED_NOT_VERIFIED
     deep = [c for r in through.replays for c in r.checks if c.what == "clearance" and c.value > 0.01]
     assert len(deep) >= 4
-    # the rod passes the middle of the ball, at 0.75 s, whose far side is 0.1 m and the capsule's radius away
+    # The rod passes the middle of the ball at 0.75 s. The ball's far side is 0.1 m and the capsule's radius away.
     assert all(" at 0.7" in c.where or " at 0.8" in c.where for c in deep), deep
 
 
@@ -223,14 +223,14 @@ BAR, TOP = "<box><size>0.04 0.04 0.26</size></box>", "<box><size>1 1 0.05</size>
 
 
 def reach(folder, at, *, margin=0.01, ignore=(), start=(0.0, 0.0), to=(0.3, 0.5)):
-    """From a table at the height of its start, or beyond it."""
+    """Return the problem of moving an arm from `start` to `to` with a table at `at`."""
     model = arm_beside_table(folder, BAR, TOP, at=at, actuators="all", gravity=[0, 0, 0])
     goal, cost = dd.SelfCollision(margin=margin, ignore=ignore), dd.QuadraticCost(R=np.eye(2))
     return dd.Problem(model, x0=[*start, 0, 0], x_goal=[*to, 0, 0], num_steps=20, running_cost=cost, goals=[goal])
 
 
 def overlaps(model, xs):
-    """Whether any two shapes that Drake lets collide do so on the way between some of xs, by its penetration query."""
+    """Return whether shapes that Drake lets collide overlap on the way between some of xs, by its penetration query."""
     twin, found = model.changed(contact=True).double, False
     for before, after in pairwise(xs):
         for share in np.linspace(0, 1, 10):
@@ -242,7 +242,7 @@ def overlaps(model, xs):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
 def test_a_pair_that_overlaps_at_the_start_leaves_a_plan_undecided(tmp_path):
-    """The table goes through the lower link: nothing says that the plan may."""
+    """The table passes through the lower link, and no option allows this."""
     at = (0.9, 0, 0.0)
     solution = dd.solve(reach(tmp_path, at))
     assert not solution.success
@@ -261,25 +261,25 @@ def test_a_pair_that_overlaps_in_the_file_is_kept_clear_from_a_start_that_is(tmp
 
 @pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
 def test_a_search_begins_with_a_motion_from_rest_to_rest_where_shapes_keep_clear(tmp_path):
-    """Of x(s) = 10 s^3 - 15 s^4 + 6 s^5 the largest rate is 15/8; without gravity its efforts do no work in all."""
+    """The largest rate of x(s) = 10 s^3 - 15 s^4 + 6 s^5 is 15/8. Without gravity the inputs do no work in total."""
     problem = reach(tmp_path, (0.3, 0, -0.1), start=(0.0, 0.2), to=(0.05, 1.0))
     guess, way, h = first_guess(problem, "collocation", None, 0), np.array([0.05, 0.8]), problem.time_step
     assert guess.xs[10] == pytest.approx([0.025, 0.6, *(15 / 8 * way / problem.start_horizon)])
     assert guess.xs[[0, -1], 2:] == pytest.approx(np.zeros((2, 2)))
     power = np.sum(guess.us * (guess.xs[1:, 2:] + guess.xs[:-1, 2:]) / 2, axis=1)
-    assert np.abs(power.sum() * h) < 0.02 * np.abs(power).sum() * h  # as 20 intervals integrate it
+    assert np.abs(power.sum() * h) < 0.02 * np.abs(power).sum() * h  # to the accuracy of 20 intervals
     assert np.abs(power).max() > 0
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning")
 def test_a_plan_passes_over_a_table_and_not_through_it(tmp_path):
-    """Half a metre wide and 0.05 m high, 0.1 m below the arm: capsules around it would reach to where the arm is."""
+    """The table is half a metre wide, 0.05 m high, and 0.1 m below the arm. Capsules around it would reach the arm."""
     solution = dd.solve(reach(tmp_path, (0.3, 0, -0.1), to=(0.05, 1.0)))
     assert solution.success, solution
     with pytest.raises(InputError, match=r"x_goal: .*and top come .* nearer than their margin"):
         reach(tmp_path, (0.3, 0, -0.1), to=(0.5, 0.0))
-    around = dd.solve(reach(tmp_path, (0.5, 0, -0.45), to=(2.5, 0.0)))  # from above it to below it
+    around = dd.solve(reach(tmp_path, (0.5, 0, -0.45), to=(2.5, 0.0)))  # from above the table to below it
     assert around.success
     assert overlaps(around.problem.model, np.linspace(around.xs[0], around.xs[-1], 100))
     assert not overlaps(around.problem.model, around.xs)

@@ -1,4 +1,4 @@
-"""Costates, multipliers and the sensitivity of a plan's end against closed forms, and plans that are no optimum."""
+"""Tests of costates, multipliers and end sensitivities against closed forms, and of plans that are not optimal."""
 
 import dataclasses
 
@@ -26,9 +26,9 @@ def move(**changes):
 
 
 def exact_costates():
-    """(N+1, 2) of the least effort from rest at 0 to rest at 1, by symplectic Euler: x' = A x + B u.
+    """Return the costates (N+1, 2) of the least effort from rest at 0 to rest at 1 by symplectic Euler, and the norms.
 
-    x_N = sum_k A^(N-1-k) B u_k = G u is the goal, u = G' (G G')^-1 goal, and 2 h u + G' mu = 0.
+    For x' = A x + B u, x_N = sum_k A^(N-1-k) B u_k = G u is the goal, u = G' (G G')^-1 goal, 2 h u + G' mu = 0.
     """
     A, B = np.array([[1, H], [0, 1]]), np.array([H**2, H])
     powers = [np.linalg.matrix_power(A, N - k) for k in range(N + 1)]
@@ -49,20 +49,20 @@ def test_effort_with_a_hard_goal_has_the_costates_of_the_closed_form(method):
 
 
 def test_without_constraints_the_costate_is_the_costs_own_gradient():
-    """Final cost x_N: d cost / d x_0 is the first row of A^N, whatever the inputs."""
+    """For the final cost x_N, d cost / d x_0 is the first row of A^N for any inputs."""
     problem = move(x_goal=None, final_cost=lambda x: x[0])
     solution = dataclasses.replace(dd.solve(problem, method="ilqr"), us=np.zeros((N, 1)), xs=np.zeros((N + 1, 2)))
     found = solution.optimality
     assert found.multipliers.size == 0
     assert found.state_norms[0] == pytest.approx(np.hypot(1, N * H), rel=1e-12)
     assert found.state_norms[-1] == pytest.approx(1.0, rel=1e-12)
-    assert found.gradient == pytest.approx(N * H**2, rel=1e-12)  # by u_0: h^2 N
+    assert found.gradient == pytest.approx(N * H**2, rel=1e-12)  # with respect to u_0: h^2 N
     assert found.ratio == pytest.approx(1.0, rel=1e-12)
 
 
 @each_row("seed", [0, 1, 2])
 def test_a_plan_that_reaches_the_goal_by_a_detour_is_no_stationary_point(seed):
-    """Inputs moved within the null space of the goal: the goal is met, the effort is more than it need be."""
+    """The inputs are moved within the null space of the goal, so that the goal is met with more effort than needed."""
     solution = dd.solve(move(), method="shooting")
     A, B = np.array([[1, H], [0, 1]]), np.array([H**2, H])
     G = np.array([np.linalg.matrix_power(A, N - 1 - k) @ B for k in range(N)]).T
@@ -76,7 +76,7 @@ def test_a_plan_that_reaches_the_goal_by_a_detour_is_no_stationary_point(seed):
 
 
 def test_a_bound_may_push_inwards_only():
-    """At u = 1 = u_upper the cost (u - 2)^2 pushes outwards: optimal. At u = 1 = u_lower it pulls away: it is not."""
+    """At u = 1 = u_upper the cost (u - 2)^2 pushes outwards, which is optimal. At u = 1 = u_lower it is not."""
     cost = dd.QuadraticCost(R=[[1.0]], u_ref=[2.0])
     found = []
     for side in ("u_upper", "u_lower"):
@@ -90,7 +90,7 @@ def test_a_bound_may_push_inwards_only():
 
 @each_row("side", [1, -1])
 def test_a_state_on_a_bound_pushes_only_inwards(side):
-    """Speed 0.5 all the way, the cost wants 2: a bound above may hold it there, a bound below may not."""
+    """The speed is 0.5 all the way and the cost wants 2. An upper bound explains this, but a lower bound does not."""
     limit = {"x_upper": [np.inf, 0.5]} if side > 0 else {"x_lower": [-np.inf, 0.5]}
     problem = move(
         x0=[0, 0.5],
@@ -125,12 +125,12 @@ def test_plain_dynamics_have_neither():
 
 
 def test_parameters_and_a_free_start_are_variables_too(thrown):
-    """The ball reaches the place at the cost of none: the optimum is a zero of the residual, so nothing is left."""
+    """The ball reaches its goal without cost. The optimum is a zero of the residual, so that the gradient is 0."""
     assert thrown.optimality.gradient < 1e-6
 
 
 def test_norms_beyond_all_numbers_are_infinite():
-    """40 steps, each of which takes differences times 1e10."""
+    """Each of 40 steps multiplies differences by 1e10."""
     d = differentiate_step(dd.load_model(MODELS / "cart_pole.urdf", time_step=H), np.zeros(4), [0.0])
     norms = final_state_norms([dataclasses.replace(d, A=1e10 * np.eye(4))] * 40)
     assert norms[-2] == 1e10

@@ -1,4 +1,4 @@
-"""Problems in phases: closed forms, a known gait, and planted violations that the judge must refuse."""
+"""Tests of problems in phases: closed forms, a known gait, and planted violations that must be refused."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ def floor():
 
 
 def bouncing(height, restitution, bounces):
-    """A ball that is dropped, `bounces` times thrown back, and ends where it stands still in the air."""
+    """Return the problem of a ball that is dropped, bounces `bounces` times, and ends at rest in the air."""
     kept = {"num_steps": 4, "horizon": (0.01, 5.0), "bounds": dd.Bounds(x_lower=[0.0, np.nan])}
     fall = dd.Problem(ball(), x0=[height, 0.0], constraints=floor(), **kept)
     flights = [dd.Problem(ball(), x0=[0.0, 2.0], constraints=floor(), **kept) for _ in range(bounces - 1)]
@@ -36,7 +36,7 @@ def bouncing(height, restitution, bounces):
 
 
 def walker(slope):
-    """The simplest walker, whose hip is free: its only input is held at 0."""
+    """Return the simplest walker, whose hip is free, as its only input is fixed at 0."""
 
     def rates(x, u):
         a = np.sin(x[0] - slope)
@@ -85,12 +85,12 @@ def test_a_ball_bounces_as_newton_says(height, restitution, bounces):
     np.testing.assert_allclose([phase.horizon for phase in solution.phases], durations, rtol=1e-6)
     np.testing.assert_allclose(solution.starts, np.cumsum([0, *durations[:-1]]), rtol=1e-6)
     top = height * restitution ** (2 * bounces)
-    assert solution.phases[-1].xs[-1, 0] == pytest.approx(top, rel=1e-6, abs=1e-7)  # rows are kept to 1e-8 each
+    assert solution.phases[-1].xs[-1, 0] == pytest.approx(top, rel=1e-6, abs=1e-7)  # each row is met to 1e-8
     assert solution.link_error < 1e-8
 
 
 def test_two_halves_of_a_problem_are_the_whole():
-    """Least effort over 1 m in 1 s costs 12 / m^2 (block at rest to rest), wherever it is cut."""
+    """The least effort of a block over 1 m in 1 s from rest to rest is 12 / m^2, wherever the problem is cut."""
     block, effort = dd.Dynamics(lambda x, u: [x[1], u[0]], 2, 1), dd.QuadraticCost(R=[[1.0]])
     parts = [
         dd.Problem(block, x0=[0, 0], num_steps=6, horizon=(0.1, 0.9), running_cost=effort),
@@ -105,7 +105,7 @@ def test_two_halves_of_a_problem_are_the_whole():
 def test_the_simplest_walker_walks_its_known_gait(walked):
     """Garcia, Chatterjee, Ruina and Coleman, "The Simplest Walking Model", 1998: the long gait at a slope of 0.009.
 
-    Published: stance angle 0.200310900544287, its rate -0.199832473004977, step time 3.882.
+    The published stance angle is 0.200310900544287, its rate -0.199832473004977, and the step time 3.882.
     """
     assert walked.success, walked.message
     step = walked.phases[0]
@@ -117,7 +117,7 @@ def test_the_simplest_walker_walks_its_known_gait(walked):
 
 
 def test_a_load_that_is_dropped_leaves_with_its_states():
-    """A cart with a pendulum that is let go: four states become two. The cart alone costs what a block costs."""
+    """A cart drops its pendulum, so that four states become two. The cart alone has the cost of a block."""
 
     def loaded(x, u):
         return [x[2], x[3], u[0] + x[1], -10 * x[1] - u[0]]
@@ -149,19 +149,19 @@ def test_a_reset_without_an_expression_is_differentiated_too():
 
 
 def rejudged(solution, phases):
-    """The same with other phases, judged as after a solver that says it found a solution."""
+    """Judge the solution with other phases, as after a solver that reports a solution."""
     result = NlpResult(np.zeros(0), Outcome.SOLVED, "IPOPT: Solve Succeeded", ())
     return judged_phases(replace(solution, phases=tuple(phases)), result)
 
 
 def changed(phase, **fields):
-    """A phase with other arrays; its own status is kept, so that only what is measured of all phases can refuse it."""
+    """Return a phase with other arrays and its own status, so that only the measures of all phases can refuse it."""
     return replace(phase, **fields)
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_a_planted_jump_between_phases_is_refused(bounced, seed):
-    """The second phase is moved as a whole: by itself it stays a motion of the dynamics, but the link is broken."""
+    """A phase is moved as a whole. It is still a motion of the dynamics, but the link is violated."""
     random = np.random.default_rng(seed)
     which, shift = int(random.integers(1, 3)), random.choice([-1, 1]) * 10 ** random.uniform(-4, -1)
     xs = np.array(bounced.phases[which].xs) + np.array([shift, 0.0])
@@ -171,12 +171,12 @@ def test_a_planted_jump_between_phases_is_refused(bounced, seed):
     assert again.status is dd.Status.CONVERGED_NOT_VERIFIED
     assert "is missed by" in repr(again)
     assert again.link_error == pytest.approx(abs(shift), rel=1e-3)
-    assert rejudged(bounced, bounced.phases).success  # and as it was it holds
+    assert rejudged(bounced, bounced.phases).success  # the unchanged plan holds
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_plan_for_another_reset_is_refused(bounced, seed):
-    """The plan of one restitution, said to be that of another."""
+    """The plan for one restitution is judged with another one."""
     factor = 0.8 + np.random.default_rng(seed).choice([-1, 1]) * 10 ** np.random.default_rng(seed).uniform(-4, -1)
     other = bouncing(1.0, 0.8, 2)
     other = dd.optimize.PhasedProblem(other.phases, resets=[np.diag([1.0, -factor]), np.diag([1.0, -0.8])])
@@ -186,7 +186,7 @@ def test_a_plan_for_another_reset_is_refused(bounced, seed):
 
 
 def test_a_plan_that_leaves_its_guard_is_refused():
-    """A ball that is let go too late: the guard does not hold at the end of the phase, which its own judge says."""
+    """A ball is released too late. The phase's own checks report that the guard is violated at the end of the phase."""
     problem = bouncing(1.0, 0.8, 1)
     solution = dd.solve(problem)
     for seed in range(4):
@@ -232,7 +232,7 @@ def test_coarse_meshes_are_refined():
 
 
 def test_maps_come_in_phases_too():
-    """Savings under one rate of interest, then, half of it spent, under another."""
+    """Savings grow under one rate of interest. Half of them is spent, and the rest grows under another rate."""
 
     def saving(rate):
         return dd.optimize.DiscreteMap(lambda x, u: [rate * x[0] + u[0]], 1, 1, u_lower=[0], u_upper=[10])
@@ -244,7 +244,7 @@ def test_maps_come_in_phases_too():
     ]
     solution = dd.solve(dd.optimize.PhasedProblem(parts, resets=[[[0.5]]]))
     assert solution.success, solution.message
-    gain = np.array([0.5 * 1.44 * 1.1**2, 0.5 * 1.44 * 1.1, 0.5 * 1.44, 1.2, 1.0])  # of each payment, in the end
+    gain = np.array([0.5 * 1.44 * 1.1**2, 0.5 * 1.44 * 1.1, 0.5 * 1.44, 1.2, 1.0])  # the final value of each payment
     found = np.concatenate([phase.us[:, 0] for phase in solution.phases])
     np.testing.assert_allclose(found, 20 * gain / (gain @ gain), rtol=1e-6)  # least squares
 

@@ -1,4 +1,4 @@
-"""Plain dynamics x' = f(x, u) through the one door: status, measures, certificates, artifact, what is refused."""
+"""Tests of plain dynamics x' = f(x, u): status, measures, certificates, artifact, and refused problems."""
 
 import dataclasses
 import types
@@ -23,7 +23,7 @@ EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 
 def block_move(**changes):
-    """Rest to rest over 1 m in 1 s: u = 6 - 12 t, and the integral of u^2 is 12."""
+    """Return a move from rest to rest over 1 m in 1 s, for which u = 6 - 12 t and the integral of u^2 is 12."""
     fields = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 10, "horizon": 1.0, "running_cost": EFFORT}
     return dd.Problem(BLOCK, **fields | changes)
 
@@ -37,7 +37,7 @@ def test_auto_solves_plain_dynamics_by_collocation():
     assert solution.inputs_at_knots[:, 0] == pytest.approx(6 - 12 * solution.times, abs=1e-6)
     assert (solution.horizon, solution.time_step) == (1.0, 0.1)
     assert {certificate.verdict for certificate in solution.certificates} == {"agree"}
-    assert len(solution.certificates) == 8  # 3 of the guess, 5 of the result
+    assert len(solution.certificates) == 8  # 3 at the guess, 5 at the result
 
 
 def test_a_plant_as_plain_dynamics_is_solved_as_the_model_is(load):
@@ -50,7 +50,7 @@ def test_a_plant_as_plain_dynamics_is_solved_as_the_model_is(load):
 
 
 def test_the_integrated_motion_is_the_closed_form_from_another_input():
-    """Under u = 1 from rest: x = t^2 / 2, wherever the plan says that it goes."""
+    """Under u = 1 from rest, x = t^2 / 2, whatever the states of the plan are."""
     solution = dd.solve(block_move())
     ones = {"us": np.ones((10, 1)), "us_mid": np.ones((10, 1)), "u_final": np.ones(1)}
     other = dataclasses.replace(solution, **ones)
@@ -62,7 +62,7 @@ def test_the_integrated_motion_is_the_closed_form_from_another_input():
 
 
 def test_a_wrong_derivative_of_the_users_is_named_and_no_success():
-    """One percent off in dv'/du: the solver still converges, on a first derivative that is not the function's."""
+    """dv'/du is one percent off. The solver still converges, but with a derivative that is not the function's."""
 
     def linearize(knots):
         values, rows = BLOCK.linearize(knots)
@@ -128,7 +128,7 @@ def test_a_run_of_plain_dynamics_has_no_body_to_draw(tmp_path):
 
 
 def test_a_mesh_on_which_the_plan_does_not_hold_is_refined_by_itself():
-    """Too coarse by its errors, by an input between the nodes (9/8 of its bound), and by a constraint there."""
+    """Meshes are too coarse by their errors, or by an input (9/8 of its bound) or a constraint between the nodes."""
     swing = dd.Dynamics(lambda x, u: [x[1], u[0] - 10 * np.sin(x[0])], nx=2, nu=1)
     up = dd.Problem(swing, x0=[0, 0], x_goal=[np.pi, 0], num_steps=4, horizon=2.0, running_cost=EFFORT)
     slow = block_move(num_steps=4, constraints=dd.Constraint(lambda x: x[1], upper=1.25, name="slow"))
@@ -140,7 +140,7 @@ def test_a_mesh_on_which_the_plan_does_not_hold_is_refined_by_itself():
         assert rounds[0][0] == 4 < len(found.us) == rounds[-1][0]
         assert f"the mesh was refined from 4 to {len(found.us)} intervals" in repr(found)
         if problem is up:
-            assert found.cost == pytest.approx(fine.cost, rel=0.07)  # which is refined until 1e-6
+            assert found.cost == pytest.approx(fine.cost, rel=0.07)  # `fine` is refined to 1e-6
 
 
 def test_a_plan_that_holds_is_not_refined():
@@ -152,7 +152,7 @@ def test_a_plan_that_holds_is_not_refined():
 
 @each_row("refine", [None, True])
 def test_where_a_finer_mesh_fails_the_last_motion_is_kept(monkeypatch, refine):
-    """The first mesh is solved, and every finer one is said to have none."""
+    """The first mesh is solved, and every finer one is made to fail."""
     swing = dd.Dynamics(lambda x, u: [x[1], u[0] - 10 * np.sin(x[0])], nx=2, nu=1)
     problem = dd.Problem(swing, x0=[0, 0], x_goal=[np.pi, 0], num_steps=4, horizon=2.0, running_cost=EFFORT)
     coarse = dd.solve(problem, options=Options(refine=False))
@@ -176,7 +176,7 @@ def test_where_a_finer_mesh_fails_the_last_motion_is_kept(monkeypatch, refine):
             assert solution.status is dd.Status.CONVERGED_NOT_VERIFIED
             assert "intervals no motion was found" in repr(solution)
             assert "the motion on 4 is kept" in repr(solution)
-        else:  # without the limit it would have gone further, which is what `verify` does
+        else:  # without the limit, as in `verify`, the solve would continue
             assert solution.status is dd.Status[outcome.name]
 
 
@@ -201,7 +201,7 @@ def test_a_models_mesh_is_refined_and_its_plan_replayed(load, tmp_path):
     assert fine.replays[0].goal_error == pytest.approx(coarse.replays[0].goal_error, abs=0.05)
     record = dd.save(fine, tmp_path / "run")
     verification = dd.verify(tmp_path / "run")
-    assert verification.verdict == "undecided"  # for the constraint's function alone
+    assert verification.verdict == "undecided"  # only because of the constraint's function
     assert verification.complaints == ()
     assert verification.checked > 700
     assert record.problem["num_steps"] == 20
@@ -211,7 +211,7 @@ def test_a_models_mesh_is_refined_and_its_plan_replayed(load, tmp_path):
 
 
 def test_a_midpoint_beyond_a_bound_or_constraint_is_measured():
-    """There and back in one interval: what both knots keep, its middle breaks."""
+    """The motion goes there and back in one interval. Both knots satisfy the limit, and the midpoint violates it."""
     solution = dd.solve(block_move(num_steps=1, x_goal=None, final_cost=lambda x: 100 * x[0] ** 2, x0=[0, 1.2]))
     middle = solution.transcribed.xs_mid[0, 0]
     assert middle > solution.xs[1, 0] + 0.05
@@ -222,11 +222,11 @@ def test_a_midpoint_beyond_a_bound_or_constraint_is_measured():
     assert dataclasses.replace(solution, problem=kept).constraint_violation == pytest.approx(0.05, rel=1e-9)
 
 
-# ------------------------------------------------------------------------------ what is printed
+# ------------------------------------------------------------------------------ singular slopes and rounding
 
 
 def test_the_shortest_way_of_a_car_that_begins_along_an_axis_is_found():
-    """Dubins: two quarter turns of unit radius and 0.2 m between them; at heading 0 cos has no slope."""
+    """Dubins' path is two quarter turns of unit radius with 0.2 m between them. At heading 0 cos has no slope."""
     car = dd.Dynamics(lambda x, u: [np.cos(x[2]), np.sin(x[2]), u[0]], 3, 1, u_lower=[-1], u_upper=[1])
     problem = dd.Problem(car, x0=np.zeros(3), x_goal=[0, 2.2, np.pi], num_steps=30, horizon=(0.3, 20), running_cost=1.0)
     solution = dd.solve(problem)
@@ -235,15 +235,15 @@ def test_the_shortest_way_of_a_car_that_begins_along_an_axis_is_found():
 
 
 def test_rounding_of_terms_that_cancel_is_no_other_value():
-    """Numbers with derivatives are added one by one, plain ones in pairs: what is left of 1000 x 0.07 - 70 differs."""
-    kept = np.full((3, 1), 0.7)  # a plan that keeps a constraint has no larger value of it
+    """Numbers with derivatives are added one by one, plain ones in pairs. 1000 x 0.07 - 70 rounds differently."""
+    kept = np.full((3, 1), 0.7)  # a feasible plan has no larger value of the constraint
     function = Pointwise("sum", lambda x, u: np.sum(np.full(1000, 0.1) * x[0]) - 70, 1, (), kept)
     plain, carried = function.values(kept), function.linearize(kept)[0]
     assert np.all(np.abs(carried - plain) > 1e-9 * np.abs(carried))
 
 
 def test_other_values_are_seen_beside_an_infinite_slope():
-    """The root of x - 1 has one at 1; a function with another value under derivatives is refused all the same."""
+    """The root of x - 1 has an infinite slope at 1. A function with another value under derivatives is refused too."""
 
     def other(x, u):
         return (x[0] - 1) ** 0.5 + (0.0 if isinstance(x[0], float) else 1e-3)

@@ -1,4 +1,4 @@
-"""Problems and costs: what they mean, and what is refused before anything runs."""
+"""Tests of problems and costs: their meaning, and problems that are refused before anything runs."""
 
 import math
 
@@ -131,7 +131,7 @@ def test_bad_problems_are_named(load, changes, words):
     ],
 )
 def test_what_cannot_be_meant_is_refused_by_a_named_error(load, changes):
-    """A tuple for Bounds, an input of infinity at least, no names, a goal of gaps and no cost, a complex position."""
+    """Test a tuple for Bounds, an input of infinity at least, no names, an empty goal and no cost, a complex number."""
     with pytest.raises(InputError, match=r"expected .*got"):
         cart_pole(load, **changes)
 
@@ -153,17 +153,17 @@ def test_controls_without_actuators_are_refused(load):
 
 
 def test_a_tolerance_is_of_a_state_itself_and_of_its_way(load):
-    """A wheel that turns 1,000 rad gives a pole nothing; what does not travel has 1 % of its own range."""
+    """A wheel's 1,000 rad do not affect a pole's tolerance. A state that does not travel has 1 % of its own range."""
     xs = np.linspace([0.0, 0.0, 0.0, 0.0], [1.0, np.pi, 0.2, 1000.0], 11)
     xs[5, 2] = 3.0
     problem = cart_pole(load, goal_tolerance={"slide_x": 0.002})
     assert problem.state_scales(xs) == pytest.approx([1.0, np.pi, 3.0, 1000.0], rel=1e-12)
     assert problem.goal_tolerances(xs) == pytest.approx([0.002, 0.01 * np.pi, 0.03, 10.0], rel=1e-12)
     assert "to within 0.002 of slide_x" in str(problem)
-    for limit in (math.inf, 1e30):  # as files have them that mean no limit
+    for limit in (math.inf, 1e30):  # values that files use for no limit
         bounds = dd.Bounds(x_lower=4 * [-limit], x_upper=4 * [limit])
         problem = cart_pole(load, bounds=bounds, x_goal=[1.0, 0, 0, 0])
-        still = problem.state_scales(np.outer([0, 1], [1.0, 0, 0, 0]))  # what need not travel: 0.01 rad, 1e-6 of 1 m
+        still = problem.state_scales(np.outer([0, 1], [1.0, 0, 0, 0]))  # least scales: 0.01 rad, 1e-6 of 1 m
         assert still == pytest.approx([1, 0.01, *np.array([1e-6, 0.01]) / problem.start_horizon], rel=1e-9)
 
 
@@ -208,7 +208,7 @@ def test_a_cost_without_a_derivative_where_the_search_begins_is_named_with_its_k
 
 
 def test_a_quaternion_and_its_negative_are_one_goal(load):
-    """A goal on the other side is turned to the side of x0, and a state on either side is at no distance from it."""
+    """A goal on the other side is turned to the side of x0. A state on either side is at a distance of 0 from it."""
     model = load("sphere_on_ground.sdf")
     x0 = np.array(model.default_state)
     x0[:4], free = [0.8, 0.6, 0.0, 0.0], np.arange(model.nx) == 10
@@ -221,7 +221,7 @@ def test_a_quaternion_and_its_negative_are_one_goal(load):
 
 
 def test_a_quaternion_of_zeros_is_no_orientation(load):
-    """Its direction would be that of any state."""
+    """The direction of such a quaternion would be that of any state."""
     model = load("sphere_on_ground.sdf")
     goal = np.where(np.arange(model.nx) < 4, 0.0, model.default_state)
     fields = {"optimize": ("initial_state",), "initial_state_mask": np.arange(model.nx) == 10}
@@ -230,7 +230,7 @@ def test_a_quaternion_of_zeros_is_no_orientation(load):
 
 
 def test_a_body_that_turns_on_has_the_signs_of_the_waypoint_before(load):
-    """Quarter turns about z: at three of them a quaternion is nearer to the negative of that of x0."""
+    """Make quarter turns about z. At three of them the quaternion is nearer to the negative of x0's quaternion."""
     model = load("sphere_on_ground.sdf")
     angles = np.array([0.0, np.pi / 2, np.pi, 3 * np.pi / 2, 2 * np.pi])
     states = np.tile(np.asarray(model.default_state), (5, 1))
@@ -244,4 +244,4 @@ def test_a_body_that_turns_on_has_the_signs_of_the_waypoint_before(load):
         np.testing.assert_allclose(problem.waypoints[knot], state, rtol=0, atol=1e-15)  # sums of rounded angles
     np.testing.assert_allclose(
         problem.x_goal, states[4], rtol=0, atol=1e-15
-    )  # a whole turn, whose quaternion is that of x0 negated
+    )  # a whole turn, whose quaternion is the negative of x0's

@@ -1,4 +1,4 @@
-"""Jacobians and Hessians of whole programs against central differences, whatever they are made of."""
+"""Tests of the Jacobians and Hessians of whole programs against central differences."""
 
 import numpy as np
 import pytest
@@ -92,7 +92,7 @@ PROBLEMS = [coupled, with_rates, with_everything, co_design, of_a_tree, in_phase
 
 
 def check(program, *, free=slice(None), tolerance=1e-6):
-    """Of the cost, the rows and the Lagrangian, relative to the largest entry."""
+    """Check the derivatives of the cost, the rows and the Lagrangian, relative to the largest entry."""
     made, random = program.derivatives(exact=not program.why_not), np.random.default_rng(0)
     z, weights = random.uniform(0.4, 1, program.size), random.standard_normal(len(program.sides[0]))
 
@@ -147,7 +147,7 @@ JOINED = {"trajectory_cost": lambda xs, us: xs[3, 0] * xs[4, 1] + us[2, 0] ** 3}
 
 @pytest.mark.parametrize("changes", [{}, JOINED], ids=["plain", "trajectory_cost"])
 def test_derivatives_of_a_program_of_steps_are_differences(changes):
-    """Steps do not lead from state to state, as in the midst of a search."""
+    """The steps do not lead from state to state, as during a search."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
     problem = dd.Problem(
         model,
@@ -174,7 +174,7 @@ def test_derivatives_of_a_program_of_steps_are_differences(changes):
 
 @pytest.mark.parametrize("unit", [1.0, 1e6])
 def test_a_row_that_changes_by_rounding_alone_is_as_large_as_its_values(unit):
-    """As the distance of a shape from the axis that it turns about, whose slope is 1e-17."""
+    """An example is the distance of a shape from the axis that it turns about, whose slope is 1e-17."""
 
     def rows(x):
         return np.array([0.5 * unit + 1e-17 * unit * x[0], 2e-5 * unit * x[1]])

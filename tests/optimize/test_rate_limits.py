@@ -1,4 +1,4 @@
-"""Limits of how fast inputs and accelerations change: least times in closed form, and what breaks them is seen."""
+"""Tests of limits on the rates of inputs and accelerations: least times in closed form, and detected violations."""
 
 from dataclasses import replace
 
@@ -27,12 +27,12 @@ def least_time(way, most, rate, couplings, **more):
 @each_row("limit", [InputRate(2.0), Jerk({"x1": 2.0})])
 @each_row("way", [0.1, 1.0])
 def test_the_least_time_from_rest_to_rest_is_that_of_the_s_curve(way, limit):
-    """|a| <= 1, |a'| <= 2: four ramps, of (way / (2 J))^(1/3) each, with plateaus where these would pass A."""
+    """|a| <= 1 and |a'| <= 2 give four ramps of (way / (2 J))^(1/3) each, and plateaus where they would pass A."""
     A, J = 1.0, 2.0
     wanted = 4 * (way / (2 * J)) ** (1 / 3) if way < 2 * A**3 / J**2 else A / J + np.sqrt((A / J) ** 2 + 4 * way / A)
     solution = dd.solve(least_time(way, A, J, limit))
     assert solution.success
-    assert solution.horizon == pytest.approx(wanted, rel=1e-3)  # its switches are not at the knots of 40 intervals
+    assert solution.horizon == pytest.approx(wanted, rel=1e-3)  # the input switches between the knots of 40 intervals
     assert solution.horizon > wanted * (1 - 1e-6)
 
 
@@ -47,13 +47,13 @@ def test_a_pendulum_swings_up_with_a_slow_motor(method):
     solution = dd.solve(problem, method=method)
     assert solution.success, solution.message
     assert np.max(np.abs(np.diff(solution.us[:, 0]))) <= 10 * 0.05 + 1e-6
-    for replay in solution.replays:  # feedback goes no faster either
+    for replay in solution.replays:  # feedback has the same limit
         assert np.max(np.abs(np.diff(replay.motion.us[:, 0]))) <= 10 * 0.05 * 1.05
 
 
 @pytest.mark.slow
 def test_steps_of_another_length_have_their_own_rates():
-    """A horizon of 2 s in 40 steps of a model of 0.02 s: inputs change from one 0.05 s to the next."""
+    """A horizon of 2 s in 40 steps of a model of 0.02 s. Inputs change from one step of 0.05 s to the next."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
     problem = dd.Problem(
         model, x0=[0, 0], x_goal=[1, 0], num_steps=40, horizon=2.0, running_cost=EFFORT, couplings=InputRate(4.0)
@@ -77,12 +77,12 @@ def test_an_arm_moves_without_jerks_and_its_motion_is_smooth_between_its_knots()
     times = np.linspace(0, solution.horizon, 2001)
     knots = np.hstack([state.vector_values(times).T, given.vector_values(times).T])
     accelerations = problem.dynamics.values(knots)[:, 2:]
-    # By differences of the plant's accelerations; the verdict allows 1 % of the limit
+    # By differences of the plant's accelerations. The check allows 1 % of the limit.
     assert np.max(np.abs(np.diff(accelerations, axis=0))) / times[1] <= 60.6
 
 
 def test_whatever_breaks_a_limit_is_seen():
-    """Inputs that are moved at random: what they break is known from the slopes of the parabolas through them."""
+    """Inputs are moved at random. The expected violations are from the slopes of the parabolas through them."""
     for limit in (InputRate(2.0), Jerk({"x1": 2.0})):
         solution = dd.solve(least_time(1.0, 1.0, 2.0, limit, horizon=3.0, running_cost=EFFORT))
         assert solution.success
@@ -137,7 +137,7 @@ def test_what_is_no_limit_is_refused_at_once(couplings, error, told):
 
 @each_row("limit, by", [(InputRate(8.0), "goal"), (Jerk(40.0), ["pole.mass"])])
 def test_a_sensitivity_counts_them(limit, by):
-    """Also those of jerks, whose rows change with the parameters of the model."""
+    """Check this also for jerks, whose rows change with the parameters of the model."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
     problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=EFFORT, couplings=limit)
     found = dd.sensitivity(dd.solve(problem), by)

@@ -1,4 +1,4 @@
-"""A plan that touches nothing is no optimum of what it does not touch; and what is not asked, or cannot be, is left."""
+"""Tests of plans without contact, which are no optimum of a cost on bodies that they do not touch."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def hard():
 
 
 def slides(*, touch=True, spring=False, rests=False):
-    """A driven body of 1 kg and a free one of 0.5 kg on a rail along x, which may touch; or the free one on a floor."""
+    """Return a driven 1 kg body and a free 0.5 kg one on a rail along x that may touch, or the free one on a floor."""
     made = Plant(H)
     plant = made.plant
     pusher = plant.AddRigidBody("pusher", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
@@ -52,7 +52,7 @@ def weights(*diagonal):
     return np.diag(np.array(diagonal, dtype=float))
 
 
-# What asks the ball to be elsewhere, each of another form, some of the pusher too.
+# Costs that ask the ball to be at another position, each of another form, some of them with the pusher.
 ASKING = {
     "running": {"running_cost": dd.QuadraticCost(Q=weights(0, 1, 0, 0), x_ref=[0, 1.5, 0, 0], R=[[1e-3]])},
     "of both": {"running_cost": dd.QuadraticCost(Q=weights(1, 1, 1, 1), x_ref=[0.2, 1.5, 0, 0], R=[[1e-3]])},
@@ -100,7 +100,7 @@ def of_a_plan(problem, us):
 
 @each_row("seed", range(8))
 def test_wherever_a_plan_stays_apart_it_is_silent_and_wherever_it_pushes_it_is_not(seed):
-    """The pusher ends |u| N^2 h^2 / 2 from its start, the ball begins 0.2 + gap away: closed form tells which."""
+    """The pusher moves by |u| N^2 h^2 / 2, and the ball starts 0.2 + gap away. This determines whether they touch."""
     random = np.random.default_rng(seed)
     gap, way = random.uniform(0.05, 0.5), random.uniform(0.05, 0.8)
     if abs(way - gap) < 0.02:
@@ -118,7 +118,7 @@ def test_a_ball_that_is_where_the_cost_wants_it_is_not_asked_to_move(place, sile
 
 
 def test_what_gives_way_under_its_own_weight_is_not_asked_to_move():
-    """0.5 kg on 5 kN/m sinks by 1 mm less what the step leaves: the cost is of that alone, and of the pusher."""
+    """0.5 kg on 5 kN/m sinks by 1 mm, less the step's residual. The cost is only on this depth and on the pusher."""
     model = slides(rests=True)
     x0 = dd.rollout(model, [1.0, 0.0999, 0, 0], np.zeros((200, 1))).xs[-1]
     wants = dd.QuadraticCost(Q=weights(1, 10, 0, 0), x_ref=[1.3, x0[1] + 5e-4, 0, 0], R=[[1e-3]])
@@ -149,7 +149,7 @@ def test_a_spring_between_two_bodies_carries_the_gradient():
 
 
 def test_what_is_moved_in_other_motions_alone_is_named():
-    """A bead on a turntable at rest: r'' = r w^2 has no first derivative by w at w = 0, and turning flings it out."""
+    """A bead on a turntable at rest has r'' = r w^2, with no first derivative at w = 0. Turning moves it outwards."""
     made = Plant(H)
     plant = made.plant
     table = plant.AddRigidBody("table", SpatialInertia.SolidSphereWithMass(1.0, 0.2))
@@ -165,7 +165,7 @@ def test_what_is_moved_in_other_motions_alone_is_named():
 
 
 def test_the_noise_of_differences_is_no_reach():
-    """Boxes on the ground are differenced, and SAP stops early: the far box has entries of 1e-13 to 1e-9."""
+    """Boxes on the ground need differences, and SAP stops early, so that the far box has entries of 1e-13 to 1e-9."""
     made = Plant(0.01, "lagged")
     plant = made.plant
     pusher = plant.AddRigidBody("pusher", SpatialInertia.SolidSphereWithMass(1.0, 0.1))

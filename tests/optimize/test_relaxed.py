@@ -1,4 +1,4 @@
-"""Relaxed contact: inverse dynamics over positions, their slopes, what a stage finds, and the true plant's plan."""
+"""Tests of relaxed contact: inverse dynamics, their derivatives, the result of a stage, and the true plant's plan."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def softness(plant, reach=0.02, force=20.0):
 
 
 def in_contact(count, seed=1):
-    """States of a Solo12 whose feet touch, and velocities after the step that are no rollout's."""
+    """Return states of a Solo12 with its feet in contact, and velocities after the step that are not from a rollout."""
     model, random = example_robot("solo12.urdf", 0.01, feet=True, approximation="sap"), np.random.default_rng(seed)
     xs = np.array([state_in_contact(model, random) for _ in range(count)])
     q, v = xs[:, : model.nq], xs[:, model.nq :]
@@ -32,7 +32,7 @@ def in_contact(count, seed=1):
 
 @each_row("name", ["solo12.urdf", "ur5_robot.urdf"])
 def test_where_nothing_is_near_the_force_is_what_drakes_step_was_given(name):
-    """Drake's own step from a random state under random inputs: the motors give them, and nothing else acts."""
+    """In Drake's own step from a random state with random inputs, the motors apply the only forces."""
     random = np.random.default_rng(3)
     model = example_robot(name, 0.01, feet=name == "solo12.urdf", approximation="sap")
     plant = relaxed_plant(model)
@@ -41,7 +41,7 @@ def test_where_nothing_is_near_the_force_is_what_drakes_step_was_given(name):
     nq = model.nq
     states = x[None, :nq], x[None, nq:], x_next[None, nq:]
     found = plant.forces(*states, softness(plant, reach=1e-4), slopes=False).tau[0]
-    assert found == pytest.approx(plant.actuation @ u, abs=1e-8)  # of tens of N m: Drake's solver's rounding over h
+    assert found == pytest.approx(plant.actuation @ u, abs=1e-8)  # of tens of N m: rounding of Drake's solver over h
 
 
 def test_slopes_are_those_of_differences():
@@ -69,7 +69,7 @@ def test_slopes_are_those_of_differences():
 
 
 def test_a_ball_is_pushed_by_the_laws_own_formula(load):
-    """F log2(1 + exp(-phi / reach)) straight up where nothing moves, and its weight is what is missing beside it."""
+    """The force is F log2(1 + exp(-phi / reach)) straight up at rest. tau is the weight minus this force."""
     model = load("sphere_on_ground.sdf", time_step=0.01)
     plant = relaxed_plant(model)
     x = np.array(model.default_state)
@@ -102,7 +102,7 @@ def test_small_motions_between_positions_are_what_drakes_step_moves_by():
 
 
 def test_the_gradient_of_the_augmented_cost_is_that_of_differences():
-    """With a goal, bounds of inputs, and multipliers of what no motor gives, from a motion that is none."""
+    """The problem has a goal, input bounds, and multipliers of forces without motors. The motion is infeasible."""
     model, q, v, _ = in_contact(1)
     random, N = np.random.default_rng(0), 8
     x0 = np.concatenate([q[0], v[0]])
@@ -136,7 +136,7 @@ def test_the_gradient_of_the_augmented_cost_is_that_of_differences():
 
 
 def test_least_effort_far_from_contact_is_the_closed_form(two_spheres):
-    """The pusher alone: sum u^2 of x_N = h^2 / m sum (N - k) u_k = d is least at d^2 m^2 / (h^4 sum (N - k)^2)."""
+    """For the pusher, sum u^2 with x_N = h^2 / m sum (N - k) u_k = d is at least d^2 m^2 / (h^4 sum (N - k)^2)."""
     h, N, distance = 0.02, 20, -0.3
     goal = np.full(4, np.nan)
     goal[0] = distance
@@ -163,9 +163,9 @@ def test_the_true_plant_follows_what_was_rolled_out(two_spheres):
 @pytest.mark.slow
 @pytest.mark.parametrize(("time_step", "clearance"), [(0.01, 0.05), (0.05, None)])
 def test_a_hopper_that_stands_gets_half_a_metre_on(time_step, clearance):
-    """The guess stays on the ground: a line to the goal. With a clearance on the way it has to hop.
+    """The guess is a line to the goal and stays on the ground. With a clearance on the way the hopper has to hop.
 
-    At 20 ms it lands too deep for a plan that is verified: at 2 m/s a foot moves 4 cm in a step.
+    At 20 ms it lands too deep for a plan that is verified, as a foot moves 4 cm in a step at 2 m/s.
     """
     model = dd.load_model(MODELS / "hopper.sdf", time_step=time_step)
     x0, goal, count = np.zeros(8), np.full(8, np.nan), round(1 / time_step)
@@ -173,7 +173,7 @@ def test_a_hopper_that_stands_gets_half_a_metre_on(time_step, clearance):
     goal[[0, 1]], goal[4:] = 0.5, 0.0
     above = {} if clearance is None else {round(0.6 * count): {"z": 0.5 + clearance, "leg": 0.45}}
     cost = dd.QuadraticCost(R=1e-3 * np.eye(2), u_ref=[0, 10])
-    near = {"z_x": 1e-3, "z_v": 1e-2}  # it stands up by a tenth of a millimetre
+    near = {"z_x": 1e-3, "z_v": 1e-2}  # the hopper rises by a tenth of a millimetre
     problem = dd.Problem(
         model, x0=x0, x_goal=goal, num_steps=count, running_cost=cost, waypoints=above, goal_tolerance=near
     )
@@ -192,11 +192,11 @@ def test_what_has_no_relaxed_contact_is_refused_by_name(load, two_spheres):
         dd.solve(free, method="ilqr", options=Options(continuation="relaxed"))
     hydroelastic = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.01, contact_model="hydroelastic")
     assert isinstance(relaxed_plant(hydroelastic), Refusal)
-    assert "couplers" in relaxed_plant(example_robot("panda.urdf")).reason  # of its two fingers
+    assert "couplers" in relaxed_plant(example_robot("panda.urdf")).reason  # for its two fingers
 
 
 def test_the_schedule_is_read_off_the_model(two_spheres):
-    """Of two balls of radius 0.1 m: from that on, each reach half of the last; a third of the weight of 0.5 kg."""
+    """The reach starts at the balls' radius, 0.1 m, and is halved per stage. The force is 1/3 of 0.5 kg's weight."""
     problem = push(two_spheres(), gap=0.3, goal=1.0)
     stages = relaxed_schedule(problem, read_relaxed_plant(problem))
     assert [stage.reach for stage in stages] == pytest.approx(0.1 / 2.0 ** np.arange(5), rel=1e-9)

@@ -1,4 +1,4 @@
-"""Replays of a plan: closed forms for what they measure, and plans that must not pass."""
+"""Tests of replays of a plan: closed forms of their measures, and plans that must not pass."""
 
 import dataclasses
 import math
@@ -39,7 +39,7 @@ def block(write_urdf, *, time_step=H, count=COUNT, **fields):
 
 
 def plan_of(problem, us):
-    """The plan that the plant's own steps make of `us`."""
+    """Return the plan of `us` by the plant's own steps."""
     us = np.asarray(us, dtype=float)
     xs = dd.rollout(problem.model, problem.x0, us).xs if problem.model.nu else None
     with np.errstate(all="ignore"):
@@ -48,7 +48,7 @@ def plan_of(problem, us):
 
 
 def broken_variants(plan, found):
-    """The plants in which a plan has to hold and holds under no control."""
+    """Return the plants in which a plan has to hold, but holds under no control."""
     variants = deciding(plan, found)
     return [v for v in variants if not any(r.holds for r in found if r.variant == v and r.control != GAINS_ALONE)]
 
@@ -58,7 +58,7 @@ def by_name(found, variant, control):
 
 
 def test_half_the_step_leads_a_block_elsewhere_by_the_closed_form(write_urdf):
-    """Symplectic Euler under a constant force: x_N = u h^2 N (N + 1) / 2 = u T (T + h) / 2."""
+    """Symplectic Euler under a constant force gives x_N = u h^2 N (N + 1) / 2 = u T (T + h) / 2."""
     problem = block(write_urdf, x_goal=[math.nan, math.nan], final_cost=lambda x: x[0])
     found = replays(plan_of(problem, np.full((COUNT, 1), 2.0)))
     total, steps = H * COUNT, (H, H / 2, H / 8)
@@ -66,11 +66,11 @@ def test_half_the_step_leads_a_block_elsewhere_by_the_closed_form(write_urdf):
         end = by_name(found, f"in steps of {h:g} s", "open loop").motion.xs[-1, 0]
         assert end == pytest.approx(2.0 * total * (total + h) / 2, rel=1e-9)
     assert by_name(found, "in continuous time", "open loop").motion.xs[-1, 0] == pytest.approx(total**2, rel=1e-9)
-    assert len({r.variant for r in found}) == 4  # nothing can touch
+    assert len({r.variant for r in found}) == 4  # without contact
 
 
 def test_feedback_holds_what_open_loop_loses(load):
-    """Balancing upright: what half the step changes grows by exp(4.4 t) open loop, and decays under TVLQR."""
+    """Balance upright. The change by half the step grows as exp(4.4 t) open loop, and decays under TVLQR."""
     model = load("pendulum.urdf", time_step=0.02)
     balance = LQR(model, [np.pi, 0], [0], Q=np.eye(2), R=[[1.0]])
     us = dd.rollout(model, [np.pi - 0.5, 0], policy=balance, num_steps=150).us
@@ -101,7 +101,7 @@ def test_the_plants_own_step_gives_the_plan_back(write_urdf):
     ],
 )
 def test_a_plan_that_misses_what_is_asked_is_told(write_urdf, fields, what, where, value):
-    """u = 2 for 1 s: x ends at 1.05 (symplectic), v at 2, x_10 = 0.275."""
+    """With u = 2 for 1 s, x ends at 1.05 (symplectic Euler), v at 2, and x_10 = 0.275."""
     problem = block(write_urdf, **{"final_cost": lambda x: x[0], **fields})
     plan = plan_of(problem, np.full((COUNT, 1), 2.0))
     found = by_name(replays(plan), f"in steps of {H:g} s", "open loop")
@@ -113,14 +113,14 @@ def test_a_plan_that_misses_what_is_asked_is_told(write_urdf, fields, what, wher
 @pytest.mark.slow
 @each_row("i", range(4))
 def test_one_coordinate_off_is_refused_and_named(load, i):
-    """A cart-pole's own motion, asked to end at its own last state but for one coordinate, within one bound as well."""
+    """The goal is the motion's own last state except for one coordinate, or one coordinate has to satisfy a bound."""
     model, us = load("cart_pole.urdf"), np.linspace(40, -20, 15)[:, None]
     x0 = np.array([0.1, 0.5, -0.3, 1.0])
     xs = dd.rollout(model, x0, us).xs
     plan = plan_of(dd.Problem(model, x0=x0, num_steps=15, final_cost=lambda x: x[0]), us)
     scale = plan.scale[i]
-    sign = np.sign((xs[:, i] - x0[i])[np.argmax(np.abs(xs[:, i] - x0[i]))])  # the side that it moves away to
-    for factor in (0.9, 1.1):  # a bound that is nearer is a scale of its own where that state need not travel
+    sign = np.sign((xs[:, i] - x0[i])[np.argmax(np.abs(xs[:, i] - x0[i]))])  # the side to which it moves
+    for factor in (0.9, 1.1):  # a nearer bound is itself the scale of a state that need not travel
         goal, limits = np.array(xs[-1]), np.full(4, sign * np.inf)
         goal[i] += sign * factor * SAME * scale
         limits[i] = sign * (np.max(sign * xs[1:, i]) - factor * STATE_TOLERANCE * scale)
@@ -137,7 +137,7 @@ def test_one_coordinate_off_is_refused_and_named(load, i):
 
 
 def test_the_plans_own_step_allows_one_percent_and_finer_ones_five_or_three_under_feedback(write_urdf):
-    """u = 2 for 1 s ends at 1 + h in steps of h: 1.05 in the plan's own, 1.025 in halves."""
+    """u = 2 for 1 s ends at 1 + h in steps of h, which is 1.05 in the plan's own steps and 1.025 in halves."""
     us, own, finer = np.full((COUNT, 1), 2.0), f"in steps of {H:g} s", f"in steps of {H / 2:g} s"
     for variant, control, end, tolerance in (
         (own, "open loop", 1.05, SAME),
@@ -154,7 +154,7 @@ def test_the_plans_own_step_allows_one_percent_and_finer_ones_five_or_three_unde
 
 
 def test_a_replay_is_compared_with_the_plan_where_nothing_is_asked_of_its_end(write_urdf):
-    """Soft costs alone: u = 2 for 1 s ends at 1 + h in steps of h and costs 4; a plan that says else is refused."""
+    """With soft costs only, u = 2 for 1 s ends at 1 + h in steps of h and costs 4. Plans that differ are refused."""
     us, own = np.full((COUNT, 1), 2.0), f"in steps of {H:g} s"
     plan = plan_of(block(write_urdf, final_cost=lambda x: 0.0 * x[0]), us)
     fine = by_name(replays(plan), f"in steps of {H / 8:g} s", "open loop")
@@ -167,8 +167,8 @@ def test_a_replay_is_compared_with_the_plan_where_nothing_is_asked_of_its_end(wr
 
 
 def test_what_an_eighth_of_the_step_alone_shows_is_refused(write_urdf):
-    """u = 2 ends at 1 + h: at a goal of 1.05 it misses by 2.5, 4.4 and, in continuous time, 5 of 5.25 hundredths."""
-    for beyond, holds in ((0.0, True), (0.01, False)):  # at 1.06 h and h/2 miss 1 and 3.5, h/8 misses 5.4 hundredths
+    """u = 2 ends at 1 + h. A goal of 1.05 is missed by 2.5, 4.4 and, in continuous time, 5 of 5.25 hundredths."""
+    for beyond, holds in ((0.0, True), (0.01, False)):  # at 1.06, h and h/2 miss by 1 and 3.5, h/8 by 5.4 hundredths
         problem = block(write_urdf, x_goal=[1.05 + beyond, math.nan])
         plan = plan_of(problem, np.full((COUNT, 1), 2.0))
         found = [r for r in replays(plan) if r.control == "open loop"]
@@ -177,7 +177,7 @@ def test_what_an_eighth_of_the_step_alone_shows_is_refused(write_urdf):
 
 
 def test_the_regulator_is_the_same_in_finer_steps(write_urdf):
-    """The running weights are of a sum over steps; as an integral they give gains that settle as h shrinks."""
+    """The running weights are for a sum over steps. As an integral they give gains that converge as h shrinks."""
     problem = block(write_urdf, x_goal=[1, 0])
     us = np.concatenate([np.full((COUNT // 2, 1), 4.0), np.full((COUNT // 2, 1), -4.0)])
     plan = plan_of(problem, us)
@@ -187,22 +187,22 @@ def test_the_regulator_is_the_same_in_finer_steps(write_urdf):
         policy = regulator(plan, plan.model_at(parts), xs, finer)
         away = [float(policy(xs[0] + d, 0.0)[0] - policy(xs[0], 0.0)[0]) for d in np.eye(2) * 0.01]
         first.append(away)
-    assert first[0] == pytest.approx(first[1], rel=0.05)  # O(h): they would be 2 apart in a sum's weights
+    assert first[0] == pytest.approx(first[1], rel=0.05)  # O(h); a sum's weights would give a factor of 2
 
 
 def test_energy_out_of_nothing_is_told(load):
-    """Semi-implicit Euler of an oscillator is unstable beyond h w = 2: the swing grows without a motor's work."""
+    """Semi-implicit Euler of an oscillator is unstable beyond h w = 2. The swing grows without work of a motor."""
     model = load("pendulum.urdf", time_step=0.55)  # w = sqrt(g / l) = 4.4: h w = 2.4
-    problem = dd.Problem(model, x0=[0.02, 0], num_steps=4, final_cost=lambda x: x[0])  # later it is no small swing
+    problem = dd.Problem(model, x0=[0.02, 0], num_steps=4, final_cost=lambda x: x[0])  # later the swing is not small
     plan = plan_of(problem, np.zeros((4, 1)))
     check = energy_check(plan.open_loop)
     assert (check.where, check.passes) == ("gained", False)
-    found = replays(plan)  # which finer steps do not repeat
+    found = replays(plan)  # finer steps do not repeat this motion
     assert broken_variants(plan, found)[-2:] == ["in steps of 0.06875 s", "in continuous time"]
 
 
 def test_a_deep_overlap_is_told_and_another_approximation_is_tried(tmp_path):
-    """A ball of 1 kg and radius 0.1 m on a ground of 100 N/m: it sinks m g / k = 0.098 m, a quarter is 0.05 m."""
+    """A ball of 1 kg and radius 0.1 m on 100 N/m sinks by m g / k = 0.098 m. A quarter of its diameter is 0.05 m."""
     path = tmp_path / "ball.sdf"
     path.write_text(BALL)
     model = dd.load_model(path, time_step=0.002, ground=0.5)
@@ -213,12 +213,12 @@ def test_a_deep_overlap_is_told_and_another_approximation_is_tried(tmp_path):
     steps = [f"in steps of {h:g} s" for h in (0.002, 0.001, 0.00025)]
     assert [r.variant for r in found] == [*steps, "with lagged contact"]
     assert found[3].approximation == "lagged"
-    assert 0.02 < found[3].penetration < 0.05  # Hunt-Crossley dissipation, which sap leaves out, sinks slower
+    assert 0.02 < found[3].penetration < 0.05  # Hunt-Crossley dissipation, which sap ignores, slows the ball down
     assert found[3].holds
     for replay in found[:3]:
         (deep,) = [c for c in replay.checks if not c.passes]
         assert (deep.what, deep.tolerance, deep.unit) == ("penetration", pytest.approx(0.05), "m")
-        assert 0.09 < replay.penetration < 0.2  # near the static depth, and less than twice that, the undamped swing
+        assert 0.09 < replay.penetration < 0.2  # near the static depth, below twice this depth without damping
 
 
 BALL = """<sdf version="1.9"><model name="ball"><link name="ball"><inertial><mass>1</mass></inertial>
@@ -231,7 +231,7 @@ BALL = """<sdf version="1.9"><model name="ball"><link name="ball"><inertial><mas
 
 
 def test_a_plan_that_lives_from_one_law_of_contact_is_refused_in_the_other_in_fine_steps_too(tmp_path):
-    """A ball that is to lie still after its fall: sap's relaxation time stops it, an undamped spring throws it back."""
+    """A ball has to lie still after its fall. The relaxation time of sap stops it, an undamped spring does not."""
     path = tmp_path / "ball.sdf"
     damped = """10000</drake:point_contact_stiffness><drake:relaxation_time>0.1</drake:relaxation_time>
     <drake:hunt_crossley_dissipation>0</drake:hunt_crossley_dissipation>"""
@@ -248,7 +248,7 @@ def test_a_plan_that_lives_from_one_law_of_contact_is_refused_in_the_other_in_fi
     assert all(r.holds for r in found[:-2]), found
     assert list(broken_variants(plan, found)) == [other[1]]
     assert [(c.what, c.where) for c in found[-1].checks if not c.passes] == [("goal", "z_x")]
-    assert found[-1].motion.xs[-1, 0] > 0.11  # 0.1 s to the ground, 0.03 s on its spring, and on the way up
+    assert found[-1].motion.xs[-1, 0] > 0.11  # after 0.1 s to the ground and 0.03 s on its spring it is on the way up
 
 
 def test_inputs_that_cannot_be_stepped_are_missing_not_zero(write_urdf):
@@ -263,7 +263,7 @@ def test_inputs_that_cannot_be_stepped_are_missing_not_zero(write_urdf):
 
 
 def test_a_collocated_plan_is_replayed_in_finer_steps_until_two_hold(write_urdf):
-    """4 intervals: at h = 0.25 the simulator ends h T / 2 times the mean slope elsewhere, at h/16 within 5 %."""
+    """With 4 intervals of h = 0.25 the simulator ends off by h T / 2 times the mean slope, with h/16 within 5 %."""
     problem = block(write_urdf, time_step=0.25, count=4, x_goal=[1, 0])
     solution = dd.solve(problem, method="collocation", options=Options(scheme="hermite_simpson"))
     assert solution.success, solution.message
@@ -274,8 +274,8 @@ def test_a_collocated_plan_is_replayed_in_finer_steps_until_two_hold(write_urdf)
 
 
 def test_a_frame_that_has_to_be_exact_is_replayed_in_steps_that_are_fine_enough_for_it(write_urdf):
-    """x = t^2 under 2 N on 1 kg: in steps of h the simulator ends h further. 5 mm allow h/32, not h/16, of 0.1 s."""
-    fixed = dd.Bounds(u_lower=[2.0], u_upper=[2.0])  # feedback cannot help
+    """x = t^2 under 2 N on 1 kg. Steps of h end h further. A tolerance of 5 mm allows 0.1 s / 32, not 0.1 s / 16."""
+    fixed = dd.Bounds(u_lower=[2.0], u_upper=[2.0])  # feedback has no effect
     goals = [dd.FrameGoal("block", [1, 0, 0])]
     problem = block(write_urdf, time_step=0.1, count=10, bounds=fixed, goals=goals)
 
@@ -293,7 +293,7 @@ def test_a_frame_that_has_to_be_exact_is_replayed_in_steps_that_are_fine_enough_
 
 
 def test_a_solve_whose_replay_fails_is_no_success(load):
-    """A discrete swing-up in steps of 0.2 s is right at 0.2 s alone."""
+    """A discrete swing-up in steps of 0.2 s holds in these steps only."""
     problem = dd.Problem(
         load("cart_pole.urdf", time_step=0.2),
         x0=np.zeros(4),
@@ -318,7 +318,7 @@ def cart_pole_swing_up():
 
 
 def test_gains_of_half_steps_keep_a_smooth_plan_in_finer_ones_as_well_as_their_own():
-    """In steps of 5 ms each regulator brings the cart-pole up; in such of 20 ms they are the same one."""
+    """In steps of 5 ms both regulators bring the cart-pole up. In steps of 20 ms they are the same."""
     plan = cart_pole_swing_up().plan
     ends = {}
     for parts in (2, 8):
@@ -326,13 +326,13 @@ def test_gains_of_half_steps_keep_a_smooth_plan_in_finer_ones_as_well_as_their_o
         for known, policy in ((False, regulator(plan, model, xs, us)), (True, plan.follower(parts).law())):
             motion = dd.rollout(model, xs[0], policy=policy, num_steps=len(us))
             ends[parts, known] = np.abs(plan.problem.goal_error(motion.xs[-1])) / plan.scale
-    assert np.allclose(ends[2, True], ends[2, False], rtol=1e-9)  # neither reaches the limits of the input
-    assert np.max(ends[8, True]) < 0.01  # of 3 % allowed
+    assert np.allclose(ends[2, True], ends[2, False], rtol=1e-9)  # no input limit is reached
+    assert np.max(ends[8, True]) < 0.01  # 3 % are allowed
     assert np.max(ends[8, False]) < 0.01
 
 
 def test_a_smooth_plan_that_is_wrong_is_refused_whatever_its_gains():
-    """Under feedback about states that go elsewhere from the middle on, and under inputs that are cut off."""
+    """Test feedback about states that deviate from the middle on, and inputs that are clipped."""
     plan = cart_pole_swing_up().plan
     assert not list(broken_variants(plan, replays(plan)))
 
@@ -354,7 +354,7 @@ def test_a_smooth_plan_that_is_wrong_is_refused_whatever_its_gains():
 
 
 def test_a_command_is_held_over_a_step_of_the_controller(write_urdf):
-    """u_k - K_k (x - x_k) by the plant's state at the controller's steps, within the limits of the input."""
+    """The command is u_k - K_k (x - x_k) with the state at the controller's steps, within the limits of the input."""
     us = np.concatenate([np.full((COUNT // 2, 1), 4.0), np.full((COUNT // 2, 1), -4.0)])
     plan = plan_of(block(write_urdf, x_goal=[1, 0], bounds=dd.Bounds(u_lower=[-4], u_upper=[4])), us)
     motion = plan.follower().in_model("in eighths", lambda: plan.model_at(8), 8)[1].motion
@@ -368,7 +368,7 @@ def test_a_command_is_held_over_a_step_of_the_controller(write_urdf):
 
 
 def test_a_collocated_plan_holds_open_loop_only_where_its_motion_costs_what_is_reported():
-    """x' = 8 x + u: errors grow by exp(8), to less than 1 % of x, which a final cost of 1e6 x^2 doubles a cost by."""
+    """Errors of x' = 8 x + u grow by exp(8) to less than 1 % of x. With a final cost of 1e6 x^2 this doubles a cost."""
     unstable, steep = dd.Dynamics(lambda x, u: [8 * x[0] + u[0]], nx=1, nu=1), 1e6
     fields = {"num_steps": 40, "running_cost": lambda x, u: u[0] ** 2, "final_cost": lambda x: steep * x[0] ** 2}
     problem = dd.Problem(unstable, x0=[1.0], horizon=1.0, **fields)
@@ -379,13 +379,13 @@ def test_a_collocated_plan_holds_open_loop_only_where_its_motion_costs_what_is_r
     state, cost = (c for c in solution.following if c.feedback is None)
     assert state.passes
     assert (cost.what, cost.passes) == ("replayed cost", False)
-    assert cost.value == pytest.approx(steep * (end**2 - solution.xs[-1, 0] ** 2), rel=0.1)  # 1e-6 a step grows too
+    assert cost.value == pytest.approx(steep * (end**2 - solution.xs[-1, 0] ** 2), rel=0.1)  # 1e-6 per step grows too
     assert solution.feedback == "TVLQR"
     assert solution.message == "converged: holds under TVLQR in continuous time"
 
 
 def test_the_cost_beside_a_plans_is_by_the_integral():
-    """A motion 0.1 further on costs 0.1 (3 T + 5) more where 3 x are paid by time, and 5 x at the end."""
+    """A motion shifted by 0.1 costs 0.1 (3 T + 5) more, for a running cost of 3 x and a final cost of 5 x."""
     drift = dd.Dynamics(lambda x, u: [u[0]], nx=1, nu=1)
     fields = {"running_cost": lambda x, u: u[0] ** 2 + 3 * x[0], "final_cost": lambda x: 5 * x[0]}
     motion = dd.solve(dd.Problem(drift, x0=[0.0], num_steps=7, horizon=2.0, **fields)).transcribed
@@ -393,7 +393,7 @@ def test_the_cost_beside_a_plans_is_by_the_integral():
 
 
 def test_finer_steps_have_the_gains_of_the_plans_own_parameters(load):
-    """A rod of 3 kg where the file has another mass: gains of halves, beside which offsets are looked for."""
+    """The rod has 3 kg instead of the file's mass. The gains are those of half steps, to which offsets are added."""
     model = load("pendulum.urdf", time_step=0.02)
     heavy = select(model, {"pole.mass": 3.0})
     us, x0 = np.full((20, 1), 2.0), np.array([0.1, 0.0])

@@ -1,4 +1,4 @@
-"""More first guesses: the cheapest verified plan is kept, and all optima are listed."""
+"""Tests of restarts: the cheapest verified plan is returned, and all optima are listed."""
 
 import signal
 
@@ -13,7 +13,7 @@ pytestmark = pytest.mark.solve
 
 
 def around(size=0.5, **asked):
-    """A point at constant speed past a disk that lies on its way: to the left, or to the right and longer."""
+    """Return the problem of passing a disk at constant speed, on the left, or on the right by a longer way."""
     move = dd.Dynamics(lambda x, u: [u[0], u[1]], nx=2, nu=2)
     disk = dd.Constraint(lambda x: (x[0] - 1) ** 2 + (x[1] - 0.1) ** 2, lower=size**2, name="disk")
     effort = dd.QuadraticCost(R=np.eye(2))
@@ -23,7 +23,7 @@ def around(size=0.5, **asked):
 
 
 def length(side, size=0.5):
-    """Of the shortest way past the disk, below it (1) or above it (-1): two tangents and an arc."""
+    """Return the length of the shortest way past the disk, below it (1) or above it (-1): two tangents and an arc."""
     middle = np.array([1.0, 0.1 * side])
     total = 0.0
     angles = []
@@ -36,7 +36,7 @@ def length(side, size=0.5):
 
 
 def test_the_ways_around_a_disk_are_listed():
-    """The cost of a way is the square of its length: one way on each side of the disk."""
+    """The cost of a way is the square of its length. There is one way on each side of the disk."""
     solution = dd.solve(around(), restarts=6)
     assert solution.success
     costs = [each.cost for each in solution.optima]
@@ -70,11 +70,11 @@ def test_discrete_methods_restart_too(write_urdf, method):
     )
     solution = dd.solve(problem, method=method, restarts=2)
     assert solution.success
-    assert [optimum["count"] for optimum in solution.options["optima"]] == [3]  # a convex problem has one
+    assert [optimum["count"] for optimum in solution.options["optima"]] == [3]  # a convex problem has one optimum
 
 
 def test_ctrl_c_ends_restarts_and_keeps_the_plan():
-    """Pressed in the third search: the verified plan stays, and what came after it is told."""
+    """Interrupt the third search. The verified plan is returned, and the interruption is reported."""
     begun = []
 
     def press(row):

@@ -1,4 +1,4 @@
-"""The Riccati recursion against a problem by hand, and the whole linear-quadratic problem as one linear system."""
+"""Tests of the Riccati recursion against a problem by hand, and the whole problem as one linear system."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from drake_diff.optimize.ilqr.riccati import LinearQuadratic, follow, slope_alon
 
 
 def problem(seed=0, count=6, n=3, m=2, *, gaps=1.0, free=0.0, bound=np.inf):
-    """Random and convex; x_0 within +-`free`, inputs within +-`bound`."""
+    """Return a random convex problem with x_0 within +-`free` and inputs within +-`bound`."""
     random = np.random.default_rng(seed)
     roots = random.standard_normal((count + 1, n + m, n + m))
     gradients, hessians = random.standard_normal((count + 1, n + m)), roots @ roots.swapaxes(1, 2) + 0.1 * np.eye(n + m)
@@ -26,7 +26,7 @@ def problem(seed=0, count=6, n=3, m=2, *, gaps=1.0, free=0.0, bound=np.inf):
 
 
 def minimum(p):
-    """(dxs (N+1, n), dus (N, m)) of the whole problem: its conditions of optimality as one dense linear system."""
+    """Return (dxs (N+1, n), dus (N, m)) from the optimality conditions of the whole problem as one linear system."""
     n, (count, m) = p.num_states, p.lower.shape
     moves = p.start_lower < p.start_upper
     xs = np.arange((count + 1) * n).reshape(-1, n)
@@ -51,7 +51,7 @@ def minimum(p):
 
 
 def followed(p, policy, start):
-    """(dxs, dus) under the policy's feedback."""
+    """Return (dxs, dus) under the policy's feedback."""
     xs, us = [start], []
     for k in range(len(p.F)):
         us.append(policy.feedforward[k] + policy.feedback[k] @ xs[-1])
@@ -66,7 +66,7 @@ def value(p, xs, us):
 
 
 def one_step(bound=np.inf):
-    """x' = x + u, cost x^2/2 + 3 u + u^2/2 + 2 x' + x'^2/2."""
+    """Return x' = x + u with the cost x^2/2 + 3 u + u^2/2 + 2 x' + x'^2/2."""
     one = np.ones((1, 1))
     return LinearQuadratic(
         F=np.ones((1, 1, 2)),
@@ -85,7 +85,7 @@ def one_step(bound=np.inf):
     [
         (np.inf, 0.0, -2.5, -0.5, -0.5, 1.5, -12.5, 12.5, 5.0),  # 5 + x + 2 u = 0; s = 2 + u, P = 2 - 2/4
         (np.inf, 1.0, -1.25, -0.25, -0.5 + 1.25 / 2, 2 - 0.5 + 2 / 16, -6.25, 3.125, 5.0),  # 5 + x + (1 + 1) 2 u = 0
-        (1.0, 0.0, -1.0, 0.0, 1.0, 2.0, -5.0, 2.0, 0.0),  # on the bound, whatever x is
+        (1.0, 0.0, -1.0, 0.0, 1.0, 2.0, -5.0, 2.0, 0.0),  # on the bound for any x
     ],
 )
 def test_one_step_by_hand(bound, regularization, u, K, s, P, slope, curvature, gradient):
@@ -101,7 +101,7 @@ def test_one_step_by_hand(bound, regularization, u, K, s, P, slope, curvature, g
 @each_row("size", [(6, 3, 2), (20, 4, 1), (1, 2, 3), (9, 7, 4), (3, 1, 5)])
 @each_row("free", [0.0, 1e6])
 def test_the_policy_leads_to_the_minimum_of_the_whole_problem(seed, size, free):
-    """1e-9 of the largest entry: 20 unstable steps magnify rounding."""
+    """The tolerance is 1e-9 of the largest entry, as 20 unstable steps magnify rounding."""
     p = problem(seed, *size, free=free)
     policy = solve_riccati(p, 0.0)
     for found, expected in zip(followed(p, policy, policy.start), minimum(p), strict=True):
@@ -112,7 +112,7 @@ def test_the_policy_leads_to_the_minimum_of_the_whole_problem(seed, size, free):
 @each_row("bound", [np.inf, 0.2])
 @each_row("regularization", [0.0, 0.3])
 def test_what_is_promised_is_what_following_the_policy_costs(gaps, bound, regularization):
-    """1e-10: sums of a hundred terms of size 10."""
+    """The tolerance of 1e-10 allows for rounding in sums of a hundred terms of size 10."""
     p = problem(gaps=gaps, bound=bound)
     policy = solve_riccati(p, regularization)
     held = np.abs(policy.feedforward) == bound
@@ -126,7 +126,7 @@ def test_what_is_promised_is_what_following_the_policy_costs(gaps, bound, regula
     assert slope + curvature / 2 == pytest.approx(still, abs=1e-10)
     if not gaps:
         assert -policy.expected == pytest.approx(still, abs=1e-10)
-    if not gaps and not held.any() and not regularization:  # else they are split otherwise
+    if not gaps and not held.any() and not regularization:  # otherwise the sum is split differently
         assert (policy.slope, policy.curvature) == pytest.approx((slope, curvature), abs=1e-10)
 
 

@@ -1,4 +1,4 @@
-"""Where a schedule lets a robot stand, by closed form and by Drake alone; and plans of robots as their files say."""
+"""Tests of standing postures under a schedule, by closed forms and by Drake alone, for robots from their files."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def quadruped(path=MODELS / "quadruped.urdf", **changes):
 
 
 def with_stiffness(tmp_path, value):
-    """The quadruped, the stiffness of whose feet is `value` or none."""
+    """Write the quadruped's file with a stiffness of `value` for its feet, or without one."""
     text = (MODELS / "quadruped.urdf").read_text()
     line = '<drake:point_contact_stiffness value="12000"/>'
     assert line in text
@@ -41,8 +41,8 @@ def test_springs_under_the_feet_carry_the_weight_by_the_lever_rule(tmp_path, sti
     legs.put(x[: model.nq])
     points, center = legs.points(), legs.center_of_mass()
     forces = stiffness * OF_GROUND / (stiffness + OF_GROUND) * -points[:, 2]
-    assert np.sum(forces) == pytest.approx(legs.mass * G, rel=1e-6)  # by a velocity of 1e-7 m/s after the step
-    # Sideways forces of the feet are 0 in all and act within some tenths of a millimetre of one height.
+    assert np.sum(forces) == pytest.approx(legs.mass * G, rel=1e-6)  # a velocity of 1e-7 m/s is left after the step
+    # The horizontal forces of the feet sum to 0 and act within some tenths of a millimetre of one height.
     moment = forces @ (points - center)[:, :2]
     assert np.max(np.abs(moment)) < 1e-3 * legs.mass * G * 0.2
     for name, angle in BENT.items():
@@ -59,7 +59,7 @@ def test_drake_alone_keeps_it_where_it_stands():
     model.plant.SetPositionsAndVelocities(context, rest.x)
     model.plant.get_actuation_input_port().FixValue(context, rest.u)
     simulator.AdvanceTo(10 * model.time_step)
-    # 1e-7 is left after a step; inputs alone let it fall, e-fold in some 0.1 s.
+    # 1e-7 is left after a step. Under constant inputs the robot falls, by a factor of e in some 0.1 s.
     assert np.max(np.abs(model.plant.GetPositionsAndVelocities(context) - rest.x)) < 1e-5
 
 
@@ -72,7 +72,7 @@ def test_a_softened_foot_sinks_by_a_sixteenth_of_a_metre_per_second_times_the_st
         assert -np.mean(legs.points()[:, 2]) == pytest.approx(0.0625 * h, rel=1e-6)
     own = STAND.with_soft_feet(quadruped())
     stiffnesses = {g.stiffness for g in own.contract.geometries if g.body in FEET}
-    assert stiffnesses == {12000.0}  # what the file says stays
+    assert stiffnesses == {12000.0}  # the file's stiffness is not changed
 
 
 def test_the_law_of_contact_is_that_of_the_option(tmp_path):
@@ -88,7 +88,7 @@ def test_what_cannot_stand_is_refused_with_the_reason():
     with pytest.raises(InputError, match=r"foot .* mm over the ground"):
         STAND.standing(model, BENT | {"FL_knee": -2.4})
     back = {f"{leg}_hip_pitch": 1.5 for leg in LEGS} | {f"{leg}_knee": -1.0 for leg in LEGS}
-    with pytest.raises(InputError, match=r"after a step|over the ground"):  # the centre of mass is not over its feet
+    with pytest.raises(InputError, match=r"after a step|over the ground"):  # the centre of mass is not over the feet
         STAND.standing(model, back)
     with pytest.raises(UnknownNameError, match="elbow"):
         STAND.standing(model, {"elbow": 0.0})
@@ -104,7 +104,7 @@ def test_what_cannot_stand_is_refused_with_the_reason():
 
 
 def test_a_trunk_that_carries_too_is_refused(tmp_path):
-    """A ball about the trunk reaches the ground: 0.02 mm into it, at 500 N/mm, it carries 10 N."""
+    """A ball about the trunk reaches 0.02 mm into the ground. At 500 N/mm it carries 10 N."""
     text = (MODELS / "quadruped.urdf").read_text()
     path, depth = tmp_path / "quadruped.urdf", 2e-5
     high = STAND.standing(quadruped(), BENT)[6]

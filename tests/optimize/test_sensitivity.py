@@ -1,4 +1,4 @@
-"""The derivative of an optimal plan: closed forms, whole solves again, and the corners at which there is none."""
+"""Tests of the derivative of an optimal plan: closed forms, repeated solves, and corners without a derivative."""
 
 import re
 from dataclasses import replace
@@ -19,7 +19,7 @@ EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 
 def block(limit=np.inf, **asked):
-    """x'' = u from rest at 0 to rest at 1 in T = 1: u = 6 - 12 t."""
+    """Return x'' = u from rest at 0 to rest at 1 in T = 1, for which u = 6 - 12 t."""
     push = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1, u_lower=[-limit], u_upper=[limit])
     rest = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 10, "horizon": 1.0, "running_cost": EFFORT}
     return dd.Problem(push, **rest | asked)
@@ -27,10 +27,10 @@ def block(limit=np.inf, **asked):
 
 @each_row("scheme", ["hermite_simpson", "trapezoid"])
 def test_a_block_between_two_states_has_the_closed_forms_derivative(scheme):
-    """cost = 12 d^2 - 12 d (v0 + v1) + 4 (v0^2 + v0 v1 + v1^2), d the way and v0, v1 the speeds at the ends."""
+    """cost = 12 d^2 - 12 d (v0 + v1) + 4 (v0^2 + v0 v1 + v1^2), with the distance d and the end speeds v0, v1."""
     solution = dd.solve(block(), options=Options(scheme=scheme))
     by_goal, by_x0 = dd.sensitivity(solution, "goal"), dd.sensitivity(solution, "x0")
-    exact = scheme == "hermite_simpson"  # of order 2 the other's is off by 4 % in ten intervals
+    exact = scheme == "hermite_simpson"  # the other scheme has order 2 and is off by 4 % for ten intervals
     np.testing.assert_allclose(by_goal.cost, [24, -12], rtol=1e-9 if exact else 0.05)
     np.testing.assert_allclose(by_x0.cost, [-24, -12], rtol=1e-9 if exact else 0.05)
     assert by_goal.verdict == by_x0.verdict == "agree"
@@ -44,17 +44,17 @@ def test_a_block_between_two_states_has_the_closed_forms_derivative(scheme):
 
 
 def test_least_time_with_a_limited_input_has_the_closed_forms_derivative():
-    """T = 2 sqrt(d): dT/dd = 1 / sqrt(d), with the input held by its limit in every interval."""
+    """T = 2 sqrt(d) has dT/dd = 1 / sqrt(d), with the input at its limit in every interval."""
     for way in (0.5, 1.0, 3.0):
         problem = block(1.0, x_goal=[way, 0], num_steps=20, horizon=(0.1, 10), running_cost=1.0)
         found = dd.sensitivity(dd.solve(problem), "goal")
-        assert found.horizon[0] == pytest.approx(1 / np.sqrt(way), rel=2e-3)  # the one interval of the switch
+        assert found.horizon[0] == pytest.approx(1 / np.sqrt(way), rel=2e-3)  # the interval with the switch
         assert found.active >= 36
         assert found.differences[0] < 1e-4
 
 
 def test_a_limit_that_is_touched_without_force_is_a_corner():
-    """u = 6 at both ends is just what the limit allows: a farther goal is held by it, a nearer one is not."""
+    """u = 6 at both ends is exactly the limit, which is active for a farther goal, but not for a nearer one."""
     found = dd.sensitivity(dd.solve(block(6.0)), "goal")
     assert found.verdict == "discontinuous"
     assert "u0 at node 0" in found.weak
@@ -65,7 +65,7 @@ def test_a_limit_that_is_touched_without_force_is_a_corner():
 
 
 def test_a_wrong_derivative_is_told(monkeypatch):
-    """Planted: the Hessian of the inputs is off by 1 %, and a tenth of that."""
+    """The Hessian has a planted error of up to 1 %, or of a tenth of that."""
     honest = HeldPlan._hessian
     for part in (0.01, 0.001):
         with monkeypatch.context() as patched:
@@ -81,7 +81,7 @@ def test_a_wrong_derivative_is_told(monkeypatch):
 
 
 def test_a_plan_that_is_one_of_many_has_no_derivative():
-    """The second input moves a state that nothing asks for and costs nothing."""
+    """The second input moves a state that has no goal and no cost."""
     slide = dd.Dynamics(lambda x, u: [u[0], u[1]], nx=2, nu=2)
     free = dd.QuadraticCost(R=np.diag([1.0, 0.0]))
     problem = dd.Problem(slide, x0=[0, 0], x_goal=[1, None], num_steps=10, horizon=1.0, running_cost=free)
@@ -117,7 +117,7 @@ def test_what_has_no_sensitivity_is_refused(write_urdf):
 
 
 def regulated(write_urdf, x0=(1.0, 0.5), **asked):
-    """A block of 1.5 kg that is brought to rest, by iLQR."""
+    """Return the problem of bringing a block of 1.5 kg to rest."""
     given = {"num_steps": 20, "running_cost": dd.QuadraticCost(Q=np.diag([1.0, 0.1]), R=[[0.2]])}
     model = write_urdf(mass=1.5, time_step=0.1)
     return dd.Problem(model, x0=x0, final_cost=dd.QuadraticCost(Q=np.diag([5.0, 2.0])), **given | asked)
@@ -125,7 +125,7 @@ def regulated(write_urdf, x0=(1.0, 0.5), **asked):
 
 @pytest.mark.parametrize("method", slow_after(1, ["ilqr", "shooting"]))
 def test_a_linear_regulator_has_the_gains_of_its_riccati_equation(write_urdf, method):
-    """du_0/dx0 = -K_0, dx_k/dx0 the closed loop, d cost/dx0 = 2 P_0 x0: the discrete Riccati recursion."""
+    """By the discrete Riccati recursion du_0/dx0 = -K_0, dx_k/dx0 is the closed loop, and d cost/dx0 = 2 P_0 x0."""
     problem = regulated(write_urdf)
     h, m, count = 0.1, 1.5, 20
     A, B = np.array([[1, h], [0, 1]]), np.array([[h * h / m], [h / m]])
@@ -148,7 +148,7 @@ def test_a_linear_regulator_has_the_gains_of_its_riccati_equation(write_urdf, me
 
 @pytest.mark.slow
 def test_a_discrete_plan_between_two_states_is_a_least_norm(write_urdf):
-    """u = S' (S S')^-1 (goal - free motion), S from inputs to the last state; u and cost scale with the mass."""
+    """u = S' (S S')^-1 (goal - free motion), with S from inputs to the last state. u and cost scale with the mass."""
     h, m, count = 0.1, 1.5, 10
     A, B = np.array([[1, h], [0, 1]]), np.array([[h * h / m], [h / m]])
     S = np.hstack([np.linalg.matrix_power(A, count - 1 - k) @ B for k in range(count)])
@@ -165,7 +165,7 @@ def test_a_discrete_plan_between_two_states_is_a_least_norm(write_urdf):
 
 @pytest.mark.slow
 def test_discrete_plans_keep_what_holds_them(write_urdf):
-    """A waypoint, a constraint, a coupling, a free entry of the first state, and a bound of the input."""
+    """Test a waypoint, a constraint, a coupling, a free entry of the first state, and a bound on the input."""
     model = write_urdf(mass=1.0, time_step=0.1)
     asked = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 20, "running_cost": EFFORT}
     slow = dd.Constraint(lambda x: x[1] ** 2, upper=0.7**2, name="slow")
@@ -195,7 +195,7 @@ def test_discrete_plans_keep_what_holds_them(write_urdf):
 @pytest.mark.long
 @each_row("method", ["ilqr", "shooting"])
 def test_the_length_of_steps_moves_with_the_goal(write_urdf, method):
-    """Effort k d^2 / T^3 in N steps of any length, and T: T grows with the root of d, so that dT/dd = T / 2 d."""
+    """The cost is k d^2 / T^3 for the effort of N steps, plus T. T grows with the root of d, and dT/dd = T / (2 d)."""
     problem = dd.Problem(
         write_urdf(mass=1.0, time_step=0.1),
         x0=[0, 0],
@@ -215,7 +215,7 @@ def test_the_length_of_steps_moves_with_the_goal(write_urdf, method):
 
 @pytest.mark.slow
 def test_a_contact_that_is_about_to_begin_is_a_corner():
-    """A ball is driven to 4 um before or behind where it touches another; 0.1 mm away it is none, on either side."""
+    """A ball ends 4 um before it touches another, which is a corner. At -0.2 mm and 0.1 mm there is no corner."""
     model = dd.load_model(MODELS / "two_spheres.sdf", time_step=0.01)
     slopes = {}
     for off, verdict in ((-4e-6, "discontinuous"), (-2e-4, "agree"), (1e-4, "agree")):
@@ -226,7 +226,7 @@ def test_a_contact_that_is_about_to_begin_is_a_corner():
         slopes[off] = found.us[-1, 0, 0]
         if verdict == "discontinuous":
             assert any("the one-sided derivatives by push_x differ" in told for told in found.weak)
-    assert slopes[1e-4] > slopes[-2e-4] + 10  # both are right, and the corner is between them
+    assert slopes[1e-4] > slopes[-2e-4] + 10  # both are correct, and the corner is between them
 
 
 def test_a_plan_that_is_no_optimum_has_no_derivative(write_urdf):

@@ -1,4 +1,4 @@
-"""Shooting: exact gradients through Drake's steps, known optima, and only what is free moves."""
+"""Tests of shooting: exact gradients through Drake's steps, known optima, and fixed variables."""
 
 import math
 import signal
@@ -52,7 +52,7 @@ def test_the_sensitivities_of_a_block_are_the_closed_form():
 
 
 def everything(**changes):
-    """30 steps whose initial speed, inputs and damping move; limits of every kind."""
+    """Return 30 steps with a free initial speed, free inputs and damping, and limits of every kind."""
     given = {
         "num_steps": 30,
         "final_cost": lambda x: np.cos(x[0]) + x[1] ** 2,
@@ -72,7 +72,7 @@ def everything(**changes):
 
 @pytest.mark.parametrize("error", [GradientError, SimulationError])
 def test_a_point_without_a_derivative_is_a_step_that_was_too_long(monkeypatch, error):
-    """A swing-up whose trial points go faster than guess and optimum ever do: halfway there derivatives end."""
+    """The trial points of a swing-up are faster than guess and optimum. Derivatives fail above half of this excess."""
     true, limit, fastest = steps.Steps.along, [np.inf], []
 
     def some(self, points):
@@ -108,7 +108,7 @@ def test_a_guess_without_a_derivative_is_the_end(monkeypatch):
 
 @pytest.mark.slow
 def test_an_acrobot_swings_up_from_rest():
-    """Open loop at half the step it falls over."""
+    """At half the step the acrobot falls over open loop."""
     model = dd.load_model(MODELS / "acrobot.xml", time_step=0.05)
     solution = shoot(dd.Problem(model, x0=np.zeros(4), x_goal=[np.pi, 0, 0, 0], num_steps=100, running_cost=EFFORT))
     assert solution.status in (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED), solution.message
@@ -119,7 +119,7 @@ def test_an_acrobot_swings_up_from_rest():
 
 @pytest.mark.parametrize("limit", [None, 8.0])
 def test_a_cart_pole_swings_up(limit):
-    """67.095 without a limit and at most 41.234 in 3 s within it, by fatrop on the same program."""
+    """The cost is 67.095 without a limit and at most 41.234 in 3 s with it, by fatrop on the same program."""
     model, bounds = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04), None
     if limit is not None:
         bounds = dd.Bounds(u_lower=[-limit], u_upper=[limit])
@@ -156,7 +156,7 @@ def test_the_block_moves_by_symplectic_eulers_optimum(count):
 
 
 def test_initial_state_and_inputs_together_are_the_dense_kkt_solution():
-    """min sum_k (x'Qx + R u^2) + x_N'Qf x_N over v_0 and u with x_0 = 0.2 fixed and x_N = 1 required."""
+    """Solve min sum_k (x'Qx + R u^2) + x_N'Qf x_N over v_0 and u with x_0 = 0.2 fixed and x_N = 1 required."""
     h, count, Q, R, Qf = 0.1, 8, np.diag([1.0, 0.5]), 0.2, np.diag([2.0, 3.0])
     A, B = np.array([[1, h], [0, 1]]), np.array([h**2, h])
     states = [(np.array([0.2, 0.0]), np.vstack([np.zeros(count + 1), np.eye(count + 1)[0]]))]  # x_k = a + S z
@@ -184,7 +184,7 @@ def test_initial_state_and_inputs_together_are_the_dense_kkt_solution():
     )
     solution = shoot(problem)
     assert solution.success, solution.message
-    # The solver meets the goal to 1e-8, which its multiplier of 5 or so turns into cost.
+    # The solver meets the goal to 1e-8. The cost changes by this times a multiplier of about 5.
     assert solution.cost == pytest.approx(z @ hessian @ z + 2 * slope @ z + constant, rel=1e-8)
     assert solution.xs[0, 0] == 0.2
     assert solution.xs[0, 1] == pytest.approx(z[0], abs=1e-5)
@@ -193,7 +193,7 @@ def test_initial_state_and_inputs_together_are_the_dense_kkt_solution():
 
 @pytest.mark.parametrize("by", ["cost", "goal"])
 def test_the_projectile_lands_at_six_metres(by):
-    """300 steps of 0.01 s without drag: v_x = 6 / 3 = 2; nothing else of the initial state may move."""
+    """300 steps of 0.01 s without drag need v_x = 6 / 3 = 2. No other entry of the initial state may move."""
     model = dd.load_model(MODELS / "projectile.sdf", time_step=0.01)
     x0 = model.default_state
     x0[11:13] = 0.3, 14.715
@@ -213,7 +213,7 @@ def test_the_projectile_lands_at_six_metres(by):
 
 @pytest.mark.parametrize(("row", "column"), slow_after(2, [(0, 1), (1, 2), (0, 0), (0, 2), (1, 0), (1, 1)]))
 def test_a_step_derivative_that_is_one_percent_off_is_named(row, column, monkeypatch):
-    """Each entry of [A B] of the pendulum; the wrong one is used by the solver and by the certificate alike."""
+    """Test each entry of the pendulum's [A B]. The solver and the certificate both use the wrong entry."""
     module = sys.modules["drake_diff.derivatives.sources"]
     honest = module._by_autodiff
 
@@ -246,7 +246,7 @@ def test_a_wrong_derivative_is_not_believed_by_ilqr(monkeypatch):
 
 
 def test_inputs_that_move_nothing_of_the_goal_end_as_no_gradient():
-    """Two blocks, one pushed; the goal is the other's."""
+    """Only one of two blocks is pushed, and the goal is for the other one."""
     model = block(blocks=2, actuated=1)
     problem = dd.Problem(model, x0=np.zeros(4), num_steps=5, running_cost=EFFORT, x_goal=[math.nan, 1, math.nan, 0])
     solution = shoot(problem)
@@ -274,7 +274,7 @@ def test_another_seed_starts_elsewhere_and_the_same_seed_in_the_same_place():
 
 @pytest.mark.parametrize("method", ["shooting", "ilqr"])
 def test_fixed_inputs_act_while_the_initial_state_is_free(method):
-    """x_N = x_0 + N h v_0 + u h^2 N (N + 1) / 2 with u = 0.5 held: v_0 = 1 - 0.5 * 0.55 reaches 1 after 1 s."""
+    """x_N = x_0 + N h v_0 + u h^2 N (N + 1) / 2 for a fixed u = 0.5. v_0 = 1 - 0.5 * 0.55 reaches 1 after 1 s."""
     problem = dd.Problem(
         block(),
         x0=[0, 0],
@@ -292,7 +292,7 @@ def test_fixed_inputs_act_while_the_initial_state_is_free(method):
 
 @each_row("count", [3, 1001])
 def test_the_chain_rule_by_few_and_many_variables(count):
-    """What is nearly the identity must not be taken for it."""
+    """A matrix that is nearly the identity must not be treated as the identity."""
     rows = np.arange(2.0 * count).reshape(2, count)
     nearly = np.eye(count)
     nearly[-1, 0] = 0.5

@@ -1,4 +1,4 @@
-"""A Solution measures itself: corrupt a motion in any one place and a measure grows; what is missing is infinite."""
+"""Tests of a Solution's measures: any change of the motion increases one, and missing parts make one infinite."""
 
 import dataclasses
 import functools
@@ -20,7 +20,7 @@ MOVED = 1e-3
 
 @functools.cache
 def solved(method):
-    """A block moved by 1 m within bounds that are not active."""
+    """Solve for a block that moves by 1 m within bounds that are not active."""
     problem = dd.Problem(
         block(),
         x0=[0, 0],
@@ -35,7 +35,7 @@ def solved(method):
 
 
 def moved(solution, name, index, by):
-    """`solution` with one entry of one of its arrays changed."""
+    """Return `solution` with one entry of one of its arrays changed."""
     values = np.array(getattr(solution, name))
     values[index] += by
     return dataclasses.replace(solution, **{name: values})
@@ -53,7 +53,7 @@ def test_an_untouched_solution_measures_as_exact(method):
 @each_row("coordinate", [0, 1])
 @each_row("knot", [0, 1, N // 2, N - 1, N])
 def test_one_moved_knot_shows_in_its_own_intervals(method, coordinate, knot):
-    """A first position can hide from no interval here, nor can a velocity: both ends of an interval are measured."""
+    """Both ends of an interval are measured, so that a moved position or velocity shows in each of its intervals."""
     s = moved(solved(method), "xs", (knot, coordinate), MOVED)
     touched = [k for k in (knot - 1, knot) if 0 <= k < N]
     assert s.defect > MOVED / 2
@@ -68,7 +68,7 @@ def test_a_moved_first_state_shows_in_the_initial_state_error(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_motion_shifted_as_a_whole_shows_at_its_start(method):
-    """No interval of it is wrong: only where it starts."""
+    """All intervals of the motion are correct. Only its start is wrong."""
     s = solved(method)
     shifted = dataclasses.replace(s, xs=s.xs + np.array([MOVED, 0]))
     assert shifted.defect < 1e-9
@@ -78,7 +78,7 @@ def test_a_motion_shifted_as_a_whole_shows_at_its_start(method):
 @each_row("method", METHODS)
 @each_row("index", [0, N // 2, N - 1])
 def test_one_moved_input_shows_in_the_defect(method, index):
-    """A held input moves the velocity of 1 kg by h du; one at a knot a sixth of that, by Simpson's rule."""
+    """An input over a step moves the velocity of 1 kg by h du, and one at a knot by a sixth of it (Simpson's rule)."""
     assert moved(solved(method), "us", index, 0.01).defect >= 0.99 * H * 0.01 / 6
 
 
@@ -116,7 +116,7 @@ def test_collocations_last_input_is_held_to_its_bound():
 @each_row("method", METHODS)
 @each_row("order", [1, -1])
 def test_the_worst_of_several_constraints_counts(method, order):
-    """One holds and one is broken by a known excess, in either order: the other way round both would seem to hold."""
+    """One constraint holds and one has a known excess, in either order. The violated one must be measured in both."""
     s = solved(method)
     kept = dd.Constraint(lambda x: x[0], upper=2.0, name="kept")
     broken = dd.Constraint(lambda x: x[0], upper=float(s.xs[N, 0]) - 0.25, name="broken")
@@ -129,7 +129,7 @@ def test_the_worst_of_several_constraints_counts(method, order):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_the_cost_is_computed_from_the_motion(method):
-    """Inputs twice as large cost four times as much; the final cost of a motion left as it is stays."""
+    """Inputs twice as large cost four times as much. The final cost of the unchanged states is the same."""
     s = solved(method)
     final = 0.0 if s.problem.final_cost is None else s.problem.final_cost(s.xs[-1])
     inputs = {name: getattr(s, name) for name in ("us", "u_final", "us_mid")}
@@ -148,18 +148,18 @@ def test_one_entry_of_a_state_that_is_no_number_makes_the_motion_infinitely_wron
 @each_row("method", METHODS)
 @each_row("steps", [0, 1, N - 1])
 def test_a_motion_that_ends_too_early_is_infinitely_wrong(method, steps):
-    """Each of its intervals may be right: those that are missing are not."""
+    """All intervals of the motion may be correct, but some are missing."""
     s = solved(method)
     assert dataclasses.replace(s, xs=s.xs[: steps + 1], us=s.us[:steps]).defect == math.inf
 
 
 def test_the_replay_of_a_collocated_solution_is_the_discrete_plants():
-    """Held mean inputs on 1 kg by symplectic Euler: v_k+1 = v_k + h (u_k + u_k+1) / 2, x_k+1 = x_k + h v_k+1."""
+    """Mean inputs on 1 kg by symplectic Euler give v_k+1 = v_k + h (u_k + u_k+1) / 2, x_k+1 = x_k + h v_k+1."""
     s = solved("collocation")
     v = np.concatenate([[0], H * np.cumsum((s.inputs_at_knots[:-1, 0] + s.inputs_at_knots[1:, 0]) / 2)])
     x = np.concatenate([[0], H * np.cumsum(v[1:])])
     assert s.replay.xs == pytest.approx(np.column_stack([x, v]), abs=1e-12)
-    assert abs(s.replay.xs[-1, 0] - 1) > MOVED  # another integrator: it does not land where the cubic does
+    assert abs(s.replay.xs[-1, 0] - 1) > MOVED  # another integrator does not end where the cubic ends
 
 
 def test_the_integration_error_of_a_cubic_motion_is_rounding():
@@ -168,7 +168,7 @@ def test_the_integration_error_of_a_cubic_motion_is_rounding():
 
 @pytest.mark.solve
 def test_the_integration_error_falls_by_the_fourth_order_of_hermite_simpson():
-    """Per interval it is O(h^5): halving h divides it by about 32 on a smooth motion, by 16 at the very least."""
+    """The error per interval is O(h^5). Halving h divides it by about 32 on a smooth motion, and at least by 16."""
     errors = []
     for count in (20, 40):
         model = dd.load_model(MODELS / "cart_pole.urdf", time_step=2 / count)

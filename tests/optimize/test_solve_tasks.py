@@ -1,4 +1,4 @@
-"""What users ask `solve` for: minimum time, waypoints, path constraints, limits, each against a closed form."""
+"""Tests of common tasks against closed forms: minimum time, path constraints, and limits."""
 
 import math
 
@@ -17,7 +17,7 @@ SCHEMES = ("hermite_simpson", "trapezoid", "drake")
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_minimum_time_is_bang_bang(write_urdf, scheme):
-    """From rest, distance D = 1, |u| <= 1, m = 1: T = 2 sqrt(D) = 2, u = +1 then -1; a node lies at the switch."""
+    """From rest, with D = 1, |u| <= 1, m = 1: T = 2 sqrt(D) = 2 and u = +1, then -1. A node is at the switch."""
     problem = dd.Problem(
         write_urdf(time_step=0.1),
         x0=[-1, 0],
@@ -28,7 +28,7 @@ def test_minimum_time_is_bang_bang(write_urdf, scheme):
         bounds=dd.Bounds(u_lower=[-1], u_upper=[1]),
     )
     solution = dd.solve(problem, method="collocation", options=Options(scheme=scheme))
-    # The input jumps at the middle, where all have to be continuous, so that O(h^2) of the way is lost.
+    # The input jumps in the middle, where all schemes are continuous, so that O(h^2) of the distance is lost.
     assert 2.0 < solution.horizon < 2.01, solution.message
     assert solution.cost == pytest.approx(solution.horizon, rel=1e-12)
     assert solution.times[-1] == pytest.approx(solution.horizon, rel=1e-12)
@@ -37,21 +37,21 @@ def test_minimum_time_is_bang_bang(write_urdf, scheme):
 
 
 def test_auto_takes_collocation_where_the_horizon_is_free(load):
-    """More time never costs more: the free horizon's optimum is no dearer than that of its upper end."""
+    """More time never costs more, so that the optimum of a free horizon costs at most that of its upper end."""
     model = load("pendulum.urdf", time_step=0.02)
     problem = dd.Problem(model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=60, running_cost=EFFORT, horizon=(0.5, 2.0))
     solution = dd.solve(problem)
     assert solution.method == "collocation"
     assert solution.options["method_reason"] == "the horizon is free"
     assert solution.success, solution.message
-    assert 0.5 <= solution.horizon <= 2.0 + 1e-6  # IPOPT keeps a bound to its tolerance
+    assert 0.5 <= solution.horizon <= 2.0 + 1e-6  # IPOPT satisfies a bound to its tolerance
     fixed = dd.Problem(model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=60, running_cost=EFFORT, horizon=(2.0, 2.0))
     assert solution.cost <= dd.solve(fixed).cost + 1e-6
 
 
 @pytest.mark.parametrize(("count", "holds"), [(4, False), (40, True)])
 def test_what_a_constraint_is_exceeded_by_between_the_nodes_is_in_the_record(write_urdf, tmp_path, count, holds):
-    """v <= 1.25 over 1 m in 1 s, reached at 0.3 s: between nodes, and at one."""
+    """v <= 1.25 over 1 m in 1 s is reached at 0.3 s, which is between nodes of one mesh and at a node of the other."""
     problem = dd.Problem(
         write_urdf(time_step=1 / count),
         x0=[0, 0],
@@ -74,7 +74,7 @@ def test_what_a_constraint_is_exceeded_by_between_the_nodes_is_in_the_record(wri
 @pytest.mark.parametrize("method", ["shooting", "ilqr"])
 @pytest.mark.parametrize("limit", [2.0, 0.03])
 def test_a_plan_at_the_limits_of_its_motor_is_verified(write_urdf, method, limit):
-    """6 d / T^2 is the largest input of least effort, 4 d / T^2 the least limit that will do: 4.5 d / T^2 acts."""
+    """The inputs of least effort reach 6 d / T^2, and limits need at least 4 d / T^2, so that 4.5 d / T^2 is active."""
     count, h = 30, 0.04
     distance = limit * (count * h) ** 2 / 4.5
     model = write_urdf(limit=limit, time_step=h)
@@ -90,7 +90,7 @@ def test_a_plan_at_the_limits_of_its_motor_is_verified(write_urdf, method, limit
 
 
 def test_a_plan_whose_derivative_is_wrong_exactly_at_the_limit_is_not_verified(write_urdf, monkeypatch):
-    """The fault is there at the limit alone, where no difference is taken."""
+    """The derivative is wrong at the limit only, where no difference is taken."""
     force = SmoothStep.force_of
     monkeypatch.setattr(
         SmoothStep,
@@ -106,9 +106,9 @@ def test_a_plan_whose_derivative_is_wrong_exactly_at_the_limit_is_not_verified(w
 
 
 def test_a_bead_takes_the_cycloid_though_its_first_time_is_far_off():
-    """r (a - sin a) = 2.28, r (1 - cos a) = 2.017 in a sqrt(r / g); a search once ended in a way of twice the time."""
+    """r (a - sin a) = 2.28, r (1 - cos a) = 2.017 in a sqrt(r / g). A search once found a path of twice the time."""
     a = 2.5
-    for _ in range(50):  # Newton on the quotient of both
+    for _ in range(50):  # Newton's method on the quotient of both
         value, slope = (2.28 * (1 - math.cos(a)) - 2.017 * (a - math.sin(a)) for a in (a, a + 1e-6))
         a -= 1e-6 * value / (slope - value)
     least = a * math.sqrt(2.017 / (1 - math.cos(a)) / 9.81)

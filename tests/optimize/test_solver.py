@@ -1,4 +1,4 @@
-"""The solvers against known optima, and a status that is measured, not believed."""
+"""Tests of the solvers against known optima, and of the status, which is measured."""
 
 import dataclasses
 import math
@@ -48,7 +48,7 @@ SOFT = {
 
 @pytest.mark.parametrize("outcome", [Outcome.INACCURATE, Outcome.INFEASIBLE])
 def test_where_the_optimum_in_steps_is_far_a_motion_in_them_near_the_collocated_one_will_do(load, monkeypatch, outcome):
-    """It need not be the nearest one; what is no motion is none, however near."""
+    """The motion need not be the nearest one. A motion that violates the dynamics is refused, however near it is."""
     monkeypatch.setattr("drake_diff.optimize.solve.REFINING", 1)
     shoot = Run.shoot
 
@@ -66,12 +66,12 @@ def test_where_the_optimum_in_steps_is_far_a_motion_in_them_near_the_collocated_
         assert solution.plant == "steps"
         assert "not an optimum in these steps" in " ".join(solution.notes)
         replayed = dd.rollout(solution.problem.model, solution.xs[0], solution.us).xs
-        assert np.max(np.abs(replayed - solution.xs)) < 1e-6  # asked of the README's cart-pole
+        assert np.max(np.abs(replayed - solution.xs)) < 1e-6  # required of the README's cart-pole
 
 
 @pytest.mark.parametrize("method", ["shooting", "ilqr"])
 def test_pendulum_with_a_soft_goal(load, method):
-    """J* = 1.88951695347 by a solve of the same steps beside Drake."""
+    """J* = 1.88951695347 by a solve of the same steps without Drake."""
     solution = dd.solve(pendulum(load, **SOFT), method=method, options=Options(tolerance=1e-10))
     assert solution.success, solution.message
     assert solution.cost == pytest.approx(1.88951695347, rel=1e-10)
@@ -145,7 +145,7 @@ def test_progress_is_told_while_it_runs(load, monkeypatch):
 def test_the_same_seed_gives_the_same_bits(load):
     a, b = (dd.solve(swing_up(load, 20), method="shooting", seed=3) for _ in range(2))
     assert a.xs.tobytes() == b.xs.tobytes()
-    assert repr(a.iterations) == repr(b.iterations)  # a blank cell is NaN, which equals nothing
+    assert repr(a.iterations) == repr(b.iterations)  # as text, since a blank cell is NaN, which is not equal to itself
 
 
 def test_auto_chooses_and_says_why(load):
@@ -179,7 +179,7 @@ def test_pd_control_is_left_to_the_discrete_methods():
 
 
 def test_collocation_through_a_ball_between_two_knots_is_not_verified():
-    """From 1 m before a fixed ball to 1 m behind it in three intervals, whose knots are 0.4 m away or more."""
+    """Move from 1 m before a fixed ball to 1 m behind it in three intervals, with knots at least 0.4 m away."""
     plant = Plant(0.25)
     plant.ball("ball", 1.0, 0.1, contact_properties(1e4), "x")
     plant.shape(plant.plant.world_body(), Sphere(0.1), contact_properties(1e4))
@@ -237,7 +237,7 @@ def test_collocation_needs_controls_to_optimize(load):
 
 
 def test_auto_goes_on_from_what_a_failed_attempt_left(load, monkeypatch):
-    """Collocation is made to fail once: iLQR finds a motion, and collocation starts from that."""
+    """Collocation is made to fail once. iLQR then finds a motion, from which collocation starts."""
     honest = Run.collocate
     calls = []
 

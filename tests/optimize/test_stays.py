@@ -1,4 +1,4 @@
-"""Where a motion is to stay: goals held for a while, and sets from which a regulator takes over."""
+"""Tests of goals that apply for a duration, and of sets in which a regulator takes over."""
 
 from dataclasses import replace
 
@@ -43,7 +43,7 @@ def swung_up(path="pendulum.urdf", goal=(np.pi, 0.0), limit=3.0, **more):
 def test_a_crane_stays_where_it_was_sent(method):
     solution = dd.solve(crane(goals=[stay()]), method=method)
     assert solution.success, solution.message
-    # the last 0.5 s of 2.5 s, in the plan and on the plant in its finest steps
+    # The last 0.5 s of 2.5 s, in the plan and on the plant in its finest steps
     assert np.max(np.abs(solution.xs[solution.times >= 2.0 - 1e-9, :2] - [0.5, 0])) < 0.0101
     held = [r for r in solution.replays if r.holds][-1].motion
     assert np.max(np.abs(held.xs[held.times >= 2.0 - 1e-9, :2] - [0.5, 0])) <= 0.02
@@ -60,7 +60,7 @@ def test_it_stays_on_the_way():
 
 
 def test_a_motion_that_leaves_too_early_is_refused():
-    """Moved at one knot of the stay by more than the plan's half of the tolerance."""
+    """One knot of the stay is moved by more than the half of the tolerance that the plan uses."""
     solution = dd.solve(crane(goals=[stay()]))
     random, knots = np.random.default_rng(0), np.flatnonzero(solution.times >= 2.0 - 1e-9)
     for _ in range(30):
@@ -90,7 +90,7 @@ def test_what_is_no_stay_is_refused_at_once(make, told):
 
 
 def test_the_set_of_a_block_is_the_largest_in_which_its_force_is_enough(write_urdf):
-    """A linear plant: the level is that at which the largest |K d| is the limit, by SciPy's Riccati equation."""
+    """For a linear plant the level is that at which the largest |K d| is the limit, by SciPy's Riccati equation."""
     model, h, limit = write_urdf(time_step=0.1), 0.1, 0.7
     mass = 1 / model_gain(model)
     A, B = np.array([[1, h], [0, 1]]), np.array([[h * h], [h]]) / mass  # Drake's step: v first, then q with the new v
@@ -113,7 +113,7 @@ def test_a_pendulum_swings_up_to_where_a_regulator_takes_over(method):
     solution = dd.solve(swung_up(), method=method)
     assert solution.success, solution.message
     assert all(c.passes for c in solution.checks if c.what == "regulator" and c.plant == "in steps of 0.01 s")
-    # Drake's own plant, under the regulator of its own LQR, comes to rest upright
+    # Drake's own plant comes to rest upright under the regulator of its own LQR
     model, x = solution.problem.model, np.array(solution.xs[-1])
     regulator = LQR(model, [np.pi, 0], [0], np.eye(2), np.eye(1))
     for _ in range(200):
@@ -125,7 +125,7 @@ def test_a_pendulum_swings_up_to_where_a_regulator_takes_over(method):
 
 @pytest.mark.slow
 def test_where_a_formula_is_too_hopeful_sampling_lowers_the_level():
-    """An acrobot falls over long before its torque is at the limit. States of other seeds judge what is given out."""
+    """An acrobot falls over long before its torque is at the limit. States of other seeds test the level."""
     problem = swung_up("acrobot.xml", (np.pi, 0, 0, 0), 500.0)
     model = problem.model
     region = problem.goals[0].region(model, problem.bounds)
@@ -135,7 +135,7 @@ def test_where_a_formula_is_too_hopeful_sampling_lowers_the_level():
     def arrives(x):
         regulator = LQR(model, [np.pi, 0, 0, 0], [0], np.eye(4), np.eye(1))
         for _ in range(400):
-            if np.max(np.abs(x)) > 1e6:  # it spins ever faster, beyond what this step can follow
+            if np.max(np.abs(x)) > 1e6:  # it spins too fast for this time step
                 return False
             x = dd.step(model, x, np.clip(regulator(x, 0.0), -500, 500))
         return bool(np.max(np.abs(x - [np.pi, 0, 0, 0])) < 0.05)

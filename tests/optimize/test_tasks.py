@@ -1,4 +1,4 @@
-"""Tasks from end to end: a tip, a hand, a contact force, written with task quantities."""
+"""Tests of tasks with a contact force, which is limited by a constraint on a task quantity."""
 
 import numpy as np
 import pytest
@@ -18,9 +18,9 @@ by_each_method = pytest.mark.parametrize("method", METHODS, ids=["ilqr", "shooti
 @pytest.mark.slow
 @by_each_method
 def test_a_box_is_pressed_as_deep_as_a_contact_force_allows(method):
-    """F_k = k (d_k + (h + tau) w_(k+1)) with d_(k+1) = d_k + h w_(k+1), of SAP's linear law, k = 4e4 N/m, tau = 0.2 s.
+    """SAP's linear law is F_k = k (d_k + (h + tau) w_(k+1)), d_(k+1) = d_k + h w_(k+1), k = 4e4 N/m, tau = 0.2 s.
 
-    Deepest is F = 30 N in each step: d_N = F / k - (F - m g) / k * (tau / (h + tau))^N.
+    F = 30 N in each step gives the largest depth: d_N = F / k - (F - m g) / k * (tau / (h + tau))^N.
     """
     model, count, k, limit, weight = box_on_the_ground(pusher=True), 12, 4e4, 30.0, 2 * 9.81
     force, x0 = dd.quantities.contact_force(model, "box"), np.array([0.1 - weight / k, 0])

@@ -1,6 +1,6 @@
-"""The time limit of a solve: it holds in whatever the solve calls, and the result names what was not made.
+"""The time limit of a solve applies to everything that the solve calls, and the result names what was not made.
 
-The clock is ours: it stands still but where a test lets time pass.
+The clock of these tests stands still unless a test advances it.
 """
 
 import signal
@@ -32,7 +32,7 @@ METHODS = [("collocation", None), ("shooting", None), ("ilqr", None)]
 
 class Clock:
     def __init__(self):
-        self.now = time.monotonic()  # of which a solve that has begun knows
+        self.now = time.monotonic()  # the time that a solve in progress has read
 
     def __call__(self):
         return self.now
@@ -41,7 +41,7 @@ class Clock:
 def stopped(monkeypatch):
     clock = Clock()
     monkeypatch.setattr(time, "monotonic", clock)
-    monkeypatch.setattr("drake_diff._base.clock._uncounted", 0.0)  # what was compiled for other tests
+    monkeypatch.setattr("drake_diff._base.clock._uncounted", 0.0)  # without compilations for other tests
     return clock
 
 
@@ -52,7 +52,7 @@ def swing():
 
 
 def late(clock, function, *, from_call):
-    """The function, whose calls from a number on take a year."""
+    """Return the function with calls that take a year, from the call with number `from_call` on."""
     calls = []
 
     def run_late(*arguments, **options):
@@ -71,10 +71,10 @@ def test_time_that_is_up_is_up_for_all_that_is_called(monkeypatch):
     with until(10.0), until(20.0):
         check_time(ahead=9.0)
         with pytest.raises(TimeIsUpError):
-            check_time(ahead=11.0)  # the block around this one ends first
+            check_time(ahead=11.0)  # the outer block ends first
         pace = Pace()
         clock.now = 9.5
-        with pytest.raises(TimeIsUpError):  # 9.5 s for one piece, so that the next may take until after 10
+        with pytest.raises(TimeIsUpError):  # one piece took 9.5 s, so that the next one may end after 10 s
             pace.go_on()
         clock.now = 10.5
         with pytest.raises(TimeIsUpError):
@@ -91,7 +91,7 @@ def test_what_is_found_in_time_and_not_certified_is_not_called_verified(monkeypa
     assert found.status is STATUS
     assert "not made within the time limit: certificates of the result, replays and other measures" in repr(found)
     assert found.goal_error < 1e-5  # the motion is the one that was found
-    assert len(found.certificates) == 3  # those of the guess
+    assert len(found.certificates) == 3  # the certificates of the guess
 
 
 @each_row(
@@ -116,7 +116,7 @@ def test_a_limit_that_comes_before_the_search_leaves_the_guess(monkeypatch, meth
 
 
 def test_no_other_method_is_begun_after_the_limit(monkeypatch):
-    """A plan that is not verified is followed by others, if there is time."""
+    """Other methods follow a plan that is not verified, if there is time."""
     problem, clock = swing(), stopped(monkeypatch)
 
     def unverified(self, search, guess, begin):
@@ -132,7 +132,7 @@ def test_no_other_method_is_begun_after_the_limit(monkeypatch):
 
 
 def test_no_iteration_is_begun_that_would_end_after_the_limit(monkeypatch):
-    """A derivative by thousands of variables takes seconds, and nothing can interrupt it."""
+    """A derivative with respect to thousands of variables takes seconds and cannot be interrupted."""
     clock, real, each = stopped(monkeypatch), steps.StepProgram.hessian, 3.0
 
     def slow(self, *at):
@@ -148,7 +148,7 @@ def test_no_iteration_is_begun_that_would_end_after_the_limit(monkeypatch):
 
 @each_row("method, solver", METHODS[1:])
 def test_a_signal_in_the_middle_of_an_evaluation_ends_it(monkeypatch, method, solver):
-    """Not at the next iteration, which may take seconds: what follows it is one rollout of what was best."""
+    """The solve does not wait for the next iteration, which may take seconds. It only rolls out the best point."""
     calls, plans, signalled = [], [], 200
 
     def counted():
@@ -170,29 +170,29 @@ def test_a_signal_in_the_middle_of_an_evaluation_ends_it(monkeypatch, method, so
 
 
 def test_a_signal_ends_a_compilation_at_once():
-    """Numba's own code is on the stack while it compiles, for seconds in which it looks at no flag."""
+    """Numba's own code is on the stack while it compiles, for seconds in which it checks no flag."""
     numba_s = {"__name__": "numba.core.compiler", "signal": signal}
     exec("def compile_it(): signal.raise_signal(signal.SIGINT)", numba_s)
     with noted_interrupts() as flag:
         with until_set(flag), pytest.raises(StoppedError):
             numba_s["compile_it"]()
         flag.clear()
-        numba_s["compile_it"]()  # outside a search it is noted alone
+        numba_s["compile_it"]()  # outside a search the signal is only noted
         assert flag.is_set()
 
 
 @pytest.mark.solve
 @each_row("method, solver", METHODS)
 def test_what_numba_compiles_is_told_and_no_limit_counts_it(monkeypatch, method, solver):
-    """A year by the clock, of which the limit of 10 s leaves all to the search."""
+    """A compilation takes a year by the clock, and the whole limit of 10 s is left for the search."""
     import numba
 
     clock, lines, problem = stopped(monkeypatch), [], swing()
-    monkeypatch.setattr("drake_diff._base.clock._uncounted", 0.0)  # which is taken back at the end
+    monkeypatch.setattr("drake_diff._base.clock._uncounted", 0.0)  # restored at the end
     time_compilations()
     before = uncounted()
     numba.njit(lambda x: 2 * x)(1.0)
-    assert uncounted() == before  # the clock stands still here
+    assert uncounted() == before  # the clock of the test stands still
 
     def compiling(*arguments, **options):
         with numba.core.event.trigger_event("numba:compile"), numba.core.event.trigger_event("numba:compile"):
@@ -204,7 +204,7 @@ def test_what_numba_compiles_is_told_and_no_limit_counts_it(monkeypatch, method,
     monkeypatch.setattr(run, name, compiling)
     found = dd.solve(problem, method=method, options=Options(solver=solver), time_limit=10.0, progress=lines.append)
     assert found.success
-    assert uncounted() - before == pytest.approx(6e7)  # certificates of the guess, and of the result
+    assert uncounted() - before == pytest.approx(6e7)  # for the certificates of the guess and of the result
     assert lines[-1] == "Numba compiled for 6e+07 s, once on this machine, which no time limit counts"
     monkeypatch.setattr(run, "judged", late(clock, run.judged, from_call=1))
     found = dd.solve(problem, method=method, options=Options(solver=solver), time_limit=10.0)

@@ -1,4 +1,4 @@
-"""Running costs that change in time, by every method: closed forms, references, sums, MPC, records."""
+"""Tests of running costs that change in time, by every method: closed forms, references, sums, MPC, records."""
 
 import re
 
@@ -18,7 +18,7 @@ METHODS = ["collocation", "ilqr", "shooting"]
 
 
 def point(horizon=1.0, count=20, **asked):
-    """x' = u from 0 to 1."""
+    """Return the problem of moving x' = u from 0 to 1."""
     return dd.Problem(
         dd.Dynamics(lambda x, u: [u[0]], nx=1, nu=1), x0=[0], x_goal=[1], num_steps=count, horizon=horizon, **asked
     )
@@ -29,14 +29,14 @@ def block(write_urdf, h=0.05, count=20, **asked):
 
 
 def branching(x, u, t):
-    """The same cost with a branch on the time, which CasADi cannot trace."""
+    """Return the same cost with a branch on the time, which CasADi cannot trace."""
     return (1 + t) * u[0] ** 2 if t >= 0 else 0.0
 
 
 @pytest.mark.solve
 @each_row("cost", [lambda x, u, t: (1 + t) * u[0] ** 2, branching])
 def test_a_weight_that_grows_in_time_has_the_closed_forms_optimum(cost):
-    """min of int (1 + t) u^2 with int u = 1: u = 1 / ((1 + t) ln 2), at a cost of 1 / ln 2."""
+    """The minimum of int (1 + t) u^2 with int u = 1 is at u = 1 / ((1 + t) ln 2), with a cost of 1 / ln 2."""
     solution = dd.solve(point(running_cost=cost))
     assert solution.success, solution.message
     t = solution.times
@@ -47,7 +47,7 @@ def test_a_weight_that_grows_in_time_has_the_closed_forms_optimum(cost):
 @pytest.mark.slow
 @each_row("method", METHODS)
 def test_an_input_that_is_asked_for_in_time_is_given(write_urdf, method):
-    """(u - sin 3 t)^2 is 0 where u is that; discrete methods ask at the beginning of each step."""
+    """(u - sin 3 t)^2 is 0 for u = sin 3 t. Discrete methods use the time at the beginning of each step."""
     problem = block(write_urdf, running_cost=lambda x, u, t: (u[0] - np.sin(3 * t)) ** 2)
     solution = dd.solve(problem, method=method)
     assert solution.success, solution.message
@@ -59,7 +59,7 @@ def test_an_input_that_is_asked_for_in_time_is_given(write_urdf, method):
 @each_row("method", METHODS)
 @each_row("kind", ["arrays", "solution", "trajectory", "trajectories", "function"])
 def test_a_reference_is_followed_in_whatever_form_it_is_given(write_urdf, method, kind):
-    """x = t^2 / 2 under u = 1: what follows it with its own input costs nothing."""
+    """x = t^2 / 2 under u = 1, so that a plan that follows it with its own input costs nothing."""
     t = np.linspace(0, 1, 21)
     xs, us = np.column_stack([t**2 / 2, t]), np.ones((21, 1))
     state, held = PiecewisePolynomial.CubicHermite(t, xs.T, [t, 0 * t + 1]), PiecewisePolynomial([[1.0]])
@@ -78,7 +78,7 @@ def test_a_reference_is_followed_in_whatever_form_it_is_given(write_urdf, method
     if kind != "trajectory":
         np.testing.assert_allclose(
             solution.us[2 * len(solution.us) // 20 :], 1.0, atol=0.15
-        )  # the first make up for half a step
+        )  # the first inputs make up for half a step
 
 
 def test_the_cost_of_a_reference_is_the_sum_over_its_steps(write_urdf):
@@ -106,7 +106,7 @@ def test_goals_that_are_paid_for_go_with_it():
 
 @pytest.mark.solve
 def test_mpc_follows_a_reference_that_moves_on():
-    """Each plan begins later in the reference: one that began anew would follow its first second for ever."""
+    """Each plan begins later in the reference. A plan that began anew would follow the first second forever."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
     t = np.linspace(0, 4, 81)
     wave = np.column_stack([0.5 * np.sin(2 * t), np.cos(2 * t)])
@@ -126,7 +126,7 @@ def test_a_run_that_follows_a_reference_verifies(write_urdf, tmp_path):
     dd.save(dd.solve(block(write_urdf, running_cost=cost), method="ilqr"), tmp_path / "run")
     assert dd.verify(tmp_path / "run").holds
     told = describe_problem(block(write_urdf, running_cost=lambda x, u, t: t * u[0] ** 2))
-    assert "lambda" in told["running_cost"]  # the user's function, which is in no record
+    assert "lambda" in told["running_cost"]  # the user's function is in no record
 
 
 @pytest.mark.parametrize(

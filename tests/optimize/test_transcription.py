@@ -1,8 +1,8 @@
-"""Hermite-Simpson and trapezoid against closed forms, published optima, and their own exact discrete optima.
+"""Tests of Hermite-Simpson and trapezoid against closed forms, published optima, and their exact discrete optima.
 
-Every number here was known before this code. The block is x'' = u from rest at 0 to rest at 1 in 1 s, whose least
-integral of u^2 is 12, by u = 6 - 12 t. Kelly's cart-pole and its optimum are from "An Introduction to Trajectory
-Optimization", SIAM Review 59(4), 2017; Betts, "Practical Methods for Optimal Control", has most of the others.
+All expected numbers are independent of this code. The block is x'' = u from rest at 0 to rest at 1 in 1 s, whose
+least integral of u^2 is 12, by u = 6 - 12 t. Kelly's cart-pole and its optimum are from "An Introduction to Trajectory
+Optimization", SIAM Review 59(4), 2017. Most of the others are from Betts, "Practical Methods for Optimal Control".
 """
 
 import dataclasses
@@ -98,7 +98,7 @@ def test_the_simple_pendulum_with_a_free_final_time(scheme, count, optimum):
     ],
 )
 def test_the_cost_converges_at_the_schemes_order(scheme, errors, orders):
-    """Between 20, 40 and 80 intervals the trapezoid's order goes from 1.79 to 1.91, Hermite-Simpson's is 4."""
+    """Between 20, 40 and 80 intervals the trapezoid's order goes from 1.79 to 1.91. Hermite-Simpson has order 4."""
     found = [
         move(n, heavy_pendulum(0.1), x_goal=[np.pi, 0], horizon=2.0, scheme=scheme).transcribed.quadrature
         - 72.126618030
@@ -121,9 +121,9 @@ def test_minimum_time():
 
 @pytest.mark.parametrize(("scheme", "count"), [("hermite_simpson", 10), ("hermite_simpson", 20)])
 def test_the_double_integrator_in_minimum_time(scheme, count):
-    """The optimum is 2, by an input that jumps at a node. A continuous parabola within 1 is 1 - tau^2 before it, which
+    """The optimum is 2, by an input that jumps at a node. A continuous parabola within 1 is 1 - tau^2 before the node.
 
-    loses h^2 / 12 of each half's way: T = 2 / sqrt(1 - 2 / (3 N^2)).
+    It loses h^2 / 12 of the way in each half: T = 2 / sqrt(1 - 2 / (3 N^2)).
     """
     motion = move(count, x0=[-1, 0], x_goal=[0, 0], horizon=(0.1, 10), running_cost=1.0, bounds=unit_inputs())
     assert motion.horizon == pytest.approx(2 / math.sqrt(1 - 2 / (3 * count**2)), rel=1e-7)
@@ -145,7 +145,7 @@ def test_the_brachistochrone(count, rel):
     assert motion.horizon == pytest.approx(0.824759143156625, rel=rel)
 
 
-# ------------------------------------------------------------------------------ linear and chains
+# ------------------------------------------------------------------------------ linear dynamics
 
 
 def test_a_free_final_velocity():
@@ -161,31 +161,31 @@ def bryson_denham(count, scheme="hermite_simpson"):
 
 
 def test_bryson_and_denham():
-    """Where nodes lie at the arcs' ends, 1/3 and 2/3, Hermite-Simpson is exact and the bound holds in between."""
+    """With nodes at the arcs' ends, 1/3 and 2/3, Hermite-Simpson is exact and the bound holds between the nodes."""
     motion = bryson_denham(15)
     assert motion.cost == pytest.approx(4, rel=1e-7)
     assert motion.inputs_at_knots[0, 0] == pytest.approx(-6, abs=1e-4)
     assert violation_between_nodes(motion.transcribed).state < 1e-7
     assert (
         4.0035267 < bryson_denham(100, "trapezoid").transcribed.quadrature < 4.0036
-    )  # the first keeps its bound at the nodes alone
+    )  # 4.0035267 is the optimum with the bound at the nodes only
 
 
 @each_row("count", [5, 7, 10, 11])
 @each_row("scheme", ["hermite_simpson", "trapezoid", "drake"])
 def test_a_bound_holds_between_the_nodes_wherever_they_lie(count, scheme):
-    """Bryson and Denham's optimum is 4: no motion that keeps its bound everywhere costs less."""
+    """Bryson and Denham's optimum is 4. No motion that satisfies the bound everywhere costs less."""
     motion = bryson_denham(count, scheme)
     dense = motion.transcribed.at(np.linspace(0, 1, 5001))[0][:, 0].max() - 1 / 9
     assert dense < 1e-7
     assert motion.transcribed.quadrature > 4 * (1 - 1e-7)
-    # What a trapezoid calls the motion is a parabola, but not that of the block; and its rule is off by 2 % and more.
+    # The motion of the trapezoid is a parabola, but not that of the block. The error of its rule is at least 2 %.
     missed = {"trapezoid": "an accurate integration from knot", "drake": "the cost that was minimized is"}
     assert missed[scheme] in repr(motion) if scheme in missed else motion.success, motion.message
 
 
 def at_nodes_alone(monkeypatch):
-    """A solver that keeps bounds at the nodes alone, as all did."""
+    """Make the solver enforce bounds only at the nodes."""
     monkeypatch.setattr(TranscribedProgram, "_add_inputs", lambda *_: None)
     for name, scheme in SCHEMES_OF.items():
         none = np.zeros((0, scheme.nodes + 1))
@@ -206,7 +206,7 @@ def test_a_cost_below_the_optimum_goes_with_an_excess_between_the_nodes(monkeypa
 
 
 def test_an_input_that_is_too_large_between_the_nodes_is_no_success(monkeypatch):
-    """1 kg and 1 N over 1 m: below 2 s only by an input of 9/8 N, which the nodes do not show."""
+    """1 kg and 1 N over 1 m need at least 2 s, except with an input of 9/8 N between the nodes."""
     at_nodes_alone(monkeypatch)
     asked = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 20, "horizon": (0.1, 10), "running_cost": 1.0}
     once = {"method": "collocation", "refine": False}
@@ -218,19 +218,19 @@ def test_an_input_that_is_too_large_between_the_nodes_is_no_success(monkeypatch)
         assert np.abs(motion.us).max() < 1 + 1e-7
         assert not motion.success
         assert "is 0.125 beyond its bound at " in repr(motion)
-    # What the plant cuts off is missing from the motion.
+    # The motion lacks the part of the input that the plant clips.
     assert by_formula.integration_error < 1e-7 < 1e-4 < by_its_limits.integration_error
 
 
 def test_a_constraint_that_is_broken_between_the_nodes_is_no_success():
-    """v <= 1.25 at nodes a quarter of a second apart, whose arc begins at 0.3 s: see `test_a_speed_limit`."""
+    """v <= 1.25 holds at nodes with a distance of 0.25 s, but its arc begins at 0.3 s. See `test_a_speed_limit`."""
     slow = dd.Constraint(lambda x: x[1], upper=1.25, name="slow")
     coarse, fine = (move(n, constraints=slow) for n in (4, 40))
     assert coarse.constraint_violation < 1e-7
     assert not coarse.success
     assert "between the nodes slow is " in repr(coarse)
     assert fine.success
-    everywhere = move(4, bounds=dd.Bounds(x_upper=[np.inf, 1.25]))  # as a bound it is kept
+    everywhere = move(4, bounds=dd.Bounds(x_upper=[np.inf, 1.25]))  # a bound is satisfied everywhere
     assert everywhere.success
     assert everywhere.cost > 8 * 1.25**2 / (3 * 0.3)
 
@@ -261,11 +261,11 @@ def test_friction_with_a_push_only():
 # ------------------------------------------------------------------------------ many states and scales
 
 
-HOVER = 0.486 * 9.81 / 2  # [N] of each rotor
+HOVER = 0.486 * 9.81 / 2  # [N] per rotor
 
 
 def fly(x, u):
-    """A planar quadrotor of 0.486 kg, 0.25 m from rotor to rotor's middle, 0.00383 kg m^2."""
+    """Return x' of a planar quadrotor of 0.486 kg and 0.00383 kg m^2, with its rotors 0.25 m from the middle."""
     push = (u[0] + u[1]) / 0.486
     return np.array(
         [x[3], x[4], x[5], -push * np.sin(x[2]), push * np.cos(x[2]) - 9.81, 0.25 * (u[0] - u[1]) / 0.00383]
@@ -274,7 +274,7 @@ def fly(x, u):
 
 @each_row("scheme, follows", [("trapezoid", False), ("hermite_simpson", True)])
 def test_a_plan_that_its_dynamics_do_not_follow_is_no_success(scheme, follows):
-    """Each interval of the trapezoid is right to 1 %, all together are not: rotors at their limit have nothing left."""
+    """Each interval of the trapezoid is right to 1 %, but the motion is not. Rotors at a limit cannot correct it."""
     count, goal = 25, np.array([0.782, 0.966, 0, 0, 0, 0])
     found = collocate(
         Dynamics(fly, 6, 2, u_lower=[0.5, 0.5], u_upper=[5.18, 5.18]),
@@ -295,11 +295,11 @@ def test_a_plan_that_its_dynamics_do_not_follow_is_no_success(scheme, follows):
 
 
 def test_feedback_follows_what_open_loop_loses():
-    """An unstable motion, x' = 3 x + u from 1 to 0 in 3 s: open loop an error grows by exp(9), and TVLQR holds it."""
+    """Errors of x' = 3 x + u from 1 to 0 in 3 s grow by exp(9) open loop, and TVLQR keeps them small."""
     unstable = Dynamics(lambda x, u: [3 * x[0] + u[0]], 1, 1)
     found = collocate(unstable, x0=[1], x_goal=[0], num_steps=30, horizon=3.0, running_cost=effort)
     assert abs(found.transcribed.led("open loop")[-1, 0]) > 100 * abs(found.transcribed.led("TVLQR")[-1, 0])
-    off = dataclasses.replace(found, xs=found.xs + 1e-5)  # no defect that counts, but 0.08 at the end
+    off = dataclasses.replace(found, xs=found.xs + 1e-5)  # a negligible defect, but 0.08 at the end
     assert found.success
     assert abs(off.transcribed.led("open loop")[-1, 0]) > 0.01
     assert abs(off.transcribed.led("TVLQR")[-1, 0]) < 1e-4
@@ -338,7 +338,7 @@ def hypersensitive(horizon, count, **options):
 
 
 def test_the_hypersensitive_problem_over_50_seconds():
-    """exp(-50) from the optimum of an infinite horizon; the refinement finds both ends."""
+    """The optimum is within exp(-50) of that of an infinite horizon. The refinement resolves both ends."""
     motion = hypersensitive(50.0, 25, error_tolerance=1e-5)
     assert motion.cost == pytest.approx(HYPERSENSITIVE, rel=1e-4)
     assert np.abs(motion.transcribed.at(np.linspace(20, 30, 100))[0]).max() < 1e-3
@@ -370,7 +370,7 @@ def test_refinement_says_when_it_gives_up():
 
 
 def test_the_cost_alone_can_ask_for_a_finer_mesh():
-    """x' = u: the trapezoid's states are exact, its cost is not."""
+    """For x' = u the states of the trapezoid are exact, but its cost is not."""
     dynamics, options = Dynamics(lambda x, u: u, 1, 1), {"x0": [1], "x_goal": [0.5], "horizon": 2.0}
     cost = dd.QuadraticCost(Q=[[0.5]], R=[[0.5]])
     motion = move(10, dynamics, running_cost=cost, scheme="trapezoid", refine=True, error_tolerance=1e-6, **options)
@@ -380,7 +380,7 @@ def test_the_cost_alone_can_ask_for_a_finer_mesh():
 
 
 def test_errors_are_the_distance_from_an_accurate_integration():
-    """A knot that is moved by 0.01 m is 0.01 m off, and so is the next."""
+    """A knot that is moved by 0.01 m has an error of 0.01 m, and so has the next one."""
     motion = move()
     assert motion.integration_errors.max() < 1e-12
     xs = np.array(motion.xs)
@@ -521,12 +521,12 @@ def test_a_running_cost_without_derivatives_is_refused():
         move(running_cost=lambda x, u: 1.0)
 
 
-# ------------------------------------------------------------------------------ times, printed
+# ------------------------------------------------------------------------------ errors and violations
 
 
 @each_row("end, error", [(1.0, 1 / 3), (2.0, 1 / 3)])
 def test_the_trapezoids_error_of_a_parabola_is_a_part_of_the_cost(end, error):
-    """x = end t: end^2 / 2 by the rule, end^2 / 3 in truth."""
+    """The cost of x = end t is end^2 / 2 by the rule and end^2 / 3 exactly."""
     problem = dd.Problem(
         dd.Dynamics(lambda x, u: [u[0]], 1, 1), x0=[0], num_steps=1, horizon=1.0, running_cost=lambda x, u: x[0] ** 2
     )
@@ -539,7 +539,7 @@ def test_the_trapezoids_error_of_a_parabola_is_a_part_of_the_cost(end, error):
 @each_row("row", [0, 2, -1])
 @each_row("column", [0, 1])
 def test_a_moved_knot_is_no_success(row, column):
-    """Whatever the solver says, the motion is measured."""
+    """The motion is measured, whatever the status of the solver is."""
     block = dd.Dynamics(lambda x, u: [x[1], u[0]], 2, 1)
     found = collocate(block, x0=[0, 0], x_goal=[1, 0], num_steps=5, horizon=1.0, running_cost=lambda x, u: u[0] ** 2)
     assert found.success
@@ -564,7 +564,7 @@ def test_an_input_beyond_its_bound_is_no_success():
 
 
 def test_a_users_constraint_is_not_called_where_the_dynamics_lead_nowhere():
-    """x' = x^2 from 1 is 1 / (1 - t), which has no value from 1 s on: Drake ends the process at a state without one."""
+    """x' = x^2 from 1 is 1 / (1 - t), which has no value from 1 s on. Drake ends the process at such a state."""
 
     def finite(x):
         assert np.asarray(x).dtype == object or np.isfinite(x).all()

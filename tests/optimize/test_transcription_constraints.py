@@ -1,4 +1,4 @@
-"""Constraints, waypoints, limits and interrupts of a transcription against closed forms, and what is no success."""
+"""Tests of constraints, waypoints, limits and interrupts of a transcription, against closed forms, and of failures."""
 
 import dataclasses
 import math
@@ -26,7 +26,7 @@ SWING = TASK | {"x_goal": [np.pi, 0], "num_steps": 20, "horizon": 2.0}
 @each_row("dynamics", [BLOCK, CALLED])
 @each_row("place", [0.5, 0.7, -0.2])
 def test_a_place_half_way(dynamics, place):
-    """J = 12 + 192 (w - 1/2)^2: the move and a hump, whose inputs are orthogonal; two cubics, exact for the scheme."""
+    """J = 12 + 192 (w - 1/2)^2 for the move and a hump, whose inputs are orthogonal. The scheme is exact for cubics."""
     motion = move(10, dynamics, waypoints={5: [place, np.nan]})
     assert motion.cost == pytest.approx(12 + 192 * (place - 0.5) ** 2, rel=1e-9)
     assert motion.xs[5, 0] == pytest.approx(place, abs=1e-9)
@@ -63,7 +63,7 @@ def test_bad_waypoints_are_named(waypoints, message):
 
 @pytest.mark.parametrize("dynamics", [BLOCK, CALLED])
 def test_a_speed_limit(dynamics):
-    """v is a parabola up to the limit V, which it reaches at tau = 3/2 (1 - 1/V): J = 8 V^2 / (3 tau)."""
+    """v is a parabola up to the limit V, which it reaches at tau = 3/2 (1 - 1/V), so that J = 8 V^2 / (3 tau)."""
     motion = move(10, dynamics, constraints=dd.Constraint(lambda x: x[1], upper=1.25))
     assert motion.cost == pytest.approx(8 * 1.25**2 / (3 * 0.3), rel=1e-7)
     assert motion.transcribed.nodes[:, 1].max() == pytest.approx(1.25, abs=1e-7)
@@ -118,7 +118,7 @@ def test_bad_constraints_are_named(constraint, message):
         collocate(BLOCK, **TASK, constraints=constraint)
 
 
-# ------------------------------------------------------------------------------ what is no success
+# ------------------------------------------------------------------------------ violated constraints
 
 
 @pytest.mark.solve
@@ -138,7 +138,7 @@ def test_a_constraint_that_cannot_be_kept_is_no_success(dynamics):
 
 @pytest.mark.parametrize("kind", ["waypoint", "constraint"])
 def test_a_node_moved_off_its_waypoint_or_constraint_is_no_success(kind):
-    """Whatever the solver says: the knot's velocity alone is moved, which is no end and has no bound."""
+    """Only the velocity of an inner knot is moved, which has no bound. The status of the solver has no effect."""
     limit = dd.Constraint(lambda x: x[1], upper=2.0)
     options = {"waypoints": {5: [np.nan, 1.5]}} if kind == "waypoint" else {"constraints": limit}
     motion = move(10, **options)
@@ -147,7 +147,7 @@ def test_a_node_moved_off_its_waypoint_or_constraint_is_no_success(kind):
     xs[5, 1] += 0.7
     moved = dataclasses.replace(motion, xs=xs)
     assert moved.constraint_violation == pytest.approx(0.7 if kind == "waypoint" else 0.2, abs=1e-7)
-    if kind == "constraint":  # nothing moved, but the constraint asks for more
+    if kind == "constraint":  # the motion is unchanged, but the constraint is tighter
         tighter = dataclasses.replace(limit, upper=1.0)
         held = dataclasses.replace(motion.problem, constraints=tighter)
         assert dataclasses.replace(motion, problem=held).constraint_violation == pytest.approx(0.5, abs=1e-7)
@@ -172,7 +172,7 @@ def test_an_interrupt_ends_with_the_best_iterate(monkeypatch):
     assert motion.solver_message == "stopped: interrupted"
     assert not motion.success
     assert np.isfinite(motion.transcribed.nodes).all()
-    assert len(lines) == 4  # it begins no further iteration
+    assert len(lines) == 4  # no further iteration begins
     form = r"iteration +(\d+)  cost +\S+  violation +\d\.\d\de[+-]\d\d"
     assert [re.fullmatch(form, line)[1] for line in lines] == ["0", "1", "2", "3"]
     assert signal.getsignal(signal.SIGINT) is former
@@ -189,19 +189,19 @@ def test_an_error_of_the_dynamics_ends_the_solve_and_is_told(error, status, at):
 
     def failing(knots):
         calls.append(len(knots))
-        if calls.count(len(knots)) == 4 and len(knots) == 41:  # the solver's at all nodes, not those of certificates
+        if calls.count(len(knots)) == 4 and len(knots) == 41:  # the solver's calls at all nodes, not the certificates'
             raise error("here it ends")
         return plain(knots)
 
     setattr(own, at, failing)
-    motion = collocate(Dynamics(own, 2, 1), other_guesses=0, **SWING)  # from others there is no error here
+    motion = collocate(Dynamics(own, 2, 1), other_guesses=0, **SWING)  # other guesses would not meet the error
     assert motion.status is status
     assert f"{error.__name__}: here it ends" in repr(motion)
     assert np.isfinite(motion.transcribed.nodes).all()
 
 
 def test_a_trial_point_out_of_the_domain_is_stepped_back_from():
-    """sqrt(x) is NaN below 0, which ends no solve."""
+    """sqrt(x) is NaN below 0, which must not end the solve."""
     dynamics = Dynamics(lambda x, u: u * np.sqrt(x), 1, 1)
     motion = collocate(dynamics, x0=[1], x_goal=[4], num_steps=10, horizon=1.0, running_cost=effort)
     assert motion.success

@@ -1,4 +1,4 @@
-"""Tolerances and searches do not depend on the units of a task."""
+"""Tests that tolerances and solves do not depend on the units of a task."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ TOO_FAR = (Status.INFEASIBLE, Status.CONVERGED_NOT_VERIFIED)
 
 
 def slide(tmp_path, unit, way, **changes):
-    """A slide of 20 mg whose motor moves it by 1 `unit` [m] from rest to rest in 1 s, F = 4 m d / T^2."""
+    """Return a slide of 20 mg whose motor can move it by 1 `unit` [m] from rest to rest in 1 s, F = 4 m d / T^2."""
     path, limit = tmp_path / "slide.urdf", 4 * 2e-5 * unit
     path.write_text(SLIDE.format(mass=2e-5, low=-1e3 * unit, high=1e3 * unit, fast=1e3 * unit, effort=limit))
     model = dd.load_model(path, time_step=0.05, base="weld")
@@ -38,9 +38,8 @@ EXPONENTS = st.floats(-6, 6)
 
 
 def pendulum(length=1.0, time=1.0, force=1.0, cost=1.0, order=(0, 1), single=(1.0, 1.0), side=1.0):
-    """A pendulum on a cart that is pulled along a slide, as plain dynamics: x = [slide, swing, rates], u = force.
-
-    Units are `length` [m], `time` [s], `force` [N] and `cost`; a state is a `single` times its own unit.
+    """Return a pendulum on a pulled cart as plain dynamics, with x = [slide, swing, rates] and u = force.
+    Units are `length` [m], `time` [s], `force` [N] and `cost`. Each state has its own unit times a factor in `single`.
     """
     unit = np.array([length, 1.0, length / time, 1 / time]) * np.array([single[0], single[1], single[0], single[1]])
     places = np.array([order[0], order[1], 2 + order[0], 2 + order[1]])
@@ -95,7 +94,7 @@ def test_a_search_does_not_depend_on_the_names_and_scales_of_single_states(plain
     ("unit", "method"), [(1e-6, "collocation"), (1e-6, "shooting"), (1e-6, "ilqr"), (1e4, "shooting"), (1e4, "ilqr")]
 )
 def test_a_slide_moves_at_the_same_cost_in_any_unit(tmp_path, unit, method):
-    """Half of the way that the motor can move it, at the least effort: u = 6 m d (T - 2 t) / T^3 costs 0.1875."""
+    """The slide moves half as far as the motor allows. The least effort u = 6 m d (T - 2 t) / T^3 costs 0.1875."""
     solution = dd.solve(slide(tmp_path, unit, 0.5), method=method)
     assert solution.success, solution.message
     metres = 0.1875 if method == "collocation" else 0.1875 / (1 - 1 / 20**2)  # a sum over 20 steps
@@ -106,7 +105,7 @@ BLOCK = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
 
 
 def test_bounds_set_no_tolerance_by_the_size_of_another_state():
-    """A state that moves by 0.05 and back within +-20, beside one that moves by 1,000: 1 % of its own way."""
+    """One state moves by 0.05 and back within +-20, another one by 1,000. Each has a tolerance of 1 % of its way."""
     both = dd.Dynamics(lambda x, u: [u[0], u[1]], nx=2, nu=2)
     bounds = dd.Bounds(x_lower=[-20, -2000], x_upper=[20, 2000])
     problem = dd.Problem(both, x0=[0, 0], x_goal=[0, 1000], num_steps=4, horizon=1.0, running_cost=1.0, bounds=bounds)
@@ -116,21 +115,21 @@ def test_bounds_set_no_tolerance_by_the_size_of_another_state():
 
 @pytest.mark.solve
 def test_a_small_motor_keeps_its_limit():
-    """0.12 g moved by 1 m by 1.2e-4 N in at least 2 sqrt(d m / F) = 2 s: IPOPT would move the limit by 1e-8 N."""
+    """1.2e-4 N move 0.12 g by 1 m in at least 2 sqrt(d m / F) = 2 s. IPOPT would move the limit by 1e-8 N."""
     light = dd.Dynamics(lambda x, u: [x[1], u[0] / 1.2e-4], nx=2, nu=1, u_lower=[-1.2e-4], u_upper=[1.2e-4])
     asked = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 10, "horizon": (0.1, 10), "running_cost": 1.0}
     solution = dd.solve(
         dd.Problem(light, **asked), method="collocation", options=dd.optimize.Options(scheme="trapezoid")
     )
     assert solution.success, solution.message
-    assert solution.horizon == pytest.approx(2, rel=0.01)  # whose jump is a line between two knots
+    assert solution.horizon == pytest.approx(2, rel=0.01)  # the input's jump is a line between two knots
     assert np.abs(solution.us).max() <= 1.2e-4 * (1 + 1e-5)
 
 
 @pytest.mark.solve
 @pytest.mark.parametrize("unit", [1.0, 1e-6])
 def test_a_row_that_is_flat_at_the_guess_is_kept_in_any_unit(unit):
-    """v^2 <= 1.25^2 has next to no slope at rest. On 1 m in 1 s it binds from 0.3 s: least effort is 8 V^2 / (3 t)."""
+    """v^2 <= 1.25^2 has almost no slope at rest. For 1 m in 1 s it is active from 0.3 s, with effort 8 V^2 / (3 t)."""
     slow = dd.Constraint(lambda x: (x[1] + 1e-14 * unit) ** 2, upper=(1.25 * unit) ** 2, name="slow")
     asked = {"x0": [0, 0], "x_goal": [unit, 0], "num_steps": 20, "horizon": 1.0, "constraints": slow}
     problem = dd.Problem(BLOCK, running_cost=dd.QuadraticCost(R=[[1.0]]), **asked)

@@ -1,4 +1,4 @@
-"""A solution by collocation is its own guess, with its mesh and its multipliers."""
+"""Tests of a collocated solution as its own initial guess, with its mesh and its multipliers."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ EFFORT = dd.QuadraticCost(R=[[1.0]])
 
 
 def block(upper=5.0, **asked):
-    """x'' = u, -5 <= u <= 5 from rest at 0 to rest at 1 in T = 1: 6 - 12 t, cut off."""
+    """Return x'' = u, -5 <= u <= 5 from rest at 0 to rest at 1 in T = 1, for which u is 6 - 12 t, clipped."""
     push = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1, u_lower=[-5], u_upper=[upper])
     given = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 20, "horizon": 1.0, "running_cost": EFFORT}
     return dd.Problem(push, **given | asked)
@@ -47,14 +47,14 @@ def test_its_own_optimum_takes_three_iterations_at_most(make, asked):
 
 
 def test_the_multiplier_of_a_limit_is_what_it_costs():
-    """Positive on an upper bound: d cost / d limit, of the bounds at the knots and what is between them."""
+    """A multiplier is positive on an upper bound. It is d cost / d limit for bounds at the knots and between them."""
     solution = dd.solve(block())
     wider = dd.solve(block(5.001))
     of_inputs = solution.multipliers.variables.reshape(-1, 3)[:, 2]
     assert of_inputs[0] > 0 > of_inputs[-1]
-    rows = solution.multipliers.rows[-20:]  # the inner Bernstein coefficient of each interval's input, the last rows
+    rows = solution.multipliers.rows[-20:]  # the last rows: the inner Bernstein coefficients of the intervals' inputs
     pushed = np.sum(np.maximum(of_inputs, 0.0)) + np.sum(np.maximum(rows, 0.0))
-    assert (solution.cost - wider.cost) / 0.001 == pytest.approx(pushed, rel=1e-2)  # the cost is curved
+    assert (solution.cost - wider.cost) / 0.001 == pytest.approx(pushed, rel=1e-2)  # the cost is nonlinear
 
 
 @pytest.mark.parametrize("moved", slow_after(1, [0.1, 1e-3]))
@@ -68,7 +68,7 @@ def test_a_problem_that_changed_comes_out_as_from_anywhere(moved):
 
 
 def test_wrong_multipliers_do_no_harm():
-    """Planted: of another sign and size, of no numbers, and of another number of rows."""
+    """Test multipliers of another sign and size, multipliers of NaN, and multipliers for another number of rows."""
     problem = block()
     solution = dd.solve(problem)
     sizes = solution.multipliers.sizes
@@ -81,7 +81,7 @@ def test_wrong_multipliers_do_no_harm():
         assert again.success
         assert again.cost == pytest.approx(solution.cost, rel=1e-6)
     assert "multipliers" not in again.solver_message
-    longer = dd.solve(replace(problem, num_steps=30, us=None), initial_guess=solution)  # across meshes they are none
+    longer = dd.solve(replace(problem, num_steps=30, us=None), initial_guess=solution)  # no multipliers on another mesh
     assert longer.success
     assert "multipliers" not in longer.solver_message
 

@@ -1,4 +1,4 @@
-"""Perturbations, rates, labels and predictions against closed forms: the double integrator written out."""
+"""Perturbations, rates, labels and predictions equal closed forms of the double integrator."""
 
 import time
 from dataclasses import replace
@@ -27,7 +27,7 @@ SPREAD = 1 / np.sqrt(3)  # the standard deviation of a number that is uniform in
 
 
 def regulated(model, steps=STEPS):
-    """From [1, 0] under u = K x."""
+    """Return the motion from [1, 0] under u = K x as a plan."""
     x, us = np.array([1.0, 0.0]), []
     for _ in range(steps):
         us.append(K @ x)
@@ -43,7 +43,7 @@ def feedback(plan, model, xs, us):
 
 
 def test_intervals_are_the_published_ones():
-    """Newcombe, Statistics in Medicine 17 (1998), table I, method 3; given there to four digits."""
+    """The intervals are from Newcombe, Statistics in Medicine 17 (1998), table I, method 3, with four digits."""
     for (successes, trials), interval in {
         (81, 263): (0.2553, 0.3662),
         (15, 148): (0.0624, 0.1605),
@@ -59,7 +59,7 @@ def test_a_margin_ends_at_the_first_level_that_fails(rates, found):
     assert margin([0.3, 0.2, 0.1], [success_rate(k, 100) for k in rates[::-1]]) == found
 
 
-# ---- what each perturbation does
+# ---- perturbations
 
 
 def draws(setup, name, level, count=400):
@@ -67,7 +67,7 @@ def draws(setup, name, level, count=400):
 
 
 def is_uniform(values, level):
-    """In [-level, level], mean 0 and standard deviation level / sqrt(3), each within four of its standard errors."""
+    """Check that values are in [-level, level] with mean 0 and deviation level / sqrt(3), to four standard errors."""
     values = np.asarray(values)
     assert np.abs(values).max() <= level
     assert abs(values.mean()) < 4 * level * SPREAD / np.sqrt(values.size)
@@ -112,7 +112,7 @@ def test_factors_are_uniform_and_the_plant_has_them(cart, setup):
     ],
 )
 def test_each_factor_is_of_its_own_quantity(file, name, owners):
-    """One factor for all of a vector, another for each owner; the world's mass is none."""
+    """All entries of a vector have the same factor, and each owner has another factor. The world has no mass."""
     model = dd.load_model(MODELS / file, time_step=H)
     own = {p.name: p.value for p in list_parameters(model)}
     plain = Setup(model, model.default_state, dd.loop.Loop(), 1.0, {})
@@ -212,11 +212,11 @@ def test_levels_are_sorted_and_those_that_apply_are_the_usual_ones(cart):
     assert "friction" not in levels_named(cart, None)
 
 
-# ---- whose fault it is
+# ---- labels of failures
 
 
 def label_of(task, levels, seeds=range(20)):
-    """The labels of the trials that fail."""
+    """Return the labels of the trials that fail."""
     return {t.label for s in seeds if (t := run_trial(task, levels, s)).label is not None}
 
 
@@ -268,7 +268,7 @@ def test_a_late_actuator_is_a_control_error(cart):
 
 
 def raising(at):
-    """Makes the plan's inputs, which raise a KeyError beyond `at` m."""
+    """Return a function that builds a controller with the plan's inputs, which raises KeyError beyond `at` m."""
 
     def make(plan, model, xs, us):
         def controller(x, t):
@@ -309,7 +309,7 @@ class Breaking(dd.loop.Sensor):
     ],
 )
 def test_what_raises_in_the_loop_fails_its_trial_and_the_others_go_on(cart, part, label, loop, controller):
-    """The plan ends at 2 m, so that every run raises on its way, and none ends the call."""
+    """The plan ends at 2 m, so that every run raises, but `robustness` still returns."""
     found = dd.robustness(pushed_and_stopped(cart), {"mass": [0.02]}, trials=3, controller=controller, loop=loop)
     assert found.cells[0].labels == {label: 3}
     assert f"the {part} failed: " in found.task.nominal.run.ended
@@ -318,7 +318,7 @@ def test_what_raises_in_the_loop_fails_its_trial_and_the_others_go_on(cart, part
 
 
 def test_a_controller_that_raises_beside_the_motion_has_no_gradient(cart):
-    """At rest at 0 and never beyond in the unperturbed run: differences look there, and it raises."""
+    """The unperturbed run rests at 0, but differences evaluate the controller at larger positions, where it raises."""
     task = Task(plan(cart, np.zeros((10, 1)), [0.0, 0.0]).plan, raising(1e-9))
     assert task.nominal.success
     assert LoopSensitivity(task).predicted("initial_state", 1.0) is None
@@ -332,7 +332,7 @@ def test_where_no_single_thing_helps_the_controller_is_to_blame(cart):
 
 
 def test_a_goal_error_that_is_not_finite_cannot_be_judged(cart):
-    """From -1e308 m, pushed past 0.8e308 m: a distance beyond 1.8e308 m, the largest number, overflows."""
+    """A push moves the cart from -1e308 m past 0.8e308 m. The distance overflows, as the largest number is 1.8e308."""
     task = Task(plan(cart, np.zeros((300, 1)), [-1e308, 0.0], [-1e308, 0.0]).plan, "open_loop")
     assert task.nominal.success
     labels = []
@@ -345,11 +345,11 @@ def test_a_goal_error_that_is_not_finite_cannot_be_judged(cart):
     assert set(labels) == {"evaluation_error"}
 
 
-# ---- what gradients predict
+# ---- predictions by gradients
 
 
 def closed_form(steps=STEPS):
-    """By perturbation of level 1, the root mean square of the last displacement, with powers of PHI."""
+    """Return the root mean square of the last displacement for each perturbation of level 1, from powers of PHI."""
     powers = [np.linalg.matrix_power(PHI, steps - 1 - k) for k in range(steps)]
     x = [np.linalg.matrix_power(PHI, k) @ [1.0, 0.0] for k in range(steps)]
     noise = [P @ B @ K for P in powers]
@@ -378,7 +378,7 @@ def test_predictions_are_the_closed_form(regulator):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["initial_state", "sensor_noise", "sensor_bias"])
 def test_what_is_measured_is_what_is_predicted(cart, name):
-    """The loop is linear, so the mean square is exact; 800 trials know it to their standard error, of which three."""
+    """The loop is linear, so the predicted mean square is exact. 800 trials agree with it to three standard errors."""
     found = dd.robustness(regulated(cart, 10), {name: [LEVEL]}, trials=800, controller=feedback).cells[0]
     last = np.linalg.matrix_power(PHI, 10) @ [1.0, 0.0]
     squares = np.array([np.sum((e.last - last) ** 2) for e in found.endings])
@@ -390,7 +390,7 @@ def test_what_is_measured_is_what_is_predicted(cart, name):
 
 
 def test_small_changes_of_the_plant_move_it_as_predicted(cart):
-    """To first order: a mass 1 % other, on 300 trials, whose mean square is known to sqrt(0.8 / 300) = 5 %."""
+    """A mass changed by 1 % is predicted to first order. 300 trials give the mean square to sqrt(0.8 / 300) = 5 %."""
     for name in ("mass", "actuator_strength"):
         found = dd.robustness(regulated(cart, 10), {name: [0.01]}, trials=300, controller=feedback).cells[0]
         assert found.ratio == pytest.approx(1, abs=3 * 0.5 * np.sqrt(0.8 / 300) + 0.01)
@@ -398,9 +398,9 @@ def test_small_changes_of_the_plant_move_it_as_predicted(cart):
 
 @each_row("name", ["mass", "inertia", "damping", "gravity"])
 def test_predictions_of_one_parameter_alone_are_central_differences(name, tmp_path):
-    """Of the whole closed loop by a factor 1 +- 1e-4, whose error is of its square: 1e-6 is far above.
+    """The differences of the closed loop with factors 1 +- 1e-4 have errors of second order, far below 1e-6.
 
-    A mass that is changed alone takes the inertia along: with the inertia's own derivative beside it it would not.
+    A mass parameter scales the inertia, unless the inertia is differentiated together with it.
     """
     path = tmp_path / "rod.urdf"
     path.write_text(
@@ -433,11 +433,11 @@ def test_nothing_is_predicted_of_what_no_gradient_tells(regulator):
         assert all(unknown.predicted(name, 0.1) is None for name in PREDICTED)
 
 
-# ---- the whole of it
+# ---- complete results
 
 
 def test_rates_margins_and_the_worst_are_of_the_trials(cart):
-    """Open loop a mass m (1 + U) ends at 2 m / (1 + U), which may be 5 % off: |U / (1 + U)| <= 0.05."""
+    """In open loop a mass m (1 + U) ends at 2 m / (1 + U), with a tolerance of 5 %: |U / (1 + U)| <= 0.05."""
     result = dd.robustness(pushed_and_stopped(cart), {"mass": [0.4, 0.02]}, trials=60, controller="open_loop")
     small, large = result.of("mass")
     assert (small.level, small.rate.successes, small.ratio) == (0.02, 60, pytest.approx(1, abs=0.25))
@@ -474,9 +474,9 @@ def test_a_plan_that_fails_has_no_success(cart):
 
 @pytest.mark.parametrize("by", ["name", "hand"])
 def test_mpc_is_a_controller(by):
-    """Of a linear plant and a quadratic cost it is TVLQR of the same cost: the same displacement, unperturbed none.
+    """For a linear plant and a quadratic cost, MPC equals TVLQR: the unperturbed motion is the planned one.
 
-    No gradient tells: at the same time it follows the same plan whatever it sees.
+    There is no prediction, as a second call at the same time would follow the same plan for any state.
     """
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
     cost = dd.QuadraticCost(np.eye(2), np.eye(1))

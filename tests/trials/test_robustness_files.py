@@ -1,4 +1,4 @@
-"""What trials leave on disk: every number, worst trials that can be run again, and nothing that lies."""
+"""Saved trials contain every number and worst trials that can be run again, and pass verification."""
 
 import json
 import re
@@ -34,7 +34,7 @@ TRIAL_FILES = {"trial.json", "trace.mcap", "replay.html", "latencies.json"}
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A pendulum on its way up in 0.4 s."""
+    """Save the plan of a pendulum that moves to 1 rad in 0.4 s, and return its directory."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
     options = {"x0": [0, 0], "x_goal": [1.0, 0], "num_steps": 20, "running_cost": dd.QuadraticCost(R=[[1.0]])}
     directory = tmp_path_factory.mktemp("runs") / "pendulum"
@@ -153,7 +153,7 @@ def test_the_page_opens_without_a_network_and_without_an_error(saved, browser, t
     open_page(browser, page, size=size, scheme=scheme)
     assert browser.execute_script("return document.documentElement.scrollWidth") <= size[0]
     drawn = "return document.querySelectorAll('.plot canvas').length"
-    assert browser.execute_script(drawn) == 4  # angle, speed, torque, status: a folded part is drawn when it is opened
+    assert browser.execute_script(drawn) == 4  # angle, speed, torque, status: folded parts are drawn when opened
     browser.execute_script("document.querySelectorAll('details.part').forEach(d => { d.open = true; })")
     wait_for_frame(browser)
     assert browser.execute_script("return document.documentElement.scrollWidth") <= size[0]
@@ -219,7 +219,7 @@ def test_a_run_that_breaks_off_at_once_and_one_with_a_fallback_are_kept(cart, tm
 @pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning", "ignore:invalid:RuntimeWarning")
 @pytest.mark.parametrize("levels", [{"push": [1.7e308]}, {"push": [1e20]}])
 def test_what_runs_away_is_kept(cart, tmp_path, levels):
-    """Beyond what can be judged or drawn; the last one only beyond what can be drawn."""
+    """The first motion is too large to be judged or drawn, the second only too large to be drawn."""
     start = [0.0 if levels == {"push": [1e20]} else -1e308, 0.0]
     result = dd.robustness(
         plan(cart, np.zeros((300, 1)), start, start), levels, trials=8, controller="open_loop", seed=1
