@@ -39,7 +39,7 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def audit(model: Any, file: Path) -> None:
-    """List the parts of MODEL that cannot be differentiated correctly, or at all, and how to change them.
+    """List problems of MODEL, such as parts that cannot be differentiated or have no motor, and remedies.
 
     Exit status 1 if a finding is an error.
     """

@@ -154,7 +154,7 @@ def plots_of(m: Measurement) -> Iterator[Plot]:
         times, energy = motion.times, Line("total", motion.energy)
         parts = [Line("kinetic", motion.kinetic_energy), Line("potential", motion.potential_energy), energy]
         yield Plot("energy", "J", times, parts, group=PHYSICS)
-        note = "what neither actuators nor damping account for: the time stepping's error, and what contact takes"
+        note = "change of energy that inputs, damping, contact and joint limits do not explain: an error of the steps"
         yield Plot("unexplained energy", "J", times, [Line("error", motion.energy_error)], note=note, group=PHYSICS)
         note = "nothing can touch"
         if math.isfinite(m.penetration_limit):
