@@ -1,4 +1,4 @@
-"""What makes two engines' steps differ is named: each single change of a model, of a scheme, of a law."""
+"""Check that the cause of a difference between two engines' steps is named, for changes of model, scheme and law."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def arm_state(model):
 @pytest.mark.parametrize(
     ("scheme", "v_next", "moved"),
     [
-        # M = 2, D = 3, force -K q: implicit (M + h D) a = -K q - D v, explicit M a = -K q - D v; from q = 0.1, v = 0.5
+        # M = 2, D = 3, force -K q. Implicit: (M + h D) a = -K q - D v. Explicit: M a = -K q - D v. q = 0.1, v = 0.5.
         ("damping implicit, positions by v'", 0.5 + H * (-K * 0.1 - D * 0.5) / (M + H * D), "new"),
         ("damping explicit, positions by v'", 0.5 + H * (-K * 0.1 - D * 0.5) / M, "new"),
         ("damping explicit, positions by v,", 0.5 + H * (-K * 0.1 - D * 0.5) / M, "old"),
@@ -50,7 +50,7 @@ def test_an_exponential_turn_is_rodrigues_formula():
     np.testing.assert_allclose(exponential_turn(quaternion, np.zeros(3)), quaternion, atol=0)
 
 
-# A change of the model that MuJoCo is given, and the term that must be found to be responsible.
+# A change of the model for the tested engine, and the terms that may be named as responsible.
 CHANGES = {
     "mass": ({"mass": 1.3 * 1.01}, {"inertia", "bias"}),
     "frame": ({"rpy": "0.3 0.2 0.15"}, {"inertia", "bias"}),
@@ -72,7 +72,7 @@ def test_the_term_that_was_changed_is_found(tmp_path, name, change):
     found = of(plain, other, *arm_state(plain.model))
     assert found.responsible in terms
     assert found.gap > 1e-6
-    # The other terms are the same numbers, and what no term explains is rounding.
+    # The other terms are equal, and the unexplained part is rounding.
     assert found.effects["unexplained"] < 1e-9 * max(1.0, found.gap / 1e-6)
     assert next(iter(found.effects.values())) == max(found.effects.values())
 
@@ -103,7 +103,7 @@ def test_a_turning_body_differs_by_the_exponential(load):
     found = of(drake, mujoco, x, np.zeros(0))
     assert found.responsible == "integrator"
     assert [scheme.turn for scheme in found.schemes] == ["first term", "exponential"]
-    # From no turn at all: (cos a, sin a n) against (1, a n) of norm 1, a the half angle and n the axis.
+    # From the identity: (cos a, sin a n) against the normalized (1, a n), with half angle a and axis n.
     w = drake.step(x, np.zeros(0))[7:10]
     a = model.time_step * np.linalg.norm(w) / 2
     along = np.abs(w / np.linalg.norm(w)).max()
@@ -124,7 +124,7 @@ def test_contact_and_limits_are_told_apart_from_the_free_step(load):
 
 
 class Doctored:
-    """An engine that steps otherwise than its own terms say, and offers no mass matrix where asked not to."""
+    """An engine whose step differs from its terms by `push`, and which offers no mass matrix if `offers` is False."""
 
     def __init__(self, engine, push=0.0, offers=True):
         self.engine, self.push, self.offers = engine, push, offers

@@ -1,4 +1,4 @@
-"""Engines side by side: what is the same is found to be, what is not is found, and why."""
+"""Check comparisons of engines: equal engines are found to be equal, and differences are found and explained."""
 
 from dataclasses import replace
 
@@ -45,7 +45,7 @@ def test_a_free_model_is_the_same_in_every_engine(load):
         assert e.step_gaps.max() < 1e-13
         assert e.jacobian_gaps.max() < 1e-10
         assert e.motion.xs.shape == (51, model.nx)
-        # A product of 50 Jacobians, each to 1e-11 of its largest entry.
+        # The rollout Jacobian is a product of 50 Jacobians, each accurate to 1e-11 of its largest entry.
         np.testing.assert_allclose(e.rollout_jacobian, found.reference.rollout_jacobian, atol=1e-8)
         assert e.seconds_per_step > 0
         assert e.seconds_per_jacobian > 0
@@ -84,7 +84,7 @@ def test_contact_laws_are_told_apart_and_the_free_part_is_not(load):
         assert e.largest.responsible == "contact law"
         assert "contact law" in [line.quantity for line in e.told]
         assert max(e.step_gaps[: fall - 2]) < STEP_TOLERANCE["float64"]
-    # Nothing holds the ball in Pinocchio, as its contract tells: it is not the same model.
+    # Pinocchio has no contact pairs, as its contract says, so it is not the same model.
     assert not compared.holds
     assert [line.quantity for line in found["pinocchio"].broken] == ["contact pairs"]
     assert found["pinocchio"].motion.xs[-1, 6] < 0
@@ -94,7 +94,7 @@ def test_contact_laws_are_told_apart_and_the_free_part_is_not(load):
 
 @pytest.mark.parametrize("name", ["mujoco", "pinocchio"])
 def test_another_model_is_no_other_law(tmp_path, name):
-    """One per cent of mass: the contract is broken, however well the gap can be told of."""
+    """A mass that is 1 % larger breaks the contract, even if the gap has an explanation."""
     heavier = engine_of(name, arms(tmp_path, mass=1.3 * 1.01))
     e = by_name(dd.compare(arms(tmp_path), (heavier,), num_steps=20))[name]
     assert e.verdict == "other model"
@@ -112,7 +112,7 @@ def test_what_no_contract_tells_of_is_unexplained(load):
 
 
 def test_a_wrong_jacobian_is_found_where_every_step_is_right(load):
-    """One entry is 1e-4 off: neither the reference's nor that of the engine's own step."""
+    """One entry is off by 1e-4, so the Jacobian is neither the reference's nor that of the engine's own step."""
     model = load("pendulum.urdf")
     drake = engine_of("drake", model)
 
@@ -176,7 +176,7 @@ def test_missing_and_impossible_engines_are_listed_with_the_reason(load, monkeyp
     assert "drake-diff[absent]" in told["absent"].reason
     assert told["numpy"].installed
     assert "no hand calculation" in told["numpy"].reason
-    assert not found.holds  # nothing was compared
+    assert not found.holds  # no engine was compared
 
 
 def test_bad_input_is_named(load):
@@ -204,7 +204,7 @@ def test_a_float32_engine_has_its_own_tolerance(load):
 @pytest.mark.slow
 @each_row("name, verdict", [("pinocchio", "other model"), ("mujoco", "other law")])
 def test_another_jacobian_in_contact_is_not_unexplained(load, name, verdict):
-    """The motion never touches; at the sampled contact state Pinocchio has no contact, and MuJoCo another law of it."""
+    """The motion has no contact. At the sampled contact state, Pinocchio has no contact and MuJoCo another law."""
     needs(name)
     model = load("sphere_on_ground.sdf")
     x0 = np.array(model.default_state)
@@ -213,7 +213,7 @@ def test_another_jacobian_in_contact_is_not_unexplained(load, name, verdict):
     assert e.first_apart is None
     assert e.verdict == verdict
     of_states = {e.jacobians[i].state: e.laws[i] for i in e.other_states}
-    # MuJoCo turns by the exponential.
+    # MuJoCo integrates rotations with the exponential map.
     assert of_states == {"contact": "contact law"} | ({} if name == "pinocchio" else {"free": "integrator"})
 
 

@@ -1,4 +1,4 @@
-"""What a comparison leaves on disk: every engine's numbers, readable by others, and nothing that lies."""
+"""Check the files of a comparison: every engine's numbers are readable, and incomplete results are marked."""
 
 import json
 from hashlib import sha256
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.solve
 
 @pytest.fixture(scope="module")
 def ball():
-    """A ball that falls on the ground in Drake, twice, and in Pinocchio, which has none."""
+    """Compare a ball that falls on the ground in Drake (twice) and in Pinocchio, which has no ground contact."""
     needs("pinocchio")
     model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.01)
     x0 = np.array(model.default_state)
@@ -51,7 +51,7 @@ def test_the_record_has_every_number_and_its_own_hash(ball, saved):
         assert np.array_equal(found.jacobians[0].jacobian, e.jacobians[0].jacobian)
         assert found.largest.effects == e.largest.effects
     assert [r.engine for r in record.refused] == ["numpy"]
-    assert record.verdict == "fail"  # Pinocchio has no contact, and the ball lands
+    assert record.verdict == "fail"  # the ball lands, and Pinocchio has no contact
 
 
 def test_the_trace_has_every_engines_motion(ball, saved):

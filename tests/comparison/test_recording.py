@@ -1,4 +1,4 @@
-"""Recorded motions: read from every kind of file, compared step by step, and told as if what they had been stepped."""
+"""Check recorded motions: reading from all file types, comparison step by step, and the law that they imply."""
 
 import gzip
 import json
@@ -29,7 +29,7 @@ INPUTS = 2 * np.sin(np.arange(40))[:, None]
 
 
 def record(engine, x0, us, *, every=1, h=H, name="recorded", **facts):
-    """What `engine` does, each `every`-th state kept."""
+    """Record the engine's motion, with every `every`-th state."""
     motion = move(engine, np.array(x0, dtype=float), np.repeat(us, every, axis=0))
     return dd.Recording(name, "1", h * np.arange(len(us) + 1), motion.xs[::every], us, facts)
 
@@ -43,7 +43,7 @@ def write_csv(path, header, rows):
     return path
 
 
-# ---- compared ----------------------------------------------------------------------------------------------------
+# ---- comparison --------------------------------------------------------------------------------------------------
 
 
 def test_a_recording_of_the_same_model_is_the_same_and_has_no_jacobians(load):
@@ -52,13 +52,13 @@ def test_a_recording_of_the_same_model_is_the_same_and_has_no_jacobians(load):
     mujoco = engine_of("mujoco", model)
     found = dd.compare(model, ("numpy",), recordings=(record(mujoco, [0, 0.7, 0, 0], INPUTS),))
     numpy, e = found.engines[1:]
-    np.testing.assert_array_equal(found.x0, [0, 0.7, 0, 0])  # the recording's: all engines run the same motion
+    np.testing.assert_array_equal(found.x0, [0, 0.7, 0, 0])  # the recording's x0 is used by all engines
     np.testing.assert_array_equal(found.us, INPUTS)
-    np.testing.assert_allclose(numpy.motion.xs, e.motion.xs, atol=1e-10)  # 40 steps, each to rounding
+    np.testing.assert_allclose(numpy.motion.xs, e.motion.xs, atol=1e-10)  # 40 steps, each accurate to rounding
     assert (e.engine, e.verdict, e.first_apart, e.gradient) == ("recorded", "same", None, "none")
     assert e.step_gaps.max() < 1e-13
     assert (len(e.jacobians), e.rollout_jacobian, e.seconds_per_step) == (0, None, None)
-    assert e.motion.energy is not None  # Drake's, of the recorded states
+    assert e.motion.energy is not None  # Drake computes the energy of the recorded states
     assert "Jacobian" not in e.sentence
 
 
@@ -70,7 +70,7 @@ def test_the_reference_takes_as_many_steps_as_lie_between_samples(load):
     assert e.final_gap == 0.0
     late = record(drake, [0.5, 0], INPUTS[:10])
     late = dd.Recording("late", "1", late.times + 7, late.xs, late.us)
-    assert compared(model, late).motion.times[0] == 0.0  # as the others' are
+    assert compared(model, late).motion.times[0] == 0.0  # the times start at 0 for all engines
     for period in (1.5 * H, 0.5 * H):
         with pytest.raises(InputError, match=rf"0\.01 s, got {period:g}"):
             compared(model, record(drake, [0.5, 0], INPUTS[:10], h=period))
@@ -87,7 +87,7 @@ def damped_cart_pole(tmp_path, damping):
 
 
 def explicit_damping(model, tmp_path):
-    """MuJoCo without eulerdamp."""
+    """Return the MuJoCo engine without `eulerdamp`."""
     path = tmp_path / "explicit.xml"
     text = mjcf(engine_of("mujoco", model).description, model.time_step)
     path.write_text(text.replace('warmstart="disable"', 'warmstart="disable" eulerdamp="disable"'))
@@ -96,7 +96,7 @@ def explicit_damping(model, tmp_path):
 
 @pytest.mark.slow
 def test_explicit_joint_damping_is_another_law_and_half_of_the_time_step_is_unexplained(tmp_path):
-    """The smallest change of the model that explains a recording is what `dd.explain` seeks."""
+    """Searching for the smallest change of the model that explains a recording is left to `dd.explain`."""
     model, x0 = damped_cart_pole(tmp_path, 0.4), [0, 0.7, 0.3, -0.2]
     e = compared(model, record(explicit_damping(model, tmp_path), x0, INPUTS))
     told = "as if joint damping were explicit"
@@ -116,7 +116,7 @@ def test_mujoco_s_turn_of_a_free_body_is_named(load):
 
 
 def test_what_no_single_change_takes_is_unexplained(load):
-    """A push of 1e-3 on every state, and gravity that is another without pointing the other way."""
+    """The changes are a push of 1e-3 on every state, and a gravity with a different size but the same direction."""
     model = load("pendulum.urdf")
     recording = record(engine_of("drake", model), [0.5, 0], INPUTS)
     pushed = dd.Recording("pushed", "1", recording.times, recording.xs + 1e-3 * np.arange(41)[:, None], INPUTS)
@@ -134,7 +134,7 @@ def test_contact_is_the_contact_law_s_and_a_told_law_explains_it(load):
     x0[6] = 0.15
     recording = record(engine_of("mujoco", model), x0, np.zeros((30, 0)))
     e = compared(model, recording)
-    assert (e.verdict, e.largest.responsible) == ("unexplained", "contact law")  # no fact tells of the law
+    assert (e.verdict, e.largest.responsible) == ("unexplained", "contact law")  # the recording has no fact on the law
     told = {"contact law": "soft constraint, elliptic cone"}
     e = compared(model, dd.Recording("told", "1", recording.times, recording.xs, recording.us, told))
     assert (e.verdict, [line.quantity for line in e.told]) == ("other law", ["contact law"])
@@ -158,7 +158,7 @@ def test_facts_are_lines_of_the_contract_and_nothing_else_is_known(load):
     rounded = dd.Recording("r", "1", rounded.times, rounded.xs.astype(np.float32), INPUTS, rounded.facts)
     assert compared(model, rounded).verdict == "same"
     strict = dd.Recording("r", "1", rounded.times, rounded.xs, INPUTS)
-    assert compared(model, strict).verdict == "unexplained"  # precision is not guessed
+    assert compared(model, strict).verdict == "unexplained"  # precision is not guessed from the numbers
 
 
 def test_a_recording_by_hand_is_checked_too(load):
@@ -339,16 +339,14 @@ def test_rows_and_records_without_end_are_refused(load, tmp_path):
         base.execute(f"CREATE VIEW messages AS {numbers}")
     with pytest.raises(ArtifactError, match=r"bag\.db3: expected tables of messages alone, got 1 views and triggers"):
         read_recording(tmp_path / "bag", load("pendulum.urdf"))
-    zeros = bytes(
-        9 * 10
-    )  # ten records of opcode 0 and no length: the mcap package reads 33 million of them in a minute
+    zeros = bytes(9 * 10)  # ten records of opcode 0 without length: mcap reads 33 million of them in a minute
     chunk = struct.pack("<QQQIIQ", 0, 0, len(zeros), zlib.crc32(zeros), 0, len(zeros)) + zeros
     with pytest.raises(ValueError, match="opcode 0"):
         raw_messages(b"\x89MCAP0\r\n" + struct.pack("<BQ", 6, len(chunk)) + chunk, "cdr")
 
 
 def bag_of(path, messages):
-    """A bag of (topic, type, header frame, stamp [ns], fields) with rosbags."""
+    """Write a bag of (topic, type, header frame, stamp [ns], fields) with rosbags."""
     pytest.importorskip("rosbags", reason="no rosbags (the extra `ros2`)")
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
@@ -384,7 +382,7 @@ def twist(types, linear, angular):
 
 
 def odometry(types, x, R):
-    """As REP 105 has it: the twist in the child's frame, the quaternion x y z w."""
+    """Return the fields as REP 105 defines them: the twist in the child frame, and the quaternion as x y z w."""
     covariance = np.zeros(36)
     return {
         "child_frame_id": "ball",
@@ -401,7 +399,7 @@ BALL = np.array([*TURNED.ToQuaternion().wxyz(), 1, 2, 3, 0.4, -0.5, 0.6, 7, 8, -
 
 
 def ball_bag(path, parts):
-    """The ball in flight by Drake, at times of today, as messages made of each state."""
+    """Write a bag of a ball's flight from Drake, with messages for each state and present-day time stamps."""
     model = dd.load_model(MODELS / "projectile.sdf", time_step=H)
     xs = dd.rollout(model, BALL, num_steps=5).xs
     rows = [part(STAMP + 10_000_000 * k, x) for k, x in enumerate(xs) for part in parts]
@@ -415,16 +413,16 @@ def rotation_of(x):
 
 
 def test_odometry_s_frames_and_quaternion_are_mapped(tmp_path):
-    """The twist is turned from the child frame, w goes to the front: a mistake in either leaves no step the same."""
+    """The twist is rotated from the child frame, and w moves to the front. With an error in either, no step agrees."""
     part = lambda t, x: ("/odom", "nav_msgs/msg/Odometry", "world", t, lambda y: odometry(y, x, rotation_of(x)))  # noqa: E731
     model, xs, path = ball_bag(tmp_path / "bag", [part])
     found = read_recording(path, model)
-    np.testing.assert_allclose(found.xs[0], BALL, atol=1e-14)  # by hand, the rotation by Drake's own
+    np.testing.assert_allclose(found.xs[0], BALL, atol=1e-14)  # by hand, with Drake's rotation
     np.testing.assert_allclose(found.xs, xs, atol=1e-14)
-    np.testing.assert_allclose(found.times, H * np.arange(6), atol=1e-9)  # from 0, to the nanosecond
+    np.testing.assert_allclose(found.times, H * np.arange(6), atol=1e-9)  # times start at 0 and are accurate to 1 ns
     assert compared(model, found).verdict == "same"
     swapped = np.array(found.xs)
-    swapped[:, :4] = np.roll(found.xs[:, :4], -1, axis=1)  # x y z w
+    swapped[:, :4] = np.roll(found.xs[:, :4], -1, axis=1)  # the order x y z w
     as_child = np.array(found.xs)
     as_child[:, 7:10] = found.xs[:, 7:10] @ TURNED.matrix()
     for wrong in (swapped, as_child):
@@ -458,7 +456,7 @@ def test_pose_and_twist_say_their_frame(tmp_path, frame):
 
 
 def two_in_mujoco(model, *, fine=1, count=30):
-    """Both bodies thrown and turning, their arms driven: MuJoCo in steps of H / fine."""
+    """Record two thrown and rotating bodies with driven arms, from MuJoCo with steps of H / fine."""
     random = np.random.default_rng(0)
     x0 = np.array(model.default_state)
     x0[16:] = 0.3 * random.standard_normal(14)
@@ -475,7 +473,7 @@ def csv_of(path, model, r):
 
 
 def test_a_recording_of_two_free_bodies_is_compared_and_the_wrong_mass_is_seen(tmp_path):
-    """By MuJoCo, whose turn of a free body is the only difference of the right model."""
+    """The recording is from MuJoCo, which differs from the right model only in its rotation of free bodies."""
     needs("mujoco")
     model = two_bases(tmp_path)
     right = csv_of(tmp_path / "right.csv", model, two_in_mujoco(model))
@@ -484,17 +482,17 @@ def test_a_recording_of_two_free_bodies_is_compared_and_the_wrong_mass_is_seen(t
     wrong = csv_of(tmp_path / "wrong.csv", model, two_in_mujoco(two_bases(tmp_path, 0.65)))
     e = compared(model, read_recording(wrong, model))
     assert e.verdict == "unexplained"
-    assert e.step_gaps.max() > 1e-4  # 30 % of an arm's mass, where the turn's law makes 1e-7
+    assert e.step_gaps.max() > 1e-4  # 30 % of an arm's mass, whereas the rotation law gives 1e-7
 
 
 def two_bag(path, model, xs, names):
-    """Joint states, and each body's odometry in the topic and with the child frame that `names` says."""
+    """Write a bag of joint states and each body's odometry, with topics and child frames from `names`."""
     rows = []
     for k, x in enumerate(xs):
         t = STAMP + 10_000_000 * k
         state = joints(["right_turn", "left_turn"], x[[15, 7]], x[[29, 22]], [0.2, 0.1])
         rows.append(("/joint_states", "sensor_msgs/msg/JointState", "", t, state))
-        for (topic, frame), i, j in zip(names, (8, 0), (23, 16), strict=True):  # the right one is written first
+        for (topic, frame), i, j in zip(names, (8, 0), (23, 16), strict=True):  # the right body is first
             body = np.concatenate([x[i : i + 7], x[j : j + 6]])
             made = lambda types, body=body, frame=frame: {  # noqa: E731
                 **odometry(types, body, rotation_of(body)),
@@ -507,9 +505,9 @@ def two_bag(path, model, xs, names):
 @each_row(
     "names, match",
     [
-        ([("/odom", "right_body"), ("/odom", "left_body")], ""),  # one topic, told apart by the frame
+        ([("/odom", "right_body"), ("/odom", "left_body")], ""),  # one topic, with two frames
         ([("/a", "/right_body"), ("/b", "left_body")], ""),
-        ([("/right_body/odom", "base_link"), ("/left_body/odom", "base_link")], ""),  # by the topic
+        ([("/right_body/odom", "base_link"), ("/left_body/odom", "base_link")], ""),  # separate topics
         ([("/a", "base_link"), ("/b", "left_body")], r"Odometry of the free body right_body: .*/b \(of left_body\)"),
         ([("/a", "left_body"), ("/b", "left_body")], r"Odometry of the free body left_body"),
     ],
@@ -550,7 +548,7 @@ def test_a_body_that_is_missing_at_one_time_is_named(tmp_path):
 
 
 def test_a_follower_is_left_out_of_a_bag_s_state(tmp_path):
-    """`a` is in the state, `b` follows it; a reader of this bag has both."""
+    """Only `a` is in the state and `b` follows it, but the bag's messages have both."""
     from helpers.followers import followed
 
     model = followed(tmp_path)

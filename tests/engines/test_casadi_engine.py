@@ -1,4 +1,4 @@
-"""adam's CasADi expressions against hand calculations and Drake, and the URDF that they are built from."""
+"""Compare adam's CasADi expressions with hand calculations and Drake, and check the URDF that adam reads."""
 
 import warnings
 
@@ -30,7 +30,7 @@ BOX = SpatialInertia.SolidBoxWithMass(1.3, 0.1, 0.2, 0.3)
 
 
 def add_joint(plant, kind, name, parent, body, axis, *, on_child=TURN):
-    """A joint whose frames are turned against both of its bodies."""
+    """Add a joint whose frames are rotated relative to both bodies."""
     frames = [
         plant.AddFrame(FixedOffsetFrame(f"{name}_{i}", frame, X))
         for i, (frame, X) in enumerate(((parent, TURN), (body.body_frame(), on_child)))
@@ -39,7 +39,7 @@ def add_joint(plant, kind, name, parent, body, axis, *, on_child=TURN):
 
 
 def turned(*, free):
-    """A hinge and two slides, every frame turned; on a free body whose joint's frames are turned too, or the world."""
+    """Return a model of a hinge and two slides with rotated frames, on the world or on a free body (also rotated)."""
     plant = Plant(0.01)
     parent = plant.plant.world_frame()
     if free:
@@ -108,7 +108,7 @@ def test_a_velocity_in_another_frame_is_found(monkeypatch):
 
 
 def test_adams_own_slide_is_still_wrong(monkeypatch):
-    """When this fails, `_Joint` can go."""
+    """Check that adam still has this error. When this test fails, `_Joint` can be removed."""
     from drake_diff.engines import casadi as casadi_engine
 
     monkeypatch.delattr(casadi_engine._Joint, "motion_subspace")
@@ -132,7 +132,7 @@ def read_back(model, tmp_path):
     path = tmp_path / "written.urdf"
     path.write_text(urdf(describe(model)))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ModelWarning)  # Drake makes a floating joint one of its own
+        warnings.simplefilter("ignore", ModelWarning)  # Drake replaces a floating joint with its own
         return dd.load_model(path, time_step=model.time_step)
 
 
@@ -152,7 +152,7 @@ def test_pinocchio_reads_the_same_model_from_the_urdf(tmp_path):
     for _ in range(3):
         q, v = random.uniform(-1, 1, (2, model.nq))
         bias = pin.rnea(read, read.createData(), q, v, np.zeros(model.nv))
-        np.testing.assert_allclose(bias, drake.bias(q, v), rtol=0, atol=1e-12)  # sums over six links
+        np.testing.assert_allclose(bias, drake.bias(q, v), rtol=0, atol=1e-12)  # the bias sums over six links
     np.testing.assert_allclose(read.lowerPositionLimit, [joint.lower for joint in drake.contract.joints], rtol=1e-15)
     np.testing.assert_allclose(read.upperEffortLimit, drake.contract.effort_limits, rtol=1e-15)
 

@@ -1,4 +1,4 @@
-"""A user's own equations beside Drake: right ones are the same, each planted error is found and named by its part."""
+"""Compare a user's equations with Drake: correct ones are "same", and each planted error is found and named."""
 
 import inspect
 import re
@@ -22,7 +22,7 @@ TRUE = {"cart": 1.0, "bob": 0.3, "length": 0.5, "g": 9.81, "coriolis": 1.0, "gai
 
 
 def cart_pole(q, v, u, p):
-    """A textbook's: both accelerations solved for, the pole's angle from hanging."""
+    """Return a textbook's two accelerations, solved explicitly, with the pole's angle measured from hanging."""
     s, c, m, length = np.sin(q[1]), np.cos(q[1]), p["bob"], p["length"]
     total = p["cart"] + m * s**2
     whirl, force = p["coriolis"] * length * v[1] ** 2, p["gain"] * u[0]
@@ -66,13 +66,13 @@ def test_a_textbooks_equations_stand_beside_drake_and_mujoco(model):
     both = dd.compare(model, [mine(model), "mujoco"], num_steps=20)
     assert both.holds
     assert [e.verdict for e in both.engines[1:]] == ["same", "same"]
-    # Rounding of one step of numbers of size 1.
+    # The tolerance is the rounding of one step with numbers of size 1.
     assert both.engines[1].step_gaps.max() < 1e-14
     assert both.engines[1].gradient == "none"
     assert both.engines[1].function.name == "cart_pole"
 
 
-WRONG = {  # what is wrong: parameters, the only part that is different, how it is told
+WRONG = {  # error: (parameters, the only different part, pattern of its detail)
     "the sign of gravity": ({"g": -9.81}, "forces at rest", "of hinge, .* -1 times the expected value"),
     "gravity of another place": ({"g": 9.7902}, "forces at rest", "0.997982 times"),
     "no velocity products": ({"coriolis": 0.0}, "velocity products", "of slide, .*e?-?[0-9]+ times"),
@@ -116,7 +116,7 @@ def test_another_integrator_is_another_law_and_excuses_no_equation(damped):
 
 
 def test_rk4_is_of_fourth_order(load):
-    """Halving the step takes at least 14 of the 16 by which an error of order 5 in one step, 4 in all, shrinks."""
+    """Check that halving the step divides the error by at least 14: fourth order gives 16."""
     x, ends = np.array([1.0, 0.5]), []
     for count in (4, 8, 256):
         model = load("pendulum.urdf", time_step=0.4 / count)
@@ -209,7 +209,7 @@ PLANTED = ("gravity", "products", "damping", "gain", "mass", "order")
 
 
 def robots_equations(model, wrong=None, random=None):
-    """Of Pinocchio's M and bias, with one thing wrong: a right one shares nothing with Drake's dynamics."""
+    """Return equations from Pinocchio's M and bias, which share nothing with Drake, with an optional planted error."""
     other, nv = engine_of("pinocchio", model), model.nv
     D, B = np.array(other.damping), np.array(other.actuation)
     joint = int(random.choice(np.flatnonzero(np.any(B != 0, axis=1)))) if random is not None else 0

@@ -1,4 +1,4 @@
-"""What touches what, where, and of what it is made are lines that fail; only the form of the contact law may differ."""
+"""Check that differences of shapes, poses and contact parameters fail, and that the contact law's form may differ."""
 
 import re
 
@@ -28,7 +28,7 @@ def ball(load):
 
 
 def own(tmp_path, model, *edits):
-    """MuJoCo on the MJCF that is compared, the first match of each pattern replaced."""
+    """Load MuJoCo with the exported MJCF, after replacing the first match of each pattern."""
     text = written("mjcf", describe(model), model.time_step)
     for pattern, new in edits:
         text, count = re.subn(pattern, new, text, count=1)
@@ -45,7 +45,7 @@ def resting(model):
 
 
 FLOOR = r'pos="0.0 0.0 0.0"( quat="[^"]*" />\s*</body>\s*<body name="ball")'
-# What is edited in the MJCF, the line that must fail, and a word of it.
+# The edit of the MJCF (pattern, replacement), the line that must fail, and a word of its detail.
 CHANGED = {
     "friction": (r'friction="0.5 0.5', 'friction="0.01 0.01', "friction", "0.01"),
     "friction across": (r'friction="0.5 0.5', 'friction="0.5 0.3', "other contact terms", "0.3"),
@@ -90,7 +90,7 @@ def test_the_same_contact_holds_under_another_law_and_by_other_names(ball, tmp_p
 
 
 def test_the_filters_of_a_model_written_by_hand_are_read(tmp_path):
-    """Drake reads the same MJCF: it and MuJoCo agree on what may touch, but for what the text excludes in one."""
+    """Drake and MuJoCo read the same MJCF and agree on the contact pairs, unless one of the texts excludes a pair."""
     needs("mujoco")
     text = """<mujoco model="two"><option timestep="0.01"/><worldbody><geom name="floor" type="plane" size="0 0 1"/>
     <body name="ball" pos="0 0 1"><freejoint name="ball"/><geom name="shell" size=".1" mass="1"/></body>
@@ -105,7 +105,7 @@ def test_the_filters_of_a_model_written_by_hand_are_read(tmp_path):
     drake = DrakeEngine(model)
     found = different(drake, dd.engines.load_engine("mujoco", model, path=path))
     assert not found.keys() & {"shapes", "poses", "contact pairs", "friction", "contact margin"}
-    assert "stiffness" in found  # MuJoCo's own, by mass, is not Drake's
+    assert "stiffness" in found  # MuJoCo's default stiffness scales with the mass, unlike Drake's
     for change, word in (
         ('<contact><exclude body1="ball" body2="arm"/></contact>', "upper"),
         ('<contact><pair geom1="upper" geom2="lower"/></contact>', "lower"),
@@ -121,7 +121,7 @@ def test_the_filters_of_a_model_written_by_hand_are_read(tmp_path):
 @pytest.mark.parametrize("condim", [1, 3, 4, 6])
 @pytest.mark.parametrize("solref", ["-900 -60", "0.03 1", "0.001 1"])
 def test_the_stiffness_that_is_read_is_that_on_which_a_weight_rests_in_mujoco(cone, condim, solref):
-    """m g / k deep, for every cone, dimension and form of solref; 0.001 s is cut at two steps."""
+    """The weight rests at depth m g / k for all cones, dimensions and solrefs. MuJoCo raises 0.001 s to two steps."""
     mujoco = pytest.importorskip("mujoco")
     from drake_diff.engines.mujoco_contract import read_pairs
 
@@ -130,7 +130,7 @@ def test_the_stiffness_that_is_read_is_that_on_which_a_weight_rests_in_mujoco(co
     <worldbody><geom type="plane" size="0 0 1"/><body pos="0 0 .1"><freejoint/><geom size=".1" mass="1.3"/></body>
     </worldbody></mujoco>""")
     data = mujoco.MjData(model)
-    for _ in range(2000):  # 4 s, sixty time constants
+    for _ in range(2000):  # 4 s are sixty time constants
         mujoco.mj_step(model, data)
     (pair,) = read_pairs(model)
     assert -data.contact[0].dist == pytest.approx(1.3 * G / pair.stiffness, rel=1e-6)
@@ -143,7 +143,7 @@ def test_the_exported_mjcf_is_the_one_that_was_compared_and_rests_at_m_g_over_k(
     assert text == engine_of("mujoco", ball).mjcf
     engine = dd.engines.load_engine("mujoco", ball, path=tmp_path / "out" / "model.xml")
     x = resting(ball)
-    for _ in range(600):  # 3 s: the damping is critical, at 30 rad/s
+    for _ in range(600):  # 3 s, with critical damping at 30 rad/s
         x = engine.step(x, [])
     assert engine.contact_depth(x) == pytest.approx(1.0 * G / 1e4, rel=1e-6)
 
@@ -172,7 +172,7 @@ def test_the_form_of_the_law_is_named(ball, tmp_path, option, said):
     lines = dd.engines.match_contracts(DrakeEngine(ball), own(tmp_path, ball, (r'cone="elliptic"', option)))
     told = {line.quantity: line.detail for line in lines if line.verdict == "different"}
     assert said in told["contact law"] + told["solver tolerance"]
-    assert ("stiffness" in told) == ("pyramidal" in option)  # a pyramid's edges share the force
+    assert ("stiffness" in told) == ("pyramidal" in option)  # the edges of a pyramidal cone share the force
 
 
 @pytest.mark.slow
@@ -204,7 +204,7 @@ def test_without_names_engines_that_have_no_contact_are_not_compared_with_a_mode
 
 @pytest.mark.parametrize("name", ["mujoco", "pinocchio"])
 def test_a_limit_ahead_is_the_limits_doing(load, name):
-    """Drake slows the cart down up to two steps before its limit, where neither engine has passed it."""
+    """Drake slows the cart down up to two steps before its limit, and neither engine has passed the limit yet."""
     needs(name)
     cart = load("cart_pole.urdf")
     upper = cart.plant.GetPositionUpperLimits()[0]
@@ -212,14 +212,14 @@ def test_a_limit_ahead_is_the_limits_doing(load, name):
     x = np.array([upper - 1.5 * cart.time_step * speed, 0.3, speed, 0.0])
     after = DrakeEngine(cart).step(x, [0.0])
     assert after[0] < upper
-    assert after[2] < 0.9 * speed  # it is slowed down all the same
+    assert after[2] < 0.9 * speed  # Drake slows the cart down before the limit
     e = dd.compare(cart, [name], x0=x, num_steps=1).engines[1]
     assert (e.verdict, e.first.responsible) == ("other law", "limit law")
     assert "limit" in e.sentence
 
 
 def test_a_push_beside_a_limit_is_not_the_limits_doing(load):
-    """The cart is at its limit, and the pole is pushed: no limit does that."""
+    """The cart is at its limit, and the pole is pushed. No limit can cause this difference."""
     from helpers.engines import Doctored
 
     cart = load("cart_pole.urdf")

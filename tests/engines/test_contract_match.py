@@ -1,4 +1,4 @@
-"""The same model is found to be the same in every engine, and each single change is found and named."""
+"""Check that the contracts of one model match in all engines, and that each single change is found and named."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -27,7 +27,7 @@ def test_a_change_is_found_and_named(tmp_path, name, change):
     changes, must, may, words = CHANGES[change]
     reference = dd.engines.load_engine("drake", arms(tmp_path))
     own = different(reference, engine_of(name, arms(tmp_path)))
-    assert own.keys() <= {"limit law", "solver tolerance"}  # what no other engine can have as Drake has it
+    assert own.keys() <= {"limit law", "solver tolerance"}  # terms that differ in every engine but Drake
     found = different(reference, engine_of(name, arms(tmp_path, **changes)))
     assert must <= found.keys() - own.keys() <= must | may
     first = next(quantity for quantity in found if quantity in must)
@@ -169,7 +169,7 @@ def test_another_order_inside_mujoco_is_mapped(tmp_path, name):
     x, u = np.linspace(-0.5, 0.6, 8), np.linspace(-1, 1, 4)
     np.testing.assert_allclose(engine.step(x, u), drake.step(x, u), atol=1e-13)
     one, two = engine.differentiate_step(x, u), drake.differentiate_step(x, u)
-    np.testing.assert_allclose(one.A, two.A, atol=1e-9)  # MuJoCo's is of differences
+    np.testing.assert_allclose(one.A, two.A, atol=1e-9)  # MuJoCo's Jacobian comes from finite differences
     np.testing.assert_allclose(one.B, two.B, atol=1e-10)
 
 
@@ -190,7 +190,7 @@ def test_other_friction_and_stiffness_are_found(tmp_path):
 
 
 class Other:
-    """An engine that says what another one says, but for what is given."""
+    """An engine with the contract and dynamics of another engine, except for the given changes."""
 
     def __init__(self, engine, mass_matrix=None, **contract):
         self.contract = replace(engine.contract, **contract)

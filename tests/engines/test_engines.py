@@ -1,4 +1,4 @@
-"""One model in every engine: hand calculations, Drake's step or a formula, the contract, contact at rest, refusals."""
+"""Check all engines against hand calculations, Drake's step or a formula, and check contracts, contact and refusals."""
 
 import re
 import subprocess
@@ -71,16 +71,16 @@ def test_hand_jacobians_are_those_of_the_hand_steps(form):
 
 # ---- free motion in engines whose step is Drake's -----------------------------------------------------------------
 
-SLOW = {"mjx", "newton"}  # they compile for seconds
+SLOW = {"mjx", "newton"}  # JAX and Warp compile for seconds
 
 
 def cases(*rows):
-    """Rows of an engine and more; those of an engine that compiles are slow."""
+    """Return parameter rows that begin with an engine's name, and mark those of compiling engines as slow."""
     return [pytest.param(*row, marks=[pytest.mark.slow] if row[0] in SLOW else []) for row in rows]
 
 
-# Of a step and of its Jacobian, relative to the largest entry. Pinocchio and CasADi sum over a tree in another order;
-# MuJoCo's Jacobian is of differences; MJX steps through soft limits that are not reached, solved by Newton to 1e-12.
+# Tolerances of a step and of its Jacobian, relative to the largest entry. Pinocchio and CasADi sum over the tree in a
+# different order, MuJoCo uses finite differences, and MJX solves its inactive soft limits with Newton to 1e-12.
 SAME_STEP = {
     "numpy": (1e-13, 1e-12),
     "pinocchio": (1e-12, 1e-12),
@@ -120,18 +120,18 @@ def test_free_bodies_differ_by_the_quaternions_exponential_alone(load, tmp_path,
     assert_free_bodies_differ_by_the_exponential(model, name, states=1 if name == "mjx" else 3)
 
 
-# ---- engines that only go forward, by the formula of their step ---------------------------------------------------
+# ---- forward engines, against the formula of their step -----------------------------------------------------------
 
 
 class Forward(NamedTuple):
-    """Tolerances are relative to the largest entry of a state: rounding, magnified by small inertias."""
+    """Facts about an engine. Tolerances relative to the largest entry are rounding, magnified by small inertias."""
 
-    here: float  # of small models, and of all whose step is Drake's
+    here: float  # tolerance of small models, and of all models whose step equals Drake's
     robots_tolerance: float
-    implicit: bool  # joint damping
-    exponential: bool  # how quaternions move
+    implicit: bool  # whether joint damping is implicit
+    exponential: bool  # whether quaternions are integrated by the exponential map
     robots: tuple[str, ...]
-    own: frozenset[str]  # lines of the contract that are different whatever the model
+    own: frozenset[str]  # contract lines that differ for every model
 
 
 FORWARD = {
@@ -157,7 +157,7 @@ def test_a_damped_pendulums_step_by_hand_has_the_damping_that_its_contract_says(
     x, u = [0.7, -1.2], 0.3
     force = u - damping * x[1] - inertia * G / 0.5 * np.sin(x[0])
     explicit, implicit = (x[1] + h * force / M for M in (inertia, inertia + h * damping))
-    assert abs(explicit - implicit) > 1e-4  # they can be told apart
+    assert abs(explicit - implicit) > 1e-4  # the two laws can be distinguished
     v = implicit if FORWARD[name].implicit else explicit
     rounding = 3e-7 if engine.contract.precision == "float32" else 1e-14
     np.testing.assert_allclose(engine.step(x, [u]), [x[0] + h * v, v], rtol=rounding)
@@ -168,7 +168,7 @@ def test_a_damped_pendulums_step_by_hand_has_the_damping_that_its_contract_says(
 def test_a_spinning_body_by_hand_moves_by_its_center(name):
     center, h = np.array([0.1, 0.2, 0.3]), 0.01
     engine = engine_of(name, free_box(center, h))
-    v_center, w = np.array([0.5, -0.2, 0.1]), np.array([0.0, 0.0, 3.0])  # about a principal axis: w stays
+    v_center, w = np.array([0.5, -0.2, 0.1]), np.array([0.0, 0.0, 3.0])  # about a principal axis: w is constant
     x = np.array([1, 0, 0, 0, 0, 0, 1, *w, *(v_center - np.cross(w, center))])
     half = h * 3 / 2
     quaternion = np.array([np.cos(half), 0, 0, np.sin(half)] if FORWARD[name].exponential else [1, 0, 0, half])
@@ -178,7 +178,7 @@ def test_a_spinning_body_by_hand_moves_by_its_center(name):
     atol = 1e-6 if engine.contract.precision == "float32" else 1e-13
     np.testing.assert_allclose(engine.step(x, []), expected, rtol=0, atol=atol)
     drake = dd.engines.load_engine("drake", free_box(center, h)).step(x, [])
-    assert np.abs(np.array(expected)[4:7] - drake[4:7]).max() > 1e-5  # Drake moves it by its origin
+    assert np.abs(np.array(expected)[4:7] - drake[4:7]).max() > 1e-5  # Drake integrates the body's origin
 
 
 @forward
@@ -220,7 +220,7 @@ def test_each_step_depends_on_its_arguments_alone(load, name):
 @forward
 def test_a_change_is_found_and_named(tmp_path, monkeypatch, name):
     own, names = FORWARD[name].own, set(CHANGES)
-    if name == "pybullet":  # which has no armature
+    if name == "pybullet":  # Bullet has no armature
         monkeypatch.setitem(PLAIN, "rotor", 0.0)
         names -= {"armature", "gear"}
     reference = dd.engines.load_engine("drake", arms(tmp_path))
@@ -228,7 +228,7 @@ def test_a_change_is_found_and_named(tmp_path, monkeypatch, name):
     assert always.keys() <= own
     for change in sorted(names):
         changes, must, may, words = CHANGES[change]
-        must = must - (FOLLOWS if name == "sapien" else set())  # PhysX gives neither M(q) nor bias
+        must = must - (FOLLOWS if name == "sapien" else set())  # PhysX offers neither M(q) nor bias
         found = different(reference, engine_of(name, arms(tmp_path, **changes)))
         assert must <= found.keys() - always.keys() <= must | may | (FOLLOWS & own), change
         first = next(quantity for quantity in found if quantity in must)
@@ -298,7 +298,7 @@ def test_drake_is_the_hand_calculation_in_every_variant(load, contact, method):
     one, two = (engine.differentiate_step([0.7, -1.2], [0.3]) for engine in (drake, hand))
     assert one.method == method
     assert contact in drake.name
-    np.testing.assert_allclose(one.A, two.A, rtol=0, atol=1e-9)  # differences: rounding over a step of 1e-5
+    np.testing.assert_allclose(one.A, two.A, rtol=0, atol=1e-9)  # finite differences with a step of 1e-5: rounding
 
 
 @pytest.mark.parametrize("file", ["sphere_on_ground.sdf", "sliding_block.sdf"])
@@ -330,7 +330,7 @@ def test_mujoco_slides_to_a_stop_and_its_jacobians_are_its_steps():
         x = mujoco.step(x, [])
     n = np.floor(1 / (0.5 * G * h))
     hard = h * (n - 0.5 * G * h * n * (n + 1) / 2)  # symplectic Euler with hard Coulomb friction
-    assert x[0] == pytest.approx(hard, rel=0.01)  # the cone's normal force moves the ball up and down as it slides
+    assert x[0] == pytest.approx(hard, rel=0.01)  # the cone's normal force moves the ball vertically as it slides
     assert total[0, 2] == pytest.approx((end(1 + 1e-5) - end(1 - 1e-5)) / 2e-5, rel=1e-6)
 
 
@@ -340,10 +340,10 @@ def test_mujoco_creeps_on_an_incline_by_its_own_law():
     mujoco = engine_of("mujoco", model)
     for _ in range(400):
         x = mujoco.step(x, [])
-    d, inverse_mass, ratio = 0.9, 2 / 3, 100  # that of a body on two of three rails, as MuJoCo averages
+    d, inverse_mass, ratio = 0.9, 2 / 3, 100  # mean inverse mass, with two of three axes free
     b = 2 * np.sqrt((1 - d) * k * inverse_mass) / d
     creep = (1 - d) / d * inverse_mass / ratio * G * np.sin(slope) / b  # R f = b v
-    assert x[2] == pytest.approx(creep, rel=1e-4)  # R f = a + b v, and a is not quite 0
+    assert x[2] == pytest.approx(creep, rel=1e-4)  # R f = a + b v, where a is not exactly 0
     assert mujoco.contact_depth(x) == pytest.approx(G * np.cos(slope) / k, rel=1e-6)
 
 
@@ -357,7 +357,7 @@ def test_a_free_bodys_jacobian_in_contact_is_that_of_mujocos_own_step(load):
     for i, column in enumerate(A.T):
         e = 1e-6 * np.eye(12)[i]
         ends = [space.minus(engine.step(space.plus(x, d), []), x_next) for d in (e, -e)]
-        np.testing.assert_allclose(column, (ends[0] - ends[1]) / 2e-6, atol=1e-8)  # two differences, each good to 1e-9
+        np.testing.assert_allclose(column, (ends[0] - ends[1]) / 2e-6, atol=1e-8)  # each difference is accurate to 1e-9
 
 
 @pytest.mark.parametrize("name", ["pinocchio", "casadi"])
@@ -375,7 +375,7 @@ every = pytest.mark.parametrize("name", cases(("numpy",), ("drake",), *((name,) 
 
 @every
 def test_effort_limits_cut_and_the_derivative_is_zero_there(load, name):
-    model = load("cart_pole.urdf")  # of 20 N
+    model = load("cart_pole.urdf")  # its effort limit is 20 N
     engine, x = engine_of(name, model), [0.1, 0.4, 0.2, -0.3]
     assert engine.step(x, [25.0]).tobytes() == engine.step(x, [20.0]).tobytes()
     if name not in ("sapien", "pybullet"):
@@ -384,7 +384,7 @@ def test_effort_limits_cut_and_the_derivative_is_zero_there(load, name):
 
 @every
 def test_bad_input_and_what_cannot_be_stepped_are_named(load, tmp_path, monkeypatch, name):
-    monkeypatch.chdir(tmp_path)  # MuJoCo writes a MUJOCO_LOG.TXT where it is
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes MUJOCO_LOG.TXT into the working directory
     engine = engine_of(name, load("pendulum.urdf"))
     with pytest.raises(ShapeError, match="x"):
         engine.step([0.0], [0.0])
@@ -449,7 +449,7 @@ def test_a_weld_at_a_distance_is_drakes(name):
     )
     plant.plant.AddJoint(RevoluteJoint("hinge", plant.plant.world_frame(), arm.body_frame(), [0, 1, 0]))
     plant.plant.WeldFrames(arm.body_frame(), end.body_frame(), RigidTransform(RollPitchYaw(0.3, 0.2, 0.1), [0.1, 0, 1]))
-    assert_free_steps_agree(plant.model(), name, 1e-12, 1e-10)  # MuJoCo's Jacobian is of differences
+    assert_free_steps_agree(plant.model(), name, 1e-12, 1e-10)  # MuJoCo's Jacobian comes from finite differences
 
 
 def refused(kind):

@@ -1,6 +1,6 @@
-"""MJX against hand calculations, Drake, MuJoCo and, in contact, differences of its own step.
+"""Compare MJX with hand calculations, Drake, MuJoCo and, in contact, finite differences of its own step.
 
-JAX compiles for seconds per model: all of them are slow.
+JAX compiles for seconds per model, so all tests are marked slow.
 """
 
 import numpy as np
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.slow
 
 
 def assert_jacobian_is_that_of_the_step(engine, model, x, u, *, step=1e-6, atol=2e-8):
-    """By differences on the tangent space: the solver stops at 1e-14 to 1e-13, so that 1e-6 leaves 1e-8 or so."""
+    """Compare with differences on the tangent space. With the solver at 1e-14 to 1e-13, errors are about 1e-8."""
     space, x_next = tangent_space(model), engine.step(x, u)
     A = on_tangent(model, engine.differentiate_step(x, u).A, x, x_next)
     for i, column in enumerate(A.T):
@@ -74,15 +74,15 @@ def test_a_turn_from_rest_has_its_derivative_and_says_that_mjx_has_it_not():
     drake = dd.engines.load_engine("drake", model)
     A, A2 = (on_tangent(model, e.differentiate_step(x, []).A, x, e.step(x, [])) for e in (drake, engine))
     np.testing.assert_allclose(A2, A, rtol=0, atol=1e-14)  # rounding
-    np.testing.assert_allclose(A2[:3, 6:9], 0.01 * np.eye(3), rtol=0, atol=1e-14)  # by hand: the turn is h w
-    x[7] = 2e-8  # faster than what MJX takes for 0: jacfwd by itself, the same
+    np.testing.assert_allclose(A2[:3, 6:9], 0.01 * np.eye(3), rtol=0, atol=1e-14)  # by hand: the rotation is h w
+    x[7] = 2e-8  # above MJX's threshold for zero rotation, where jacfwd is correct
     again = engine.differentiate_step(x, [])
     assert again.method == "jax.jacfwd"
     np.testing.assert_allclose(on_tangent(model, again.A, x, engine.step(x, [])), A, rtol=0, atol=1e-9)
 
 
 def test_mjx_still_loses_the_turn_from_rest(monkeypatch):
-    """When this fails, `_put_turns_back` can go."""
+    """Check that MJX still has this error. When this test fails, `_put_turns_back` can be removed."""
     model = free_box(mass=1.0)
     engine, x = engine_of("mjx", model), model.default_state
     monkeypatch.setattr(type(engine), "_put_turns_back", lambda *_: "")
@@ -131,16 +131,16 @@ def test_sliding_and_sticking_have_the_steps_jacobian_and_not_slipping_at_all_ha
 
 def test_a_solver_that_stops_early_is_said(tmp_path):
     model, x = block_on_rails()
-    x[2] = 0.03  # between sliding and sticking: no step of Newton's is exact
+    x[2] = 0.03  # between sliding and sticking, where no Newton step is exact
     engine = own_mjcf(tmp_path, model, ("<option ", '<option iterations="1" '))
     engine.step(x, [])
     assert "unbalanced" in engine.status
-    engine.step([0, 1, 0, 0], [])  # in the air there is nothing to solve
+    engine.step([0, 1, 0, 0], [])  # without contact the solver has nothing to solve
     assert engine.status == "ok"
 
 
 def test_mjx_still_cannot_have_limits_with_elliptic_cones_and_no_contact(load):
-    """When this fails, the engine need not set the cone."""
+    """Check that MJX still has this error. When this test fails, the engine need not set the cone."""
     needs("mjx")
     import jax
     from mujoco import mjx

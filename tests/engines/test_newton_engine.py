@@ -1,6 +1,6 @@
-"""Newton's step against its formula by hand, against Drake where both have the same, and its contact where it rests.
+"""Compare Newton's step with its formula, with Drake where both agree, and check its contact at rest.
 
-All are slow: the first to ask builds Newton's kernels, half a minute on an empty cache.
+All tests are slow: the first one builds Newton's kernels, which takes half a minute with an empty cache.
 """
 
 import numpy as np
@@ -21,12 +21,8 @@ pytestmark = pytest.mark.slow
 G = 9.81
 
 
-# What no engine but Drake has as Drake has it, and Newton's damping, which is explicit.
 def newton(model):
     return dd.engines.load_engine("newton", model)
-
-
-# ---- the step -------------------------------------------------------------------------------------------------------
 
 
 # ---- its derivatives ------------------------------------------------------------------------------------------------
@@ -45,7 +41,7 @@ def test_warps_tape_is_the_derivative_of_the_formula(load, tmp_path, name):
     for i, column in enumerate(A.T):
         e = 1e-6 * np.eye(len(A))[i]
         ends = [space.minus(formula(model, space.plus(x, d), u), after) for d in (e, -e)]
-        # the tape is good to single precision, magnified as the step is
+        # the tape has single precision, scaled by the largest entry
         np.testing.assert_allclose(column, (ends[0] - ends[1]) / 2e-6, rtol=0, atol=2e-5 * scale)
     for i, column in enumerate(B.T):
         e = 1e-6 * np.eye(len(u))[i]
@@ -82,19 +78,19 @@ def test_a_swapped_quaternion_or_velocity_frame_is_found(wrong, monkeypatch):
 
 
 def test_one_step_of_landing_by_hand():
-    h, k, c = 0.002, 1e4, 100.0  # the damper is Newton's own
+    h, k, c = 0.002, 1e4, 100.0  # c is Newton's own damping
     model, _ = block_on_rails(h)
     engine = newton(model)
     for z, v in ((0.098, -0.3), (0.098, 0.3)):
         push = k * (0.1 - z) - c * min(v, 0.0)
         after = engine.step([0, z, 0, v], [])
-        np.testing.assert_allclose(after[3], v + h * (push - G), rtol=0, atol=1e-5)  # 0.1 - z to 1e-8 m, times k
+        np.testing.assert_allclose(after[3], v + h * (push - G), rtol=0, atol=1e-5)  # 1e-8 m in z, times k
         assert engine.contact_depth([0, z, 0, v]) == pytest.approx(0.1 - z, abs=2e-8)
     assert "damper of 100 N s/m while closing" in engine.contract.contact_law
 
 
 def test_it_rests_as_deep_as_drake_and_slides_by_coulomb_to_its_own_slope():
-    h, friction, slope = 0.0005, 0.5, 1000.0  # explicit friction holds for h slope / m < 2
+    h, friction, slope = 0.0005, 0.5, 1000.0  # explicit friction is stable for h slope / m < 2
     model, x = block_on_rails(h, friction)
     engine = newton(model)
     for _ in range(1500):
@@ -106,7 +102,7 @@ def test_it_rests_as_deep_as_drake_and_slides_by_coulomb_to_its_own_slope():
         x = engine.step(x, [])
         v.append(x[2])
     fast = np.array(v[:-1]) > friction * G / slope
-    np.testing.assert_allclose(np.diff(v)[fast] / h, -friction * G, rtol=2e-3)  # 0.5 to 3e-8, over h
+    np.testing.assert_allclose(np.diff(v)[fast] / h, -friction * G, rtol=2e-3)  # 0.5 is rounded to 3e-8, divided by h
     slow = np.array(v[:-1])[~fast]
     np.testing.assert_allclose(np.array(v[1:])[~fast], slow * (1 - h * slope), rtol=1e-3, atol=1e-7)
     assert f"friction of {slope:g} N s/m" in engine.contract.contact_law
@@ -119,7 +115,7 @@ def test_a_ball_without_friction_is_not_slowed():
 
 
 def test_a_limit_is_an_explicit_spring_and_damper(load):
-    engine, h, ke, kd = newton(load("cart_pole.urdf", time_step=0.001)), 0.001, 1e4, 10.0  # the slide from -2 to 2
+    engine, h, ke, kd = newton(load("cart_pole.urdf", time_step=0.001)), 0.001, 1e4, 10.0  # slide limits: -2 and 2
     inside, beyond = engine.step([1.999, 0, 1.0, 0], [0]), engine.step([2.01, 0, 1.0, 0], [0])
     mass = engine.mass_matrix([2.01, 0])
     push = np.linalg.solve(mass, [-ke * 0.01 - kd * 1.0, 0])

@@ -1,4 +1,4 @@
-"""Bullet's step against its formula by hand, against Drake where both have the same, and its contact where it rests."""
+"""Compare Bullet's step with its formula, with Drake where both agree, and check its contact at rest."""
 
 import sys
 
@@ -31,17 +31,17 @@ def bullet(model):
 
 def test_nothing_is_clamped_or_dragged_by_itself(load):
     engine, h = bullet(load("pendulum.urdf")), 0.01
-    v = 500 - h * 0.1 * 500 / 0.25  # Bullet would clamp at 100 rad/s
+    v = 500 - h * 0.1 * 500 / 0.25  # Bullet's default would clamp at 100 rad/s
     np.testing.assert_allclose(engine.step([0.0, 500.0], [0.0]), [h * v, v], rtol=1e-14)
     after = bullet(free_box()).step([1, 0, 0, 0, 0, 0, 1, 0, 0, 300, 500, 0, 0], [])
     np.testing.assert_allclose(after[[9, 10]], [300, 500], rtol=1e-14)
 
 
 def test_what_is_beyond_a_limit_comes_back_by_a_fifth_of_it_each_step(load):
-    engine, h = bullet(load("cart_pole.urdf")), 0.01  # the slide from -2 to 2
+    engine, h = bullet(load("cart_pole.urdf")), 0.01  # the slide's limits are -2 and 2
     for beyond, v in ((0.01, 0.0), (0.001, 3.0)):
         assert engine.step([2 + beyond, 0, v, 0], [0])[2] == pytest.approx(-0.2 * beyond / h, abs=1e-12)
-    assert engine.step([1.999, 0, 3.0, 0], [0])[2] == 3.0  # nothing holds it before
+    assert engine.step([1.999, 0, 3.0, 0], [0])[2] == 3.0  # no force acts before the limit
     assert "0.2" in engine.contract.limit_law
 
 
@@ -77,7 +77,7 @@ def test_one_step_of_landing_by_hand_is_an_implicit_spring(z, v):
     push = max(0.0, k * ((0.1 - z) - h * (v - h * G)) / (1 + h * h * k))  # N = k (depth - h v'), m = 1
     after = engine.step([0, z, 1.0, v], [])
     np.testing.assert_allclose(after[3], v + h * (push - G), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(after[2], 1.0 - h * mu * push, rtol=0, atol=1e-12)  # Coulomb's, from 1 m/s
+    np.testing.assert_allclose(after[2], 1.0 - h * mu * push, rtol=0, atol=1e-12)  # Coulomb friction, sliding at 1 m/s
     assert engine.contact_depth([0, z, 0, v]) == pytest.approx(0.1 - z, abs=1e-15)
 
 
@@ -104,12 +104,12 @@ def test_links_are_given_what_makes_drakes_pairs_and_the_least_squares_where_pai
     drake = dd.engines.load_engine("drake", plant.model())
     engine = bullet(drake.model)
     wanted = {pair.names: pair for pair in drake.contract.contacts}
-    for pair in engine.contract.contacts:  # with three pairs of three links all can be had
+    for pair in engine.contract.contacts:  # three pairs of three links can all be satisfied
         assert pair.stiffness == pytest.approx(wanted[pair.names].stiffness, rel=1e-12)
         assert pair.friction == pytest.approx(wanted[pair.names].friction, rel=1e-12)
     assert "contact pairs" not in different(drake, engine)
     split = sys.modules["drake_diff.engines.bullet"].split
-    square = [(("a", "b"), 1.0), (("b", "c"), 2.0), (("c", "d"), 1.0), (("d", "a"), 1.0)]  # a + c, b + d: 3 and 2
+    square = [(("a", "b"), 1.0), (("b", "c"), 2.0), (("c", "d"), 1.0), (("d", "a"), 1.0)]  # a + b + c + d: 2 or 3
     found = split(square)
     assert [found[x] + found[y] for (x, y), _ in square] == pytest.approx([1.25, 1.75, 1.25, 0.75], rel=1e-12)
 

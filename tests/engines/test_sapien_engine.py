@@ -1,4 +1,4 @@
-"""PhysX's step against hand calculations, against Drake where both have the same, and its contact where it rests."""
+"""Compare PhysX's step with hand calculations, with Drake where both agree, and check its contact at rest."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def physx(model):
 @pytest.mark.solve
 def test_nothing_is_clamped_or_dragged_by_itself(load):
     engine, h = physx(load("pendulum.urdf")), 0.01
-    v = 500 / (1 + h * 0.1 / 0.25)  # PhysX would clamp at 100 rad/s
+    v = 500 / (1 + h * 0.1 / 0.25)  # PhysX's default would clamp at 100 rad/s
     np.testing.assert_allclose(engine.step([0.0, 500.0], [0.0]), [h * v, v], rtol=1e-6)
     after = physx(free_box()).step([1, 0, 0, 0, 0, 0, 1, 0, 0, 60, 500, 0, 0], [])
     np.testing.assert_allclose(after[[9, 10]], [60, 500], rtol=1e-6)
@@ -50,11 +50,11 @@ def test_a_tumbling_body_keeps_the_size_of_its_angular_momentum():
     explicit = w - h * np.cross(w, inertia * w) / inertia
     scaled = explicit * np.linalg.norm(inertia * w) / np.linalg.norm(inertia * explicit)
     np.testing.assert_allclose(after[7:10], scaled, rtol=0, atol=1e-6)
-    assert np.abs(scaled - explicit).max() > 1e-5  # it could be told
+    assert np.abs(scaled - explicit).max() > 1e-5  # the two can be distinguished
 
 
 def test_a_limit_is_not_crossed_within_the_step_and_beyond_it_four_fifths_come_back(load):
-    engine, h = physx(load("cart_pole.urdf")), 0.01  # the slide from -2 to 2
+    engine, h = physx(load("cart_pole.urdf")), 0.01  # the slide's limits are -2 and 2
     np.testing.assert_allclose(engine.step([1.999, 0, 3.0, 0], [0])[[0, 2]], [2.0, 0.001 / h], atol=1e-4)
     assert engine.step([2.01, 0, 0, 0], [0])[2] == pytest.approx(-0.8 * 0.01 / h, abs=1e-4)
     assert engine.step([1.9, 0, 3.0, 0], [0])[2] == pytest.approx(3.0, abs=1e-6)
@@ -92,7 +92,7 @@ def test_it_rests_at_no_depth_slides_by_coulomb_and_stops():
         x = engine.step(x, [])
         v.append(x[2])
         assert engine.contact_depth(x) < 1e-6
-    np.testing.assert_allclose(np.diff(v)[:50], -h * mu * G, rtol=1e-3)  # single precision of 0.5 m/s, over 0.01
+    np.testing.assert_allclose(np.diff(v)[:50], -h * mu * G, rtol=1e-3)  # 0.5 m/s in single precision, over 0.01 m/s
     np.testing.assert_allclose(v[53:], 0.0, atol=1e-5)
 
 
@@ -108,9 +108,9 @@ def test_what_is_deep_comes_out_and_what_would_not_touch_falls_through(load):
         plant.plant.SetDefaultFloatingBaseBodyPose(body, RigidTransform([0, 0, height]))
     model = plant.model()
     engine = physx(model)
-    assert engine.contact_depth(model.default_state) == pytest.approx(0.05, abs=1e-6)  # two balls of one model do touch
+    assert engine.contact_depth(model.default_state) == pytest.approx(0.05, abs=1e-6)  # balls of one model can touch
     engine.groups = {}
-    assert engine.contact_depth(model.default_state) == 0  # and without their groups they do not
+    assert engine.contact_depth(model.default_state) == 0  # without collision groups they do not touch
 
 
 def test_friction_of_a_pair_is_the_mean_of_the_two():
@@ -136,11 +136,11 @@ def test_a_link_and_its_parent_never_touch_and_the_contract_says_so():
     model = plant.model()
     x = np.array([1, 0, 0, 0, 0, 0, 0, 0.35, *[0] * 7])
     drake, engine = dd.engines.load_engine("drake", model), physx(model)
-    assert drake.contact_depth(x) == pytest.approx(0.05, abs=1e-9)  # Drake lets two touch what is welded to one
+    assert drake.contact_depth(x) == pytest.approx(0.05, abs=1e-9)  # in Drake, two can touch the body welded to one
     assert "lid_shape" in different(drake, engine)["contact pairs"]
     every = {geometry.name: (1, 1) for _, geometry in engine.tree.geometries}
     engine.groups = every
-    assert engine.contact_depth(x) == 0  # even where their groups would
+    assert engine.contact_depth(x) == 0  # PhysX ignores the pair even if the groups would allow it
 
 
 def test_bad_input_and_what_physx_has_not_are_named(load):

@@ -1,4 +1,4 @@
-"""What any motion shows of inertias: the textbook's sums of two rods, and that Drake moves alike where sums stay."""
+"""Check base inertial parameters: two rods against the textbook, and Drake's motion when they stay the same."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from drake_diff.identification.tree import ten_numbers, tree_for_identification
 
 @pytest.mark.slow
 def test_two_rods_have_the_textbooks_sums(load):
-    """Rods of 1 kg and 0.8 m, 0.7 kg and 0.5 m: I1 + l1^2 m2, m1 c1 + l1 m2, I2, m2 c2; none weighs sideways."""
+    """Rods of 1 kg and 0.8 m, 0.7 kg and 0.5 m: I1 + l1^2 m2, m1 c1 + l1 m2, I2, m2 c2, with no lateral moments."""
     found = {next(iter(b.parts)): b for b in base_parameters(load("double_pendulum.urdf"))}
     assert {name: dict(b.parts) for name, b in found.items()} == {
         "upper.inertia_yy": {"upper.inertia_yy": 1.0, "lower.mass": pytest.approx(0.64)},
@@ -30,14 +30,14 @@ def test_two_rods_have_the_textbooks_sums(load):
     (yy, *_) = base_parameters(load("double_pendulum.urdf"), ["lower"])
     assert dict(yy.parts) == {
         "lower.inertia_yy": 1.0
-    }  # with the upper one known, the lower one's mass is seen by itself
+    }  # with a known upper link, the lower link's mass is observable alone
 
 
 @pytest.mark.parametrize(
     ("name", "count"), slow_after(1, [("ur5_robot.urdf", 36), ("solo12.urdf", None), ("so100.urdf", None)])
 )
 def test_numbers_that_leave_the_sums_leave_the_motion(name, count):
-    """A UR5 has 36 of them, as is published of its kind. Drake's inverse dynamics cannot tell the changed robot."""
+    """A UR5 has 36 base parameters, as published for its kind. Equal ones give equal torques in Drake."""
     model, random = example_robot(name), np.random.default_rng(0)
     found = base_parameters(model)
     if count is not None:
@@ -68,7 +68,7 @@ def test_numbers_that_leave_the_sums_leave_the_motion(name, count):
     before = torque(x, a, own)
     after = torque(x, a, own + change)
     other = torque(x, a, own + np.abs(change).max() * random.uniform(-1, 1, len(own)))
-    # The sums are known to 1e-7 of an effect.
+    # The base parameters are accurate to 1e-7 of an effect.
     assert np.abs(after - before).max() < 1e-5 * np.abs(other - before).max()
 
 

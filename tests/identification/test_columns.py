@@ -1,4 +1,4 @@
-"""Mistaken columns of a recording are named: exchanged, with the other sign, or in degrees. The truth is hidden."""
+"""Check that exchanged, mirrored and degree-valued columns of a recording are named, without the truth."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ PERIOD = 0.01
 
 
 def recorded(model, q0, us, noise=1e-3, velocities=False, seed=0):
-    """Drake's motion by steps of 0.1 ms under inputs (n, nu) held for 10 ms, as encoders would say it."""
+    """Return Drake's motion with steps of 0.1 ms under inputs (n, nu) constant for 10 ms, with encoder noise."""
     fine, start = model.at_time_step(PERIOD / 100), np.append(q0, np.zeros(model.nv))
     xs = dd.rollout(fine, start, np.repeat(us, 100, axis=0)).xs
     xs = xs[::100] + noise * np.random.default_rng(seed).standard_normal((len(us) + 1, model.nx))
@@ -27,7 +27,7 @@ def said(model, xs, us):
 
 @pytest.fixture
 def swung(load):
-    """A double pendulum, its motion with velocities, and its inputs."""
+    """Return a double pendulum, its motion with velocities, and its inputs."""
     model, times = load("double_pendulum.urdf", time_step=0.005), PERIOD * np.arange(80)
     us = np.stack([1.5 * np.sin(5 * times + 0.5), 0.8 * np.cos(8 * times + 1)], axis=1)
     return model, recorded(model, [0.5, -0.3], us, velocities=True), us
@@ -58,7 +58,7 @@ def test_right_columns_are_not_named(swung):
 
 
 def test_what_a_mirror_does_not_change_is_told_as_it_is(load):
-    """A pendulum swings to both sides alike: its mirrored angle is right too, and a mirrored torque is one of both."""
+    """A pendulum is symmetric: its mirrored angle also fits, and either sign explains a mirrored torque."""
     model, us = load("pendulum.urdf", time_step=0.005), np.zeros((100, 1))
     w = said(model, -recorded(model, [1.0], us), us)
     assert w.names == ()

@@ -1,4 +1,4 @@
-"""What is wrong in a model whose bodies touch, by name: Drake's motions of a model that is changed, with noise."""
+"""Check that causes of errors in models with contact are named, with noisy motions of a changed model from Drake."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ PERIOD = 0.01
 
 
 def thrown(model, seed=0, samples=40, **parameters):
-    """A ball that hits the ground after 60 ms and slides: 0.1 mm, 0.5 mrad, 5 mm/s and 25 mrad/s of noise."""
+    """Record a ball that lands after 60 ms and slides, with noise of 0.1 mm, 0.5 mrad, 5 mm/s and 25 mrad/s."""
     x0 = np.array([1.0, 0, 0, 0, 0, 0, 0.13, 0, 0, 1.0, 1.0, 0.1, -0.4])
     each = round(PERIOD / model.time_step)
     named = {name.replace("__", "."): value for name, value in parameters.items()}
@@ -40,7 +40,7 @@ def test_of_a_right_model_nothing_is_said(ball):
 
 @pytest.mark.slow
 def test_a_right_model_is_not_blamed_where_its_motion_is_hard_to_find():
-    """Steps from the measured first state of this block end at twice the noise, from which stiffness looked wrong."""
+    """For this block, simulation from the measured first state ends at twice the noise, so stiffness looked wrong."""
     model, log, name, _ = recorded("sliding_block", 0.005, False, 50009)
     w = dd.explain(model, log)
     assert not name
@@ -50,7 +50,7 @@ def test_a_right_model_is_not_blamed_where_its_motion_is_hard_to_find():
 
 @pytest.fixture
 def contact_alone(monkeypatch):
-    """Masses and gravity are not tried, which takes half of the time; a busy machine says the same."""
+    """Skip masses and gravity to halve the time, and lift the time limit, so that a busy machine agrees."""
     monkeypatch.setattr(contact, "OF_MOTION", ())
     monkeypatch.setattr(candidates, "LONGEST_SEARCH", np.inf)
 
@@ -58,20 +58,20 @@ def contact_alone(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize(("quantity", "value"), [("friction", 0.3), ("stiffness", 13000.0)])
 def test_a_change_of_a_ball_is_named(ball, quantity, value, contact_alone):
-    """Drake makes one number of both bodies' friction, so that the ground's is told beside the ball's."""
+    """Drake combines the friction of both bodies into one number, so the ground's friction is named as well."""
     w = dd.explain(ball, thrown(ball, **{f"ball__{quantity}": value}))
     named = [w.names, *w.alternatives]
     assert (f"ball.{quantity}",) in named
     assert set(named) <= {(f"ball.{quantity}",), (f"ground.{quantity}",)}
     assert len(named) == 2 or quantity == "stiffness"
     low, high = w.intervals[f"ball.{quantity}"]
-    assert abs(w.values[f"ball.{quantity}"] - value) < high - low  # two intervals of 95 %: four deviations
+    assert abs(w.values[f"ball.{quantity}"] - value) < high - low  # two 95 % intervals are four standard deviations
     assert high - low < 0.2 * value
     assert w.sentence.endswith("by the model's own steps of 5 ms.")
 
 
 def test_slopes_by_a_parameter_that_drake_takes_as_a_float_are_those_of_the_steps(ball):
-    """Of a ball in contact: differences of one step by 1e-7 of the radius, which lose half of all digits."""
+    """Compare with differences of one step by 1e-7 of the radius of a ball in contact, which lose half the digits."""
     (radius,) = choose_unknowns(ball, None, ["ball.radius"]).each
     pieces = read_pieces(ball, thrown(ball), 0.0)
     law = discrete_motion(ball, Unknowns((radius,)), pieces)

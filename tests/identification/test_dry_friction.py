@@ -1,4 +1,4 @@
-"""Dry friction that holds joints still, in `dd.identify`: closed forms first, then motions that MuJoCo made."""
+"""Check Coulomb friction with sticking in `dd.identify`, with closed forms and then with motions from MuJoCo."""
 
 import numpy as np
 import pytest
@@ -14,18 +14,18 @@ from drake_diff.identification.unknowns import choose_unknowns
 
 pytestmark = pytest.mark.solve
 
-MASS, FRICTION = 2.0, 0.3 * 2.0 * 9.81  # [kg], [N] of a block on a floor
+MASS, FRICTION = 2.0, 0.3 * 2.0 * 9.81  # [kg], [N] for a block on a floor
 H, N = 0.01, 180  # [s] between samples
 NOISE = 1e-4  # [m]
 
 
 def pushes(amplitude):
-    """(N, 1) a sine of 0.9 Hz, held from each sample to the next [N]."""
+    """Return a sine of 0.9 Hz (N, 1), constant from each sample to the next [N]."""
     return amplitude * np.sin(2 * np.pi * 0.9 * H * np.arange(N))[:, None]
 
 
 def sticks_and_slips(us, mass=MASS, friction=FRICTION):
-    """(N + 1, 2) of a block from rest: in each sample it slides by a parabola, stops, and stays or goes on."""
+    """Return the states (N + 1, 2) of a block from rest, which slides along parabolas, stops, and stays or moves on."""
     x, v, found = 0.0, 0.0, [(0.0, 0.0)]
     for push in us[:, 0]:
         left = H
@@ -40,7 +40,7 @@ def sticks_and_slips(us, mass=MASS, friction=FRICTION):
 
 
 def measured(xs, us, outputs=None, seed=0):
-    """A recording of positions with noise."""
+    """Return a recording of positions with noise."""
     seen = np.column_stack(
         [xs[:, 0] + NOISE * np.random.default_rng(seed).standard_normal(N + 1), np.full(N + 1, np.nan)]
     )
@@ -50,7 +50,7 @@ def measured(xs, us, outputs=None, seed=0):
 def test_a_block_that_sticks_and_slips_has_its_friction(write_urdf):
     us = pushes(9.0)
     xs = sticks_and_slips(us)
-    assert np.mean(xs[:, 1] == 0) > 0.2  # it is held in a part of the samples
+    assert np.mean(xs[:, 1] == 0) > 0.2  # the block sticks in a part of the samples
     model = write_urdf(mass=MASS)
     off = []
     for seed in range(3):
@@ -60,26 +60,26 @@ def test_a_block_that_sticks_and_slips_has_its_friction(write_urdf):
         low, high = e.intervals["slide.coulomb_friction"]
         assert high - low < 0.005 * FRICTION
         off.append((e.values["slide.coulomb_friction"] - FRICTION) / ((high - low) / (2 * 1.96)))
-    assert np.sum(np.square(off)) < stats.chi2.ppf(0.999, 3)  # of three standard normal numbers
+    assert np.sum(np.square(off)) < stats.chi2.ppf(0.999, 3)  # three standard normal numbers
 
 
 def test_a_block_that_comes_to_rest_and_stays_has_its_friction(write_urdf, tmp_path):
     us = np.where(np.arange(N)[:, None] < 30, 20.0, 0.0)
-    us[120:] = 0.9 * FRICTION  # which does not move it
+    us[120:] = 0.9 * FRICTION  # too little to move the block
     xs = sticks_and_slips(us)
     assert np.all(xs[-70:, 1] == 0)
     e = dd.identify(write_urdf(mass=MASS), measured(xs, us), ["slide.coulomb_friction"], held_out=0)
     assert e.explained, e.reason
     low, high = e.intervals["slide.coulomb_friction"]
     assert low < FRICTION < high < low + 0.01 * FRICTION
-    assert np.all(e.motions[0].xs[-60:, 1] == 0)  # and the fit stays where it is
+    assert np.all(e.motions[0].xs[-60:, 1] == 0)  # the fitted block also stays at rest
     dd.save(e, tmp_path / "run")
-    assert dd.verify(tmp_path / "run").holds  # which fits again
+    assert dd.verify(tmp_path / "run").holds  # verification repeats the fit
 
 
 @pytest.mark.slow
 def test_friction_that_creeps_is_not_sold_as_dry_friction(write_urdf):
-    """By c tanh(v / 0.05 m/s) the block creeps where dry friction would hold it."""
+    """With c tanh(v / 0.05 m/s), the block creeps where Coulomb friction would stick."""
     us, at = pushes(9.0), H * np.arange(N + 1)
 
     def rates(t, y):
@@ -90,7 +90,7 @@ def test_friction_that_creeps_is_not_sold_as_dry_friction(write_urdf):
     e = dd.identify(write_urdf(mass=MASS), measured(xs, us), ["slide.coulomb_friction"])
     low, high = e.intervals["slide.coulomb_friction"]
     assert not e.explained or low < FRICTION < high
-    assert not e.explained  # noise of 0.1 mm: the creeping is seen
+    assert not e.explained  # the creep is visible at noise of 0.1 mm
 
 
 LINK = '<link name="{}"><inertial><mass value="{}"/>{}</inertial></link>'
@@ -102,7 +102,7 @@ LIMIT = '<limit effort="1e9"/>'
 
 
 def sliders(folder):
-    """A slide and another one that follows it by the ratio of -0.4."""
+    """Return a model of a slide and a second slide that follows the first with the ratio -0.4."""
     links = LINK.format("first", 2, SOLID) + LINK.format("second", 3, SOLID)
     follows = f'{LIMIT}<mimic joint="a" multiplier="-0.4" offset="0"/>'
     rails = JOINT.format("a", "first", LIMIT) + JOINT.format("b", "second", follows)
@@ -111,7 +111,7 @@ def sliders(folder):
 
 
 def test_the_friction_of_a_joint_that_follows_another_holds_both(tmp_path):
-    """It acts through the ratio of -0.4, as the mass of its link does: 2 + 0.16 * 3 kg, and 0.4 times its friction."""
+    """The friction acts with the ratio -0.4, as does the link's mass: 2 + 0.16 * 3 kg, and 0.4 times the friction."""
     us = pushes(9.0)
     xs = sticks_and_slips(us, mass=2 + 0.4**2 * 3)
     e = dd.identify(sliders(tmp_path), measured(xs, us), ["b.coulomb_friction"])
@@ -121,7 +121,7 @@ def test_the_friction_of_a_joint_that_follows_another_holds_both(tmp_path):
 
 
 def test_derivatives_go_through_a_stop_that_lets_another_joint_go(load):
-    """Random steps of two joints, whose stops, turns and releases follow each other: as by differences."""
+    """Compare with differences in random steps of two joints that stop, reverse and release one after another."""
     model, random, count = load("double_pendulum.urdf"), np.random.default_rng(0), 300
     tree, names = tree_for_identification(model), ["shoulder.coulomb_friction", "elbow.coulomb_friction"]
     law = TreeMotion(model, tree, choose_unknowns(model, tree, names), 0.02)
@@ -131,20 +131,20 @@ def test_derivatives_go_through_a_stop_that_lets_another_joint_go(load):
     ends = law.run(z, starts, hs, us)
     found = np.concatenate(law.slopes(z, ends, hs, us), axis=3)[:, 0]
     still = np.flatnonzero((ends[:, 1, 3] == 0) & (starts[:, 3] == 0))
-    assert len(still) > 20  # the elbow is held throughout
+    assert len(still) > 20  # the elbow sticks during the whole step
     compared = 0
     for i, step in enumerate(1e-7 * np.eye(6)):
         one, other = (law.run(z + s * step[4:], starts + s * step[:4], hs, us)[:, -1] for s in (1, -1))
         ahead, back = (one - ends[:, -1]) / 1e-7, (ends[:, -1] - other) / 1e-7
-        rows = np.max(np.abs(ahead - back), axis=1) < 1e-4  # elsewhere another order of stops is that near
-        rows &= (i != 3) | (starts[:, 3] != 0)  # at rest it slides to one side or the other
+        rows = np.max(np.abs(ahead - back), axis=1) < 1e-4  # otherwise 1e-7 changes the order of stops
+        rows &= (i != 3) | (starts[:, 3] != 0)  # at rest, the joint can slide to either side
         np.testing.assert_allclose(found[rows, :, i], (ahead + back)[rows] / 2, atol=1e-4)
         compared += int(np.sum(rows))
     assert compared > 0.9 * 5.5 * count
 
 
 def test_readings_of_held_joints_are_those_of_joints_that_stand(load):
-    """Of two joints: one is held, whose link then gets what its friction and its motor give together."""
+    """With one of two joints stuck, its link receives the sum of the friction and the motor torque."""
     model = load("double_pendulum.urdf")
     tree, names = tree_for_identification(model), ["elbow.coulomb_friction", "lower.mass", "elbow.offset"]
     unknowns = choose_unknowns(model, tree, names)
@@ -163,7 +163,7 @@ def test_readings_of_held_joints_are_those_of_joints_that_stand(load):
     assert held.tolist() == [[0, 1], [0, 0]]
     assert turn.tolist() == [[0, 0], [0, -1]]
     by_x, by_z = sensors.slopes(dynamics, np.hstack([q, v]), u, law.by(z))
-    free = np.array([[True, True, True, False], [True] * 4])  # held: no velocity of its own
+    free = np.array([[True, True, True, False], [True] * 4])  # a stuck joint has no independent velocity
     for j, step in enumerate(1e-6 * np.eye(4)):
         rows = free[:, j]
         ends = [read(z, q + s * step[:2], v + s * step[2:])[rows] for s in (1, -1)]
@@ -181,7 +181,7 @@ def test_the_force_on_a_block_is_what_friction_leaves_of_the_push(write_urdf):
     x = np.array([[0, 0.5], [0, 0], [0, 0]])
     sensors = choose_sensors(model, tree, ("slide.force",), None)
     read = sensors.read(law.dynamics(np.array([FRICTION])), x, push)
-    np.testing.assert_allclose(read[:, 0], [9 - FRICTION, 0, 9 - FRICTION], atol=1e-12)  # 3 N do not move it
+    np.testing.assert_allclose(read[:, 0], [9 - FRICTION, 0, 9 - FRICTION], atol=1e-12)  # 3 N do not move the block
 
 
 def test_a_step_in_which_a_block_stops_has_no_motion_after_it(write_urdf):
@@ -195,9 +195,9 @@ def test_a_step_in_which_a_block_stops_has_no_motion_after_it(write_urdf):
 
 @pytest.mark.slow
 def test_three_frictions_of_an_arm_that_mujoco_moved_are_found(tmp_path):
-    """MuJoCo's `frictionloss`, which stops a joint within two of its steps.
+    """MuJoCo's `frictionloss` stops a joint within two of its steps, so the steps are short.
 
-    So these are short: by steps of 0.25 ms 0.05 % less than its friction is found.
+    With steps of 0.25 ms, the friction found is 0.05 % too low.
     """
     mujoco = pytest.importorskip("mujoco")
     path = bare_arm(tmp_path)
@@ -216,4 +216,4 @@ def test_three_frictions_of_an_arm_that_mujoco_moved_are_found(tmp_path):
         low, high = e.intervals[name]
         assert high - low < 0.01 * value
         off.append((e.values[name] - value) / ((high - low) / (2 * 1.96)))
-    assert np.sum(np.square(off)) < stats.chi2.ppf(0.999, 3), off  # of three standard normal numbers
+    assert np.sum(np.square(off)) < stats.chi2.ppf(0.999, 3), off  # three standard normal numbers

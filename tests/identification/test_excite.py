@@ -1,4 +1,4 @@
-"""Motions that tell much: what they promise against closed forms, and against estimates from noisy motions."""
+"""Check the promised accuracy of exciting motions, against closed forms and estimates from noisy motions."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.solve
 
 
 def test_what_is_promised_of_a_block_is_the_textbooks_and_more_than_random_motion_gives(write_urdf):
-    """x = x0 + v0 t + s (double integral of u / m): linear in x0, v0 and the strength s; the mass is one over it."""
+    """x = x0 + v0 t + s (double integral of u / m) is linear in x0, v0 and the strength s. The mass is 1 / s."""
     model, sigma = write_urdf(mass=2.0), 0.002
     x_name, v_name, u_name = *model.state_names, *model.input_names
     limits = {x_name: 0.5, v_name: 2.0, u_name: 3.0}
@@ -31,11 +31,11 @@ def test_what_is_promised_of_a_block_is_the_textbooks_and_more_than_random_motio
             harmonics=2,
             max_iterations=most,
         )
-        moved = e.xs[:, 0] - e.xs[0, 0]  # what s = 1 does, as it starts from rest
+        moved = e.xs[:, 0] - e.xs[0, 0]  # the effect of s = 1, as the block starts from rest
         X = np.column_stack([np.ones(51), e.times, moved])
         deviation = sigma * np.sqrt(np.linalg.inv(X.T @ X)[2, 2])
         wanted = deviation * (2.0 if name == "block.mass" else 1.0)
-        # The search and the textbook have the same numbers: rounding, and Runge and Kutta's steps of order 8.
+        # The values differ by rounding and by the error of Runge-Kutta steps of order 8.
         assert e.deviations[name] == pytest.approx(wanted, rel=1e-6)
         assert np.all(np.abs(e.xs) <= [0.5, 2.0])
         assert np.all(np.abs(e.us) <= 3.0)
@@ -43,16 +43,16 @@ def test_what_is_promised_of_a_block_is_the_textbooks_and_more_than_random_motio
         found[name, most] = e
     best = found[f"{u_name}.strength", 4]
     (name,) = best.deviations
-    assert best.deviations[name] < 0.8 * found[name, 0].deviations[name]  # the best of 15 random motions
+    assert best.deviations[name] < 0.8 * found[name, 0].deviations[name]  # the value for the best of 15 random motions
     assert best.deviations[name] < 0.5 * best.random[name]
     assert best.gain == pytest.approx(best.random[name] / best.deviations[name], rel=1e-2)
-    # The motion is the double integral of inputs that are held.
+    # The motion is the double integral of piecewise constant inputs.
     v = np.concatenate([[0.0], np.cumsum(best.us[:, 0]) * 0.02 / 2.0])
     np.testing.assert_allclose(best.xs[:, 1], v, atol=1e-9)
 
 
 def test_what_is_promised_of_friction_is_what_its_sign_does(write_urdf):
-    """From a friction of 0 a block moves by minus the double integral of the sign of its speed, over its mass."""
+    """At friction 0, the position's derivative with respect to it is minus the double integral of sign(v) / m."""
     model, sigma = write_urdf(mass=2.0), 0.002
     limits = {"slide_x": 0.5, "slide_v": 2.0, "push": 3.0}
     given = {"duration": 1.0, "period": 0.02, "noise": {"slide_x": sigma}, "limits": limits, "harmonics": 2}
@@ -62,7 +62,7 @@ def test_what_is_promised_of_friction_is_what_its_sign_does(write_urdf):
     speed = np.concatenate([[0.0], np.cumsum((slows[1:] + slows[:-1]) / 2)]) * (fine[1] - fine[0]) / 2.0
     moved = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2)])[::400] * (fine[1] - fine[0])
     X = np.column_stack([np.ones(51), e.times, moved])
-    # The sum over 50 us misses a turn by at most half of that, in motions of some 0.1 s to either side.
+    # The sum with steps of 50 us misses a reversal by at most half a step, in motions of about 0.1 s per side.
     wanted = sigma * np.sqrt(np.linalg.inv(X.T @ X)[2, 2])
     assert e.deviations["slide.coulomb_friction"] == pytest.approx(wanted, rel=1e-3)
 
@@ -84,7 +84,7 @@ def test_the_command_prints_the_sentence_and_writes_a_recording(load, tmp_path):
     assert e.sentence in result.output
     read = read_recording(out, model)
     for one, other in ((read.times, e.times), (read.xs, e.xs), (read.us, e.us)):
-        np.testing.assert_array_equal(one, other)  # printed to the last bit
+        np.testing.assert_array_equal(one, other)  # the values are printed to the last bit
     assert np.max(np.abs(read.us)) <= 4
 
 
@@ -102,7 +102,7 @@ def test_the_command_prints_the_sentence_and_writes_a_recording(load, tmp_path):
 )
 def test_the_command_refuses_what_makes_no_sense(words, expected):
     result = command(*QUICK, *words)
-    assert isinstance(result.exception, DrakeDiffError), result.output  # of which the entry point makes status 2
+    assert isinstance(result.exception, DrakeDiffError), result.output  # the entry point turns this into exit status 2
     assert expected in str(result.exception)
 
 

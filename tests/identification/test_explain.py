@@ -1,4 +1,4 @@
-"""What is wrong in a model, by name: recordings of equations of motion that SciPy integrates."""
+"""Check that errors of a model are named, with recordings of equations of motion that SciPy integrates."""
 
 import html
 from dataclasses import replace
@@ -33,7 +33,7 @@ def pendulum(load):
 
 
 def driven(*, mass=MASS, damping=0.1, gravity=GRAVITY, bias=0.0, strength=1.0, delay=0.0, limit=np.inf, seed=0):
-    """The pendulum under torques held for 10 ms, so that mass, damping, gravity and strength are told apart."""
+    """Record a pendulum with torques constant for 10 ms, which separate mass, damping, gravity and strength."""
     times = np.linspace(0, 2, 201)
     us = 3 * np.sin(2 * np.pi * 0.9 * times[:-1]) + 2 * np.sin(2 * np.pi * 2.3 * times[:-1] + 1)
 
@@ -43,7 +43,7 @@ def driven(*, mass=MASS, damping=0.1, gravity=GRAVITY, bias=0.0, strength=1.0, d
         return [y[1], moment / (mass * LEVER**2)]
 
     xs = [np.array([1.0, 0.0])]
-    for k in range(200):  # a piece for each input
+    for k in range(200):  # one piece per input
         cuts = np.unique([times[k], np.clip(times[k] + delay % 0.01, times[k], times[k + 1]), times[k + 1]])
         x = xs[-1]
         for a, b in pairwise(cuts):
@@ -79,7 +79,7 @@ def test_a_single_change_of_a_pendulum_is_named(pendulum, changes, name, truth):
 
 
 def test_what_cannot_be_told_apart_is_named_together(pendulum):
-    """A pendulum that nothing drives shows only the quotient of damping and mass."""
+    """An unactuated pendulum shows only the quotient of damping and mass."""
     w = dd.explain(pendulum, swing(damping=0.15))
     assert {w.names, *w.alternatives} >= {("hinge.damping",), ("pole.mass",)}
     assert w.sentence.endswith("the recording cannot tell.")
@@ -95,7 +95,7 @@ def test_dry_friction_is_named(pendulum):
 
 
 def test_a_centre_of_mass_moves_as_in_a_file(tmp_path):
-    """With the inertia about it: a file with another origin of its inertia, read by Drake, is the same tree."""
+    """The inertia moves with the center of mass: Drake reads the same tree from a file with a moved origin."""
     text = (Path(dd.__file__).parents[1] / "models" / "pendulum.urdf").read_text()
     assert text.count('<origin xyz="0 0 -0.5"/>') >= 1
     (tmp_path / "pendulum.urdf").write_text(text.replace('<origin xyz="0 0 -0.5"/>', '<origin xyz="0.1 0 -0.4"/>', 1))
@@ -112,7 +112,7 @@ def test_a_centre_of_mass_moves_as_in_a_file(tmp_path):
 
 
 def test_beside_an_inertia_a_mass_takes_it_along():
-    """As it does alone: a second change is looked for where the first one was fitted."""
+    """A mass scales a fitted inertia, as it does alone: a second cause is searched from the first one's fit."""
     model = example_robot("ur5_robot.urdf")
     tree, name = tree_for_identification(model), "forearm_link"
     alone, both = (
@@ -126,7 +126,7 @@ def test_beside_an_inertia_a_mass_takes_it_along():
 
 
 def test_dry_friction_stops_and_holds_and_lets_go(load):
-    """A hinge of 0.25 kg m^2 without gravity, in closed form: steps are not cut where it stops or is let go."""
+    """A hinge of 0.25 kg m^2 without gravity matches the closed form, with stops and releases inside the steps."""
     model = load("pendulum.urdf")
     tree, _chart = tree_for_identification(model), Chart(coordinates_of(model))
     tree = replace(tree, numbers=replace(tree.numbers, gravity=np.zeros(3), damping=np.zeros(1)))
@@ -134,7 +134,7 @@ def test_dry_friction_stops_and_holds_and_lets_go(load):
     law = TreeMotion(model, tree, unknowns, 0.04)
     times, torques = 0.04 * np.arange(31), np.repeat([0.0, 0.4, -1.0], 10)
     xs = law.run(np.array([0.5]), np.array([[0.1, 0.7]]), np.full((1, 30), 0.04), torques[None, :, None])[0]
-    slides = np.minimum(times, 0.35)  # by -2 rad/s^2 until 0.7 / 2 s; 0.4 N m do not move it; -1 N m do, by -2 rad/s^2
+    slides = np.minimum(times, 0.35)  # -2 rad/s^2 until 0.35 s. 0.4 N m do not move it, and -1 N m gives -2 rad/s^2.
     let_go = np.maximum(times - 0.8, 0)
     np.testing.assert_allclose(xs[:, 0], 0.1 + 0.7 * slides - slides**2 - let_go**2, atol=1e-8)
     np.testing.assert_allclose(xs[:, 1], 0.7 - 2 * slides - 2 * let_go, atol=1e-8)
@@ -162,7 +162,7 @@ def test_of_a_right_model_nothing_is_said(pendulum, seed):
 
 
 def test_chance_names_a_change_of_a_right_arm_in_less_than_0_3_percent():
-    """The limit holds what FALSE_NAME says; the penalty of BIC alone would not, of so many changes."""
+    """The limit keeps false names below the rate FALSE_NAME. The BIC penalty alone would not, for so many changes."""
     model = example_robot("ur5_robot.urdf")
     tree, _chart, period = tree_for_identification(model), Chart(coordinates_of(model)), 0.01
     us = np.random.default_rng(0).uniform(-3, 3, (40, model.nu))
@@ -181,7 +181,7 @@ def test_chance_names_a_change_of_a_right_arm_in_less_than_0_3_percent():
     ("step", "names"), [pytest.param(0.005, (), marks=pytest.mark.slow), (0.0025, ("model.time_step",))]
 )
 def test_the_length_of_a_simulators_steps_is_named(load, step, names):
-    """Drake's own steps: those of the model are no change of it, and others are told by their length."""
+    """With motions from Drake's own steps, the model's step is not named as a change, and another step is named."""
     model = load("double_pendulum.urdf", time_step=0.005)
     times = 0.01 * np.arange(201)
     us = np.stack([4 * np.sin(5 * times[:-1]), 2 * np.sin(8 * times[:-1] + 1)], axis=1)
@@ -199,7 +199,7 @@ def test_the_length_of_a_simulators_steps_is_named(load, step, names):
 
 @pytest.mark.slow
 def test_a_comparison_with_a_recording_names_the_cause(pendulum, tmp_path):
-    """In the terminal, in the record and on the page; where nothing can be looked for, why."""
+    """The cause is in the terminal, the record and the page. If no search is possible, the reason is given."""
     log = swing(damping=0.2, velocities=True)
     rows = [",".join(["time", *pendulum.state_names, *pendulum.input_names])]
     rows += [",".join(map(repr, map(float, (t, *x, 0)))) for t, x in zip(log.times, log.xs, strict=True)]
@@ -221,7 +221,7 @@ def test_a_comparison_with_a_recording_names_the_cause(pendulum, tmp_path):
 
 @pytest.mark.slow
 def test_a_law_that_no_parameter_has_is_not_explained(pendulum):
-    """A wall that stops the measured angle."""
+    """A wall limits the measured angle, which no parameter explains."""
     log = swing(noise=1e-4)
     pushed = log.xs.copy()
     pushed[:, 0] = np.maximum(pushed[:, 0], -0.6)

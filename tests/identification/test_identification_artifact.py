@@ -1,4 +1,4 @@
-"""The directory of an identification: what is in it, that it comes out again, and that no forgery does."""
+"""Check an identification's directory: its contents, that verification reproduces it, and that forgeries fail."""
 
 import io
 import json
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.solve
 
 
 def write_swing(path, *, damping=0.15, seed=0, friction=0.0):
-    """A CSV file of a pendulum of 1 kg at 0.5 m by its equation of motion: positions with noise of 1 mrad."""
+    """Write a CSV file of a pendulum of 1 kg at 0.5 m from its equation of motion, with position noise of 1 mrad."""
 
     def rates(t, y):
         moment = -9.81 * 0.5 * np.sin(y[0]) - damping * y[1] - friction * np.tanh(y[1] / 1e-3)
@@ -70,7 +70,7 @@ def test_the_record_says_what_was_found_and_where_the_data_end(found, run, log):
     (recording,) = record.recordings
     assert (recording.file, recording.samples) == ("lab.csv", 121)
     assert recording.sha256 == record.files["recordings/0/lab.csv"].sha256
-    # 20 % of 121 samples are 24, and the sample where they begin belongs to both.
+    # 20 % of 121 samples are 24. The first of these belongs to both parts.
     assert recording.fitted_s == [[0.0, pytest.approx(0.96)]]
     assert recording.held_out_s == [[pytest.approx(0.96), pytest.approx(1.2)]]
     assert (run / recording.path).read_bytes() == log.read_bytes()
@@ -82,7 +82,7 @@ def test_the_trace_has_both_motions_on_one_axis_of_time(run):
     measured, fitted = (trace.arrays(f"/0/{which}/state") for which in ("measured", "fitted"))
     np.testing.assert_array_equal(measured["time"], fitted["time"])
     assert len(measured["time"]) == 121
-    # The noise is 1 mrad: 4.5 of it are beyond what one of 121 samples shows.
+    # The noise is 1 mrad. The largest of 121 samples is below 4.5 standard deviations.
     assert np.max(np.abs(measured["q"] - fitted["q"])) < 4.5e-3
     assert np.isnan(measured["v"]).all()
     before = trace.arrays("/0/before/state")
@@ -109,7 +109,7 @@ def test_arrays_in_place_of_a_file_are_kept_and_hold(tmp_path):
 
 
 def reseal(directory, change):
-    """The record with a change in it, and all hashes as they have to be."""
+    """Apply a change to the record and recompute all hashes."""
     path = directory / "record.json"
     fields = json.loads(path.read_text())
     change(fields)
@@ -158,7 +158,7 @@ def to(key, value):
     ],
 )
 def test_what_is_forged_and_hashed_again_is_refused(run, tmp_path, change, words):
-    copy = shutil.copytree(run, tmp_path / "copy", dirs_exist_ok=True)  # over that of the row before
+    copy = shutil.copytree(run, tmp_path / "copy", dirs_exist_ok=True)  # overwrites the copy of the previous row
     reseal(copy, change)
     verified = dd.verify(copy)
     assert verified.verdict == "broken"
@@ -185,7 +185,7 @@ def test_a_fit_that_explains_nothing_cannot_be_sold_as_one_that_does(tmp_path):
     log = write_swing(tmp_path / "dry.csv", friction=0.1)
     record = dd.save(dd.identify(model, log, ["hinge.damping"]), tmp_path / "run")
     assert (record.verdict, record.explained) == ("fail", False)
-    assert dd.verify(tmp_path / "run").holds  # true, and no success
+    assert dd.verify(tmp_path / "run").holds  # the record is valid, although the fit failed
     reseal(tmp_path / "run", lambda f: f.update(verdict="pass", explained=True))
     verified = dd.verify(tmp_path / "run")
     assert verified.verdict == "broken"

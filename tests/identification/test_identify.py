@@ -1,4 +1,4 @@
-"""Parameters from recordings: closed forms first, then motions integrated by SciPy, which knows nothing of Drake."""
+"""Check parameters from recordings, with closed forms and then with motions that SciPy integrates without Drake."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def pendulum(load):
 
 
 def test_what_enters_linearly_is_the_linear_least_squares_solution(write_urdf):
-    """x = x0 + v0 t + s (F / 2 m) t^2 is linear in x0, v0 and the strength s: the textbook's value and t interval."""
+    """x = x0 + v0 t + s (F / 2 m) t^2 is linear in x0, v0 and s, so the textbook gives the value and t interval."""
     model, n, force = write_urdf(mass=2.0), 40, 3.0
     t = 0.05 * np.arange(n)
     x = 0.2 - 0.1 * t + 1.2 * force / 4 * t**2 + 0.01 * np.random.default_rng(1).standard_normal(n)
@@ -38,7 +38,7 @@ def test_what_enters_linearly_is_the_linear_least_squares_solution(write_urdf):
     noise = np.sqrt(left[0] / (n - 3))
     half = stats.t.ppf(0.975, n - 3) * noise * np.sqrt(np.linalg.inv(X.T @ X)[2, 2])
     (name,) = e.values
-    # The fit pulls to 1 with a width of 3, which moves it by (half / 3)^2 of what it moves at all: 1e-5.
+    # The regularization to 1 with a width of 3 moves the value by (half / 3)^2 of its change: 1e-5.
     assert e.values[name] == pytest.approx(wanted[2], rel=1e-5)
     np.testing.assert_allclose(e.intervals[name], wanted[2] + np.array([-half, half]), rtol=1e-3)
     assert e.noise[model.position_names[0]] == pytest.approx(noise, rel=1e-3)
@@ -55,7 +55,7 @@ def test_the_damping_of_a_pendulum_is_found_from_positions_alone(pendulum):
     assert e.error_after < 1.3 < e.error_before
     assert "hinge.damping is 0.1" in e.sentence
     assert "+5" in e.sentence
-    assert "bound" not in e.sentence  # none was given
+    assert "bound" not in e.sentence  # no bound was given
 
 
 def test_samples_may_be_any_time_apart_and_missing(pendulum):
@@ -86,7 +86,7 @@ def test_a_motion_with_dry_friction_is_not_explained_by_damping_and_is_by_fricti
     assert without.sentence.startswith("Not explained")
     e = dd.identify(pendulum, log, ["hinge.damping", "hinge.coulomb_friction"])
     assert e.explained, e.reason
-    # Its standard error is 0.5 %; and friction turns over 0.02 rad/s here, over 0.001 in the recording.
+    # The standard error is 0.5 %. Friction is smoothed over 0.02 rad/s in the model and 0.001 in the recording.
     assert e.values["hinge.coulomb_friction"] == pytest.approx(0.08, rel=0.02)
 
 
@@ -115,7 +115,7 @@ def test_what_is_seen_only_together_is_named(pendulum):
     ],
 )
 def test_what_is_seen_of_two_is_told_as_it_is(names, values, seen, words):
-    """The direction in which a function of two numbers stays as it is, by its derivatives."""
+    """The direction that keeps a function of two numbers constant, from derivatives, is reported as the function."""
     each = [Unknown(name, "", np.array([v]), 0.0, v) for name, v in zip(names, values, strict=True)]
     a, b = np.array(values) * (1 + 1e-6j), np.array(values)
     by_a, by_b = np.imag(seen(a[0], b[1])) / a[0].imag, np.imag(seen(b[0], a[1])) / a[1].imag
@@ -144,17 +144,17 @@ def test_residuals_that_hang_together_are_told_from_white_ones():
 
 @pytest.mark.parametrize("count", [25, 49])
 def test_of_few_samples_white_ones_are_not_told_to_hang_together(count):
-    """A line is fitted to each series: by chi-square alone, 5 times as many as should be would be below 0.001."""
+    """A line is fitted to each series. Chi-square alone would give 5 times too many values below 0.001."""
     random = np.random.default_rng(1)
     line = np.linalg.qr(np.column_stack([np.ones(count), np.arange(count)]))[0]
     noise = random.standard_normal((count, 4_000))
     rows = noise - line @ (line.T @ noise)
     below = sum(colour_of([rows[:, [j]]], ["a"])[1] < 1e-3 for j in range(4_000))
-    assert below <= stats.binom.ppf(0.9999, 4_000, 1.5e-3)  # half as many again as should be
+    assert below <= stats.binom.ppf(0.9999, 4_000, 1.5e-3)  # allows 1.5 times the expected rate
 
 
 def test_a_chaotic_motion_is_fitted(load):
-    """A double pendulum that swings over: small changes of its start grow tenfold in half a second."""
+    """In a double pendulum that swings over, small changes of the start grow tenfold in half a second."""
     model = load("double_pendulum.urdf", time_step=0.001)
     truth = {"lower.mass": 0.6, "elbow.damping": 0.03}
     tree = tree_for_identification(model)
@@ -196,7 +196,7 @@ def test_accelerations_are_drakes_and_steps_have_the_slopes_of_differences(name)
         return TreeDynamics(tree, numbers.moved(size * direction)).accelerate(x[None], u[None])[0]
 
     difference = (moved(1e-5) - moved(-1e-5)) / 2e-5
-    # Differences over 1e-5 of light links are good to 1e-6 of the largest.
+    # For light links, differences with a step of 1e-5 are accurate to 1e-6 of the largest entry.
     np.testing.assert_allclose(by_numbers @ direction, difference, atol=1e-6 * np.abs(difference).max())
 
 
@@ -218,7 +218,7 @@ def test_steps_have_the_slopes_of_differences_by_unknowns(load):
 
 @pytest.mark.slow
 def test_the_models_own_steps_are_fitted_where_they_are_asked_for_and_are_only_as_good_as_they_are_short(load):
-    """Euler's steps of 10 ms put their error into the damping: the interval misses, and the residuals say so."""
+    """Euler steps of 10 ms bias the damping: the interval misses the truth, and the residuals show it."""
     log = swing(damping=0.15)
     long = dd.identify(load("pendulum.urdf", time_step=0.01), log, ["hinge.damping"], motion="steps")
     assert not long.explained

@@ -1,4 +1,4 @@
-"""Contact parameters from motions through impacts: a closed form, then throws and tosses of known truth."""
+"""Check contact parameters from motions through impacts, with a closed form and then throws with known truth."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.solve
 
 
 def throws(model, truth, *, steps=1, height=0.0):
-    """Four spinning throws of the ball, 200 Hz, by so many steps between samples, above a ground at a height."""
+    """Record four spinning throws of the ball at 200 Hz, with `steps` steps per sample, over a ground at `height`."""
     fine, found = model.at_time_step(0.005 / steps), []
     for k in range(4):
         x0 = np.array([1.0, 0, 0, 0, 0, 0, 0.12 + 0.01 * k, 4.0 - k, 6.0 * k - 12, 0.5, 0.4 + 0.1 * k, 0.2, -0.3])
@@ -35,7 +35,7 @@ def test_friction_of_a_ball_that_slides_is_that_of_the_closed_form(load):
     friction, gravity, radius, depth = 0.25, 9.81, 0.1, 9.81 / 1e4
     times = 0.005 * np.arange(41)
     recordings = []
-    for k, v in enumerate((1.8, 2.0, 2.2)):  # [m/s] all slide for 2 v / (7 mu g) > 0.2 s
+    for k, v in enumerate((1.8, 2.0, 2.2)):  # [m/s], all slide for 2 v / (7 mu g) > 0.2 s
         xs = np.zeros((41, 13))
         turn = 0.5 * 2.5 * friction * gravity / radius * times**2
         xs[:, 0], xs[:, 2] = np.cos(turn / 2), np.sin(turn / 2)
@@ -44,8 +44,8 @@ def test_friction_of_a_ball_that_slides_is_that_of_the_closed_form(load):
         recordings.append(dd.Recording(f"slide {k}", "1", times, xs, np.zeros((40, 0))))
     found = identify_contact(ball, recordings, ["ball.friction"])
     own = float(found.values["ball.friction"])
-    # Of a pair Drake takes 2 a b / (a + b), the ground having 0.5. Its steps lead mu g h t / 2 beyond mu g t^2 / 2:
-    # h / t, for 1 ms 2 % at 0.05 s.
+    # Drake's friction of a pair is 2 a b / (a + b), with 0.5 for the ground. Its steps add mu g h t / 2 to
+    # mu g t^2 / 2, a ratio of h / t: 2 % at 0.05 s for 1 ms.
     assert 2 * own * 0.5 / (own + 0.5) == pytest.approx(friction, rel=0.02)
 
 
@@ -53,20 +53,20 @@ def test_friction_of_a_ball_that_slides_is_that_of_the_closed_form(load):
 def test_the_truth_of_the_same_steps_is_found(ball):
     truth = {"ball.friction": 0.25, "ball.radius": 0.103}
     found = identify_contact(ball, throws(ball, truth, height=0.002), ["ball.friction", "ball.radius", "ball_z.bias"])
-    # No noise and the same steps: what is left is where least squares stop.
+    # Without noise and with the same steps, the error is the stopping tolerance of least squares.
     assert found.values["ball.friction"] == pytest.approx(0.25, rel=5e-3)
     gap = float(found.values["ball.radius"]) - float(found.values["ball_z.bias"])
-    assert gap == pytest.approx(0.101, abs=2e-4)  # a ball's height shows the difference alone
+    assert gap == pytest.approx(0.101, abs=2e-4)  # the height depends only on the difference
     assert found.error_after < 0.05 * found.error_before
 
 
 @pytest.mark.slow
 def test_an_interval_includes_what_the_time_step_does(ball):
-    """Recorded by steps a tenth as long: the friction found is too high by ten times what recordings scatter by."""
+    """With a tenth of the step in the recordings, the friction is too high by ten times the recordings' scatter."""
     found = identify_contact(ball, throws(ball, {"ball.friction": 0.25}, steps=10), ["ball.friction"])
     low, high = found.intervals["ball.friction"]
     assert low < 0.25 < high
-    # Half the step comes nearer, by 0.006 of 0.021; six times that is 0.04.
+    # Half the step reduces the error of 0.021 by 0.006, and six times 0.006 is about 0.04.
     value, half = float(found.values["ball.friction"]), float(found.at_half_step["ball.friction"])
     assert abs(half - 0.25) < abs(value - 0.25)
     assert high - value < 0.05
@@ -90,11 +90,11 @@ def test_bad_input_is_refused_by_name(ball):
 def test_the_first_state_of_a_flight_needs_no_velocities(ball):
     recording = throws(ball, {})[0]
     xs = recording.xs.copy()
-    xs[:, 7:] += 0.05  # [rad/s, m/s] what differences of poses are wrong by
+    xs[:, 7:] += 0.05  # [rad/s, m/s], the error of differentiated poses
     start = first_state(ball, dd.Recording("throw", "1", recording.times, xs, recording.us))
-    # The positions are those of the same steps without noise: least squares stop at rounding.
+    # The positions come from the same steps without noise, so least squares stop at rounding level.
     np.testing.assert_allclose(start, recording.xs[0], atol=1e-6)
-    # Where it lies on the ground from the start nothing is better than what was measured.
+    # On the ground from the start, no state is better than the measured one.
     xs[:, 6] = 0.09
     lying = dd.Recording("lies", "1", recording.times, xs, recording.us)
     np.testing.assert_array_equal(first_state(ball, lying), xs[0])
@@ -106,12 +106,12 @@ def test_a_plane_follows_what_a_ragged_function_does_on_the_whole():
         return np.concatenate([100 * (w[0] - 0.7) + ragged, [50 * (w[1] + 0.4)] * 40])
 
     w = shrink_to(residual, np.zeros(2), (1.0, 0.5, 0.25), np.random.default_rng(0)).w
-    # What is ragged counts 20 / sqrt(2 * 40 * 8) of 100: a hundredth.
+    # The ragged part contributes 20 / sqrt(2 * 40 * 8) of 100, a hundredth.
     np.testing.assert_allclose(w, [0.7, -0.4], atol=0.03)
 
 
 def noisy(ball, friction, seed):
-    """Five throws, the last of which may have another friction; noise of 0.1 mm and 0.2 mrad in every pose."""
+    """Record five throws, the last with its own friction, with noise of 0.1 mm and 0.2 mrad in every pose."""
     random, found = np.random.default_rng(seed), []
     for k in range(5):
         own = friction[k == 4]
@@ -131,10 +131,10 @@ def test_identify_goes_through_impacts_and_says_whether_they_are_explained(ball)
 
     right = fit((0.25, 0.25))
     assert right.explained, right.reason
-    assert right.values["ball.friction"] == pytest.approx(0.25, rel=0.02)  # of noise
-    # What is left has the size that noise and the first states' uncertainty explain.
+    assert right.values["ball.friction"] == pytest.approx(0.25, rel=0.02)  # from noise
+    # The residuals match the noise and the uncertainty of the first states.
     assert 0.6 < right.error_after < 1.4
-    wrong = fit((0.25, 0.1))  # what is predicted is another ball
+    wrong = fit((0.25, 0.1))  # the predicted ball differs
     assert not wrong.explained
     assert "held-out samples" in wrong.reason
     with pytest.raises(InputError, match="priors and bounds"):
@@ -152,19 +152,19 @@ def test_an_identification_through_impacts_can_be_kept_and_comes_out_again(ball,
 
 
 def test_a_fall_by_less_than_gravity_is_told_without_bounds_that_there_are_not(ball):
-    """As where the cameras' metre is too long: z = 1 - 9.6 t^2 / 2, with 0.1 mm of noise."""
+    """If the cameras' metre is too long, z is 1 - 9.6 t^2 / 2, with 0.1 mm of noise."""
     times, xs = 0.005 * np.arange(41), np.full((41, 13), np.nan)
     xs[:, :7] = [1.0, 0, 0, 0, 0, 0, 1.0]
     xs[:, 6] -= 9.6 * times**2 / 2
     xs[:, 4:7] += 1e-4 * np.random.default_rng(0).standard_normal((41, 3))
     found = dd.identify(ball, dd.Recording("fall", "1", times, xs, np.zeros((40, 0))), ["model.gravity"])
-    # 33 samples that are fitted know 9.6 to 0.1 mm * sqrt(720 / 33) / (0.16 s)^2 = 0.02.
+    # The 33 fitted samples determine 9.6 to 0.1 mm * sqrt(720 / 33) / (0.16 s)^2 = 0.02.
     assert found.values["model.gravity"][2] == pytest.approx(-9.6, abs=0.06)
     assert "bound" not in found.sentence
 
 
 def test_the_spread_of_a_first_state_is_that_of_first_states_by_other_noise(ball):
-    """By the same flight measured again and again, which is what the spread speaks of."""
+    """Compare the spread with repeated measurements of the same flight."""
     chart, found, told = Chart(coordinates_of(ball)), [], []
     for seed in range(20):
         piece = read_pieces(ball, noisy(ball, (0.25, 0.25), seed)[2], 0.0)[0].part(0, 15)
@@ -172,6 +172,6 @@ def test_the_spread_of_a_first_state_is_that_of_first_states_by_other_noise(ball
         found.append(start.x)
         told.append(np.sqrt(np.sum(start.spread**2, axis=1)))
     scattered = np.std(chart.minus(np.array(found), np.mean(found, axis=0)), axis=0, ddof=1)
-    # Of 20 flights, the root of chi^2 / 19 is within 0.55 and 1.55 for 12 numbers together, 1 in 100 times not.
+    # For 20 flights, the root of chi^2 / 19 of all 12 numbers is within 0.55 and 1.55 with probability 0.99.
     ratio = scattered / np.sqrt(np.mean(np.square(told), axis=0))
     assert np.all((ratio > 0.55) & (ratio < 1.55)), ratio

@@ -1,4 +1,4 @@
-"""Delays of inputs, priors and bounds: closed forms first, then a robot in another simulator."""
+"""Check input delays, priors and bounds, with closed forms and then with a robot in another simulator."""
 
 import numpy as np
 import pytest
@@ -20,9 +20,9 @@ pytestmark = pytest.mark.solve
 
 
 def pushed(t, us, period, delay, mass):
-    """Where a block is that inputs push, each held for a period, `delay` later than recorded: the double integral."""
+    """Return the position of a pushed block: the double integral of inputs that act `delay` after the recorded time."""
     begin = period * np.arange(len(us)) + delay
-    begin[0] = min(begin[0], 0.0)  # before the first input it is as if that had always acted
+    begin[0] = min(begin[0], 0.0)  # the first input acts from the start
     ends = np.append(begin[1:], np.inf)
     x = 0.2 - 0.1 * t
     for a, b, u in zip(begin, ends, us, strict=True):
@@ -45,7 +45,7 @@ def test_a_delay_is_found_to_a_part_of_a_sample(write_urdf):
     for delay in (0.013, 0.06):
         e = dd.identify(model, rail(model, delay), ["model.input_delay", "block.mass"])
         low, high = e.intervals["model.input_delay"]
-        assert low < delay < high < low + 0.004  # of samples 0.02 s apart
+        assert low < delay < high < low + 0.004  # the samples are 0.02 s apart
         assert e.explained, e.reason
     e = dd.identify(model, rail(model, 0.0), ["model.input_delay"])
     assert e.intervals["model.input_delay"][0] == 0.0
@@ -53,7 +53,7 @@ def test_a_delay_is_found_to_a_part_of_a_sample(write_urdf):
 
 
 def test_the_derivative_by_a_delay_is_that_of_differences(load):
-    """Inputs jump between samples, at a sample of the piece before, and at several within one step."""
+    """Inputs jump between samples, at a sample of the previous piece, and several times in one step."""
     model = load("double_pendulum.urdf")
     tree, chart = tree_for_identification(model), Chart(coordinates_of(model))
     unknowns = choose_unknowns(model, tree, ["model.input_delay", "lower.mass"])
@@ -87,12 +87,12 @@ def test_the_derivative_by_a_delay_is_that_of_differences(load):
             each.append(moved)
         found.append(-np.array(each)[segments.at[k], :2] / 1e-3)
     wanted = (residuals(delay + h) - residuals(delay - h)) / (2 * h)
-    # Differences over 2e-6 s of residuals of 1e3: rounding of 1e-13 each leaves 1e-4, of slopes of 10 and more.
+    # Residuals of 1e3 with rounding of 1e-13 give 1e-4 in differences over 2e-6 s. The derivatives are 10 and more.
     np.testing.assert_allclose(np.concatenate(found), wanted, atol=1e-3)
 
 
 def test_a_prior_counts_as_a_measurement(write_urdf):
-    """Linear in the strength: the mean of estimate and prior, weighted by one over their variances."""
+    """The problem is linear in the strength, so the result is the mean weighted by the inverse variances."""
     model = write_urdf(mass=2.0)
     log, name = rail(model, 0.0, noise=0.02), f"{model.input_names[0]}.strength"
     noise = {model.position_names[0]: 0.02}
@@ -112,7 +112,7 @@ def test_a_prior_tells_apart_what_the_data_do_not(load):
     e = dd.identify(model, swing(), names, priors={"pole.mass": (1.0, 0.02)})
     assert e.unidentifiable == ()
     low, high = e.intervals["pole.mass"]
-    assert (high - low) / 2 == pytest.approx(1.97 * 0.02, rel=0.02)  # Student's t of 155 samples
+    assert (high - low) / 2 == pytest.approx(1.97 * 0.02, rel=0.02)  # Student's t for 155 samples
     assert low < 1.0 < high
 
 

@@ -1,4 +1,4 @@
-"""Sensors that measure no coordinates: Drake's kinematics, closed forms, then a robot in another simulator."""
+"""Check sensors of other quantities with Drake's kinematics, closed forms and a robot in another simulator."""
 
 import numpy as np
 import pytest
@@ -54,7 +54,7 @@ def test_readings_are_drakes_and_their_slopes_those_of_differences(name, body, j
     np.testing.assert_allclose(read[3:6], R @ spatial[:3], atol=1e-12)
     size = np.abs(acceleration).max()
     np.testing.assert_allclose(read[6:9], R @ (acceleration[3:] + 9.81 * np.eye(3)[2]), atol=1e-9 * size)
-    # What the links need is what the drive gives: inverse dynamics without rotors, springs and friction.
+    # The force is what the drive supplies: inverse dynamics without rotors, springs and friction.
     k = plant.GetJointByName(joint).velocity_start()
     set_state(model.double, x)
     rotors = numbers.reflected * a + numbers.damping * x[nq:]
@@ -72,17 +72,17 @@ def test_readings_are_drakes_and_their_slopes_those_of_differences(name, body, j
 
     difference = (at(1e-5) - at(-1e-5)) / 2e-5
     found = by_x[0] @ direction + by_numbers[0] @ change
-    # Differences over 1e-5 of accelerations of light links are good to 1e-6 of the largest.
+    # For light links, differences of accelerations with a step of 1e-5 are accurate to 1e-6 of the largest entry.
     np.testing.assert_allclose(found, difference, atol=1e-6 * max(np.abs(difference).max(), 1.0))
 
 
 def test_a_pendulum_is_known_by_an_accelerometer_and_a_gyro_on_it(load):
-    """At r from the hinge it feels r w' + g sin q across and r w^2 + g cos q along; the gyro has a bias."""
+    """At r from the hinge, the sensor measures r w' + g sin q and r w^2 + g cos q. The gyro has a bias."""
     model, random, r = load("pendulum.urdf"), np.random.default_rng(0), 0.4
     exact = swing(damping=0.15, noise=0.0, velocities=True)
     q, w = exact.xs.T
-    w_dot = -GRAVITY / LEVER * np.sin(q) - 0.15 * w / LEVER**2  # of 1 kg
-    outputs = {  # the rod hangs along -z of its frame and turns about +y
+    w_dot = -GRAVITY / LEVER * np.sin(q) - 0.15 * w / LEVER**2  # for 1 kg
+    outputs = {  # the rod hangs along -z of its frame and rotates about +y
         "imu.gyro_y": w + 0.05 + 1e-3 * random.standard_normal(len(q)),
         "imu.accel_x": -r * w_dot - GRAVITY * np.sin(q) + 1e-2 * random.standard_normal(len(q)),
         "imu.accel_z": r * w**2 + GRAVITY * np.cos(q) + 1e-2 * random.standard_normal(len(q)),

@@ -1,4 +1,4 @@
-"""The corrected model file: every parameter of it is what was found, and what no file can have is refused by name."""
+"""Check that a corrected model file has the parameters that were found, and that errors name unsupported ones."""
 
 import re
 from dataclasses import replace
@@ -28,7 +28,7 @@ ARM = """<?xml version="1.0"?>
 
 
 def saying(model, values, *, file=None, explained=True):
-    """An identification of `model` that found `values`, each 10 % sure; how it was found does not matter here."""
+    """Return an identification of `model` with the given values and intervals of 10 %, without fitting."""
     own = {p.name: p for p in dd.list_parameters(model)}
     start = {name: own[name].value if name in own else np.ones(1) for name in values}
     start = {name: float(value[0]) if len(value) == 1 else value for name, value in start.items()}
@@ -50,12 +50,12 @@ def saying(model, values, *, file=None, explained=True):
 
 
 def same(model, path, values):
-    """All parameters of the new file are the old ones', but for those that were found."""
+    """Check that all parameters of the new file equal the old ones, except for those that were found."""
     old = {p.name: p.value for p in dd.list_parameters(model)}
     new = {p.name: p.value for p in dd.list_parameters(dd.load_model(path, **model.options))}
     assert set(old) == set(new)
     for name, value in old.items():
-        # Printed to the last digit; an inertia is moved to the centre of mass and back, of 1 kg m^2 or less here.
+        # Values are printed to the last digit. Shifting an inertia of up to 1 kg m^2 to the center of mass rounds it.
         np.testing.assert_allclose(new[name], np.atleast_1d(values.get(name, value)), rtol=1e-12, atol=1e-14)
 
 
@@ -84,9 +84,9 @@ def test_a_urdf_file_takes_everything_that_it_has_a_place_for(arm, tmp_path):
     text = path.read_text()
     assert "arm.mass was 2 kg, is 3 (95 % interval 2.699 to 3.301)" in text
     assert "from lab" in text
-    assert "<!-- an arm -- of one link -->" in text  # what was not changed stays, however odd
+    assert "<!-- an arm -- of one link -->" in text  # unchanged text stays
     assert "--" not in re.sub("<!--|-->", "", text.replace("<!-- an arm -- of one link -->", ""))
-    # The turn of the joint's frame is the file's.
+    # The rotation of the joint's frame comes from the file.
     turned = dd.load_model(path, **arm.options).plant.GetJointByName("shoulder").frame_on_parent()
     assert turned.GetFixedPoseInBodyFrame().rotation().ToRollPitchYaw().yaw_angle() == pytest.approx(0.5)
 
@@ -94,7 +94,7 @@ def test_a_urdf_file_takes_everything_that_it_has_a_place_for(arm, tmp_path):
 def test_an_sdf_file_takes_springs_too(load, tmp_path):
     model = load("mass_spring_damper.sdf")
     values = {"block.mass": 2.5, "slide.damping": 1.0, "slide.spring_stiffness": 60.0, "slide.spring_rest_length": 0.2}
-    # A mass alone carries the unit inertia with it, as in Drake.
+    # A mass scales the inertia, as in Drake.
     path = write_model(saying(model, values), tmp_path / "right.sdf")
     (inertia,) = [p.value for p in dd.list_parameters(model) if p.name == "block.inertia"]
     same(model, path, {**values, "block.inertia": inertia * 1.25})
@@ -112,7 +112,7 @@ def test_random_bodies_come_out_as_they_were_found(arm, tmp_path, seed):
         "arm.center_of_mass": rng.normal(size=3) * 0.3,
         "arm.inertia": np.array([inertia[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]),
     }
-    # A centre of mass alone may leave what a body can have.
+    # A center of mass alone may be physically impossible.
     kept = (
         values if seed % 2 else {"arm.mass": values["arm.mass"]} if seed % 4 else {"arm.inertia": values["arm.inertia"]}
     )
@@ -197,7 +197,7 @@ def test_an_overlay_stays_over_a_corrected_copy_of_the_file_that_it_adds(tmp_pat
     path = write_model(saying(model, values), tmp_path / "right.dmd.yaml")
     same(model, path, values)
     new = dd.load_model(path, time_step=0.01)
-    np.testing.assert_array_equal(new.default_state, model.default_state)  # the positions of the overlay
+    np.testing.assert_array_equal(new.default_state, model.default_state)  # the positions come from the overlay
     lines = path.read_text().splitlines()
     assert lines[0].startswith("# Explained: so -- it is -->.")
     assert [line for line in lines[1:] if "file:" not in line] == [

@@ -1,4 +1,4 @@
-"""A run carries the files of its robot: it is verified without them, wherever they were, and a changed one is found."""
+"""Check that a run includes its robot's files, is verified without the originals, and that changed files are found."""
 
 import json
 import shutil
@@ -40,7 +40,7 @@ FREE = "Everybody may use it.\n"
 
 
 def robots(root):
-    """A package, a world, MJCF with assets and directives in the folder `root`."""
+    """Write a package, a world, MJCF with assets, and directives into the folder `root`."""
     robot = root / "robot"
     for folder in (robot / "meshes", robot / "urdf", root / "mj" / "assets", root / "mj" / "sub", root / "world"):
         folder.mkdir(parents=True)
@@ -183,7 +183,7 @@ def test_a_record_is_the_same_wherever_the_model_lies_and_however_its_path_is_wr
 
 
 def forged(arm, folder, change):
-    """A run whose record says something else of the model's files, with all seals right."""
+    """Verify a run whose record has changed model files, with correct hashes."""
     folder.mkdir()
     measurement = measure(arm)
     honest = record_of(measurement, folder)
@@ -307,7 +307,7 @@ def test_a_package_called_as_a_folder_above_is_not_looked_for_there(tmp_path):
 
 
 def test_a_run_written_before_has_no_copy_and_is_verified_with_the_folder_of_its_model(arm, tmp_path):
-    """As version 4.0 wrote it: paths in the contract and its notes, no material of an OBJ, no licence."""
+    """Version 4.0 had paths in the contract and its notes, and neither OBJ materials nor licenses in the artifact."""
     model, folder = arm.problem.model, tmp_path / "run"
     dd.save(arm, folder)
     shutil.rmtree(folder / "model")

@@ -1,4 +1,4 @@
-"""A model certified at sampled states: the states, the record, the command."""
+"""Check the certification of a model at sampled states: the states, the record and the command."""
 
 import json
 import warnings
@@ -25,7 +25,7 @@ NAMES = sorted(path.name for path in MODELS.iterdir())
 @pytest.mark.long
 @each_row("name", NAMES)
 def test_every_model_here_is_certified_at_every_sampled_state(load, name):
-    """Eight states of each model, every other one in contact if the model can touch something."""
+    """Certify eight states of each model, every second one in contact if the model has contact pairs."""
     record = certify_model(load(name, time_step=0.005), states=8, seed=3)
     assert record.verdict == "pass", [s for s in record.certification.states if s.verdict != "agree"]
     assert len(record.certification.states) == 8

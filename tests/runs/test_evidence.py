@@ -1,4 +1,4 @@
-"""The run directory: complete, true, the same bytes for the same input, and honest when the run failed."""
+"""Check that a run directory is complete, correct and reproducible, also if the run failed."""
 
 import dataclasses
 from hashlib import sha256
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.solve
 
 @pytest.fixture(scope="module")
 def swing_up():
-    """A pendulum swung up through its own steps in 0.8 s."""
+    """Return a solution that swings a pendulum up with shooting in 0.8 s."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
     problem = dd.Problem(model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=40, running_cost=dd.QuadraticCost(R=[[1.0]]))
     solution = dd.solve(problem, method="shooting")
@@ -49,7 +49,7 @@ def test_the_record_says_what_the_solution_measures(run, swing_up):
     assert record.problem["x_goal"] == [np.pi, 0.0]
     assert record.gradient.final_state_norms == swing_up.final_state_norms.tolist()
     assert record.gradient.lagrangian_norms == swing_up.optimality.state_norms.tolist()
-    assert min(record.gradient.lagrangian_norms) > 0  # an effort cost with a hard goal: the multipliers' part
+    assert min(record.gradient.lagrangian_norms) > 0  # multipliers, from an effort cost with a hard goal
     assert record.gradient.stationarity < 1e-6
     assert {c.verdict for c in record.gradient.certificates} == {"agree"}
     assert record.failures == []
@@ -62,7 +62,7 @@ def test_the_record_knows_contract_versions_and_model_file(run):
     assert record.provenance.packages["drake"]
     assert record.contract["time_step"] == 0.02
     assert [b["mass"] for b in record.contract["bodies"]] == [1.0]
-    assert record.contract["inputs"][0]["upper"] is None  # no limit: JSON knows no infinity
+    assert record.contract["inputs"][0]["upper"] is None  # no limit is null, as JSON has no infinity
 
 
 def test_the_hashes_in_the_record_are_the_files(run):
@@ -114,12 +114,12 @@ def test_the_trace_has_well_known_channels_with_units_in_simulated_time(run):
 
 
 def test_contacts_are_in_the_trace_with_their_force(thrown, tmp_path):
-    """At rest the ground carries the ball: m g = 9.81 N, up."""
+    """At rest, the ground's force on the ball is m g = 9.81 N, upwards."""
     dd.save(thrown, tmp_path / "run")
     log = read_mcap(tmp_path / "run" / "trace.mcap")
     last = log.messages["/contacts"][-1][1]
     assert {last.body_a[0], last.body_b[0]} == {"ground", "ball"}
-    assert abs(last.fz[0]) == pytest.approx(9.81, abs=0.2)  # still settling
+    assert abs(last.fz[0]) == pytest.approx(9.81, abs=0.2)  # the ball is still settling
     assert len(log.messages["/scene/contacts"]) == len(log.messages["/contacts"])
     diagnostics = read_trace(tmp_path / "run" / "trace.mcap").diagnostics
     assert diagnostics["max_penetration"].max() == thrown.replay.penetration.max() > 0
@@ -129,13 +129,13 @@ def test_collocation_keeps_plan_and_replay_apart(collocated, tmp_path):
     dd.save(collocated, tmp_path / "run")
     trace = read_trace(tmp_path / "run" / "trace.mcap")
     assert len(trace.planned_us) == 41  # linear between knots
-    assert len(trace.us) == 40  # held over each step
+    assert len(trace.us) == 40  # constant over each step
     assert np.abs(trace.planned_xs[-1] - [np.pi, 0]).max() < 1e-6
-    assert np.abs(trace.xs - trace.planned_xs).max() > 1e-3  # another integrator, open loop
+    assert np.abs(trace.xs - trace.planned_xs).max() > 1e-3  # the replay uses another integrator, open loop
 
 
 def test_plain_dynamics_are_saved_and_what_cannot_be_known_is_said(tmp_path):
-    """A block pushed by u: x'' = u, one unit in one second at least effort costs 12."""
+    """A block with x'' = u, moved by one unit in one second with least effort, costs 12."""
     block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1, state_names=["place", "speed"])
     cost = dd.QuadraticCost(R=[[1.0]])
     problem = dd.Problem(block, x0=[0, 0], x_goal=[1, 0], num_steps=10, horizon=1.0, running_cost=cost)
@@ -145,7 +145,7 @@ def test_plain_dynamics_are_saved_and_what_cannot_be_known_is_said(tmp_path):
     assert sorted(record.files) == ["plan.npz", "record.schema.json", "report.html", "trace.mcap"]
     metrics = {m.name: m.value for m in record.metrics}
     assert metrics["cost"] == pytest.approx(12, rel=1e-6)
-    assert metrics["open-loop end error"] < 1e-6  # two integrators: a cubic, which RK is exact for
+    assert metrics["open-loop end error"] < 1e-6  # the solution is a cubic, which both integrators solve exactly
     assert "energy drift" not in metrics
     assert record.invariants == []
     trace = read_trace(tmp_path / "run" / "trace.mcap")

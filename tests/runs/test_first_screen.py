@@ -1,4 +1,4 @@
-"""What the first screen of a report says: the task in words, and what was checked, each in the colour it deserves."""
+"""Check a report's first screen: the task in words, and the checks, each with the color of its result."""
 
 import dataclasses
 from pathlib import Path
@@ -39,7 +39,7 @@ def test_the_end_is_named_with_its_units(cart_pole):
 
 @pytest.fixture(scope="module")
 def swung():
-    """A pendulum that swings up, and the same plan stopped early, and with an input that does not lead to its goal."""
+    """Return a pendulum's swing-up, and the same plan stopped early, before it reaches its goal."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
     problem = dd.Problem(model, x0=[0, 0], x_goal=[np.pi, 0], num_steps=40, running_cost=dd.QuadraticCost(R=[[1.0]]))
     return dd.solve(problem, method="shooting"), dd.solve(problem, method="ilqr", max_iterations=2)
@@ -76,7 +76,7 @@ def test_what_fails_is_red_and_named(swung):
 
 
 def test_a_plan_that_misses_its_goal_is_not_green_whatever_the_solver_says(swung):
-    """The inputs of another motion, under the solver's word that it converged."""
+    """The plan has the inputs of another motion, and a solver status that says it converged."""
     wrong = dataclasses.replace(swung[0], us=np.zeros((40, 1)), xs=np.zeros((41, 2)))
     found, _ = checked(wrong)
     assert found["Solver"].kind == "pass"
@@ -86,7 +86,7 @@ def test_a_plan_that_misses_its_goal_is_not_green_whatever_the_solver_says(swung
 
 @pytest.mark.parametrize(("success", "kind"), [(True, "warn"), (False, "fail")])
 def test_replays_that_hold_by_one_of_two_in_turn_are_red_only_where_the_plan_fails(success, kind):
-    """One holds open loop alone, the next with feedback alone: neither way holds in both, and the verdict may pass."""
+    """Each variant holds with only one of two controls, and no control holds in both, but the plan may pass."""
     replays = [
         {"control": control, "variant": variant, "holds": (control == "TVLQR") == (variant == "half"), "failures": []}
         for control in ("open loop", "TVLQR")

@@ -1,4 +1,4 @@
-"""The directory of a solve in phases: made again, and forged ones that are refused."""
+"""Check the directory of a solve in phases: verification repeats the solve and refuses forgeries."""
 
 import io
 import json
@@ -15,7 +15,7 @@ pytestmark = [pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWar
 
 
 def hopping():
-    """A hopper that stands, then flies: models and their quantities alone, so that all of it can be made again."""
+    """Return a hopper that stands and then flies, with models and toolkit quantities only, so it can be run again."""
     model = dd.load_model(MODELS / "hopper.sdf", time_step=0.01, contact=False)
     stance = dd.optimize.FixedContacts(model, {"foot": [0, 0, -0.05]})
     effort, x0 = dd.QuadraticCost(R=np.diag([0.1, 0.01])), np.array([0, 0.3, 0, 0.25, 0, 0, 0, 0])
@@ -29,7 +29,7 @@ def hopping():
 
 
 def swinging():
-    """A pendulum that swings to where it hangs at an angle, by way of an angle it chooses, in two phases."""
+    """Return a pendulum that swings in two phases to a hanging angle, through an angle that it chooses."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
     parts = {"num_steps": 6, "horizon": (0.2, 0.6), "running_cost": dd.QuadraticCost(R=[[1.0]])}
     first = dd.Problem(model, x0=[0, 0], **parts)
@@ -39,7 +39,7 @@ def swinging():
 
 
 def bouncing():
-    """Plain functions, linked by a matrix: no artifact holds the functions."""
+    """Return a problem of plain functions, linked by a matrix. No artifact can contain the functions."""
     ball = dd.Dynamics(lambda x, u: [x[1], u[0] - 9.81], 2, 1, u_lower=[0], u_upper=[0])
     kept = {"num_steps": 4, "horizon": (0.01, 5.0), "bounds": dd.Bounds(x_lower=[0.0, np.nan])}
     floor = dd.Constraint(lambda x: x[0], 0.0, 0.0, knots=-1, name="floor")
@@ -72,7 +72,7 @@ def copied(folder, to):
 
 
 def sealed_again(folder, name):
-    """Hash what a forger changed: the files below, then the record itself."""
+    """Update the hashes of the changed files, then that of the record."""
     fields = json.loads((folder / name).read_text())
     for path, entry in fields["files"].items():
         data = (folder / path).read_bytes()
@@ -213,7 +213,7 @@ def test_a_failed_run_is_saved_as_one(tmp_path):
     problem = bouncing()
     up = dd.Problem(
         problem.phases[1].system, x0=[0.0, 2.0], x_goal=[1.2, 0.0], num_steps=4, horizon=(0.01, 5.0)
-    )  # higher than it fell from
+    )  # higher than the start of the fall
     solution = dd.solve(dd.optimize.PhasedProblem([problem.phases[0], up], resets=problem.resets), max_iterations=30)
     record = dd.save(solution, tmp_path / "run")
     assert record.verdict == "fail"

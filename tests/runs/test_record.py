@@ -1,4 +1,4 @@
-"""The record's fields: what they refuse, that they come back as they were, and that they say what is true."""
+"""Check a record's fields: refused values, exact round trips, and agreement with the solution."""
 
 import dataclasses
 import math
@@ -35,7 +35,7 @@ PLAIN = {str: st.text(max_size=12), int: st.integers(-(2**60), 2**60), float: NU
 
 
 def values_of(annotation):
-    """A strategy for a field of a record."""
+    """Return a strategy for a field of a record."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if annotation is JsonValue:
         return JSON
@@ -58,7 +58,7 @@ def values_of(annotation):
 
 
 def records_of(model):
-    """A strategy for a part of a record, without those that its validators refuse."""
+    """Return a strategy for a part of a record, without values that its validators refuse."""
     fields = {name: values_of(field.annotation) for name, field in model.model_fields.items()}
     if model is Metric:
         return metrics()
@@ -107,7 +107,7 @@ def test_any_record_comes_back_as_it_was(record):
 
 @pytest.fixture(scope="module")
 def record(tmp_path_factory):
-    """That of a pendulum that swings up, and passes."""
+    """Save a pendulum that swings up and passes, and return its record."""
     return dd.save(dd.solve(pendulum(), method="shooting"), tmp_path_factory.mktemp("run") / "pendulum")
 
 
@@ -180,7 +180,7 @@ def test_another_major_version_is_refused_by_name_and_a_later_minor_one_is_read(
 
 
 def test_inputs_at_their_bounds_begin_and_end_in_the_events(tmp_path):
-    """+-5 N m do not lift the pole in one go: the input is at a bound for a while and leaves it."""
+    """Bounds of +-5 N m cannot lift the pole in one swing, so the input reaches a bound and leaves it."""
     bounds = dd.Bounds([-50, -99], [50, 99], [-5], [5])
     solution = dd.solve(pendulum(bounds=bounds, num_steps=60, running_cost=dd.QuadraticCost(R=[[1e-3]])))
     record = dd.save(solution, tmp_path / "run")
@@ -193,14 +193,14 @@ def test_inputs_at_their_bounds_begin_and_end_in_the_events(tmp_path):
 
 @pytest.mark.slow
 def test_momentum_energy_and_the_friction_cone_of_a_falling_ball(thrown, tmp_path):
-    """In flight momentum changes by m g t to rounding; semi-implicit Euler loses m g^2 h t / 2 of energy."""
+    """In flight, momentum changes by m g t up to rounding. Semi-implicit Euler loses m g^2 h t / 2 of energy."""
     found = {m.name: m for m in measure(thrown).invariants}
-    assert found["linear momentum error"].value < 1e-12  # N s: rounding of 1 kg * 1 m/s over some 20 steps
+    assert found["linear momentum error"].value < 1e-12  # N s, rounding of 1 kg * 1 m/s over about 20 steps
     assert found["angular momentum error"].value < 1e-12
     touches = next(k for k, contacts in enumerate(thrown.replay.contacts) if contacts)
-    lost = 9.81**2 * 0.005 * (touches * 0.005) / 2  # J, of 1 kg
+    lost = 9.81**2 * 0.005 * (touches * 0.005) / 2  # J, for 1 kg
     assert abs(found["free-motion energy drift"].value) == pytest.approx(lost, rel=1e-6)
-    assert found["friction-cone excess"].value < 1e-6  # N: SAP keeps the cone
+    assert found["friction-cone excess"].value < 1e-6  # N, as SAP satisfies the cone
     assert found["penetration"].value == thrown.replay.penetration.max() > 0
     record = dd.save(thrown, tmp_path / "ball")
     assert dd.verify(tmp_path / "ball").require().holds
@@ -210,14 +210,14 @@ def test_momentum_energy_and_the_friction_cone_of_a_falling_ball(thrown, tmp_pat
 
 
 def with_replay(solution, **changes):
-    """`solution` with another replay in the place of its own."""
+    """Return a copy of `solution` with changes of its replay."""
     other = dataclasses.replace(solution)
     vars(other)["replay"] = dataclasses.replace(solution.replay, **changes)
     return other
 
 
 def test_energy_from_nowhere_fails_where_the_verdict_rests_on_that_motion():
-    """A replay that diverges open loop has its energy error told, and not asked for: another replay holds, and is."""
+    """A diverging open-loop replay only reports its energy error. The replay behind the verdict must satisfy it."""
     solution = dd.solve(pendulum(), method="collocation")
     potential = solution.replay.potential_energy + np.linspace(0, 100, len(solution.replay.times))
     off = with_replay(solution, potential_energy=potential)
@@ -230,7 +230,7 @@ def test_energy_from_nowhere_fails_where_the_verdict_rests_on_that_motion():
 
 
 def test_a_force_outside_the_friction_cone_and_momentum_from_nowhere_are_seen(thrown):
-    """mu = 0.5 on both: of 2 N along the ground under 1 N of push, 1.5 N are more than friction can give."""
+    """With mu = 0.5 and 1 N of normal force, a force of 2 N along the ground exceeds friction by 1.5 N."""
     contacts = list(thrown.replay.contacts)
     k = next(k for k, found in enumerate(contacts) if found)
     forced = dataclasses.replace(contacts[k][0], normal=np.array([0, 0, 1.0]), force=np.array([2.0, 0, 1.0]))
@@ -239,7 +239,7 @@ def test_a_force_outside_the_friction_cone_and_momentum_from_nowhere_are_seen(th
     assert found["friction-cone excess"].value == pytest.approx(1.5, rel=1e-12)
     assert found["friction-cone excess"].t_s == thrown.replay.times[k]
     xs = np.array(thrown.replay.xs)
-    xs[5, 10] += 0.25  # m/s of v_x, of 1 kg
+    xs[5, 10] += 0.25  # m/s of v_x, for 1 kg
     found = {m.name: m for m in measure(with_replay(thrown, xs=xs)).invariants}
     assert found["linear momentum error"].value == pytest.approx(0.25, rel=1e-9)
     unknown = dataclasses.replace(forced, body_b="nobody")
@@ -304,19 +304,19 @@ DAMPED = """<robot name="damped"><link name="l"><inertial><mass value="2"/>
 
 
 def test_all_the_energy_that_damping_takes_is_counted(tmp_path):
-    """A mass of 2 kg on a damped, level slide: m v^2 / 2 becomes dissipation, and nothing is left over."""
+    """For 2 kg on a damped, level slide, m v^2 / 2 becomes dissipation, and no energy remains."""
     (tmp_path / "damped.urdf").write_text(DAMPED)
     model = dd.load_model(tmp_path / "damped.urdf", time_step=0.02)
     problem = dd.Problem(model, x0=[0, 3.0], num_steps=200, final_cost=lambda x: x[0], optimize="initial_state")
     motion = dd.rollout(model, [0, 3.0], num_steps=200)
-    lost = 9.0 - motion.xs[-1, 1] ** 2  # J: m / 2 is 1 kg
+    lost = 9.0 - motion.xs[-1, 1] ** 2  # J, with m / 2 = 1 kg
     assert lost > 5
     assert motion.dissipation[-1] == pytest.approx(lost, rel=1e-12)
     solution = dd.Solution(problem, "shooting", "none", dd.Status.CONVERGED, "by hand", motion.xs, motion.us)
     for part, drift in ((1.0, 0.0), (0.999, 1e-3)):
         other = with_replay(solution, dissipation=part * motion.dissipation)
         found = {m.name: m.value for m in measure(other).metrics}
-        # What is missing grows with the dissipation: its drift is between half of the end's and all of it.
+        # The missing energy grows with the dissipation, so its drift is between half and all of the final value.
         assert 0.5 * drift * lost - 1e-12 <= abs(found["energy drift"]) <= drift * lost + 1e-12
 
 

@@ -1,4 +1,4 @@
-"""What records of all kinds say of the robot and of their data, and how records of before are read."""
+"""Check what records of all kinds contain about the robot and the data, and that older records are read."""
 
 import json
 import shutil
@@ -24,7 +24,7 @@ OLD = ROOT / "tests" / "data" / "pendulum_2_4"
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """A directory of each kind, of the pendulum."""
+    """Write a directory of each kind for the pendulum."""
     folder = tmp_path_factory.mktemp("kinds")
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=H)
     certify_model(model, states=1, directory=folder / "certification")
@@ -44,7 +44,7 @@ def written(tmp_path_factory):
 def test_what_was_seen_and_what_was_judged_on(written):
     _, folder = written
     data = {path.name: dd.load_record(path).data for path in folder.iterdir()}
-    assert data["certification"] is None  # nothing was fitted, and no data were judged on
+    assert data["certification"] is None  # no data were fitted or used for the verdict
     assert [use.name for use in data["comparison"].judged_on] == ["motion", "lab"]
     arrays = (H * np.arange(3), np.zeros((3, 2)), np.zeros((2, 1)))
     hashed = sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
@@ -56,7 +56,7 @@ def test_what_was_seen_and_what_was_judged_on(written):
 
 
 def downgraded(folder, copy):
-    """The directory as schema 2.2 wrote it: under the names of then, without what came later, with its own hash."""
+    """Convert the directory to schema 2.2, with the old names, without later sections, and with its own hash."""
     shutil.copytree(folder, copy)
     fields = json.loads((copy / "record.json").read_bytes())
     subject = dd.load_record(folder).subject
@@ -82,14 +82,14 @@ def test_a_record_of_version_2_is_converted(written, tmp_path, kind):
     same = {"exclude": {name for name in apart if kind != "identification" or name != "recordings"}}
     assert record.model_dump(**same) == new.model_dump(**same)
     found = dd.verify(tmp_path / kind)
-    # The data boundary that it lacks differs from the one that is made again: that may be the version's doing.
+    # The record lacks a data boundary, unlike the recomputed one, which may be due to the version.
     expected = {"certification": "holds", "identification": "undecided"}
     assert found.verdict == expected.get(kind, "intact"), found.lines
     assert f"recorded by schema 2.2.0, and converted to {SCHEMA_VERSION}" in found.notes
 
 
 def test_a_run_of_version_2_4_is_read_and_measured_again():
-    """tests/data/pendulum_2_4 is artifacts/pendulum_swing_up as version 2.4 wrote it, by a solver that is gone."""
+    """tests/data/pendulum_2_4 is artifacts/pendulum_swing_up by version 2.4, with a solver that no longer exists."""
     record = dd.load_record(OLD)
     assert (record.kind, record.schema_version, record.verdict) == ("plan", "2.4.0", "pass")
     assert record.solver.status == "converged"
@@ -98,7 +98,7 @@ def test_a_run_of_version_2_4_is_read_and_measured_again():
     *worded, line = found.undecided
     assert "recorded by shooting (step, snopt)" in line
     assert all("hashes match, contents not checked: schema 2.4.0" in line for line in worded)
-    assert found.checked > 800  # of about 850 numbers: all but those of the search
+    assert found.checked > 800  # of about 850 numbers, all but those of the search
 
 
 def test_a_lie_in_a_run_of_version_2_4_is_found(tmp_path):
@@ -107,7 +107,7 @@ def test_a_lie_in_a_run_of_version_2_4_is_found(tmp_path):
     fields["metrics"][0]["value"] *= 0.99  # the cost
     (copy / "record.json").write_text(canonical({**fields, "record_sha256": own_sha256(fields)}))
     found = dd.verify(copy)
-    assert found.verdict == "undecided"  # the version that wrote it is another
+    assert found.verdict == "undecided"  # another version wrote the run
     assert any("metrics" in line for line in found.undecided)
 
 
@@ -127,7 +127,7 @@ def test_the_held_points_of_version_2_are_fixed_contacts():
 
 
 def edited(folder, copy, change):
-    """A copy of a directory with a changed record whose hash is right; what the trace carries is not changed."""
+    """Copy a directory, change the record and its hash but not the trace, and verify the copy."""
     shutil.copytree(folder, copy)
     fields = json.loads((copy / "record.json").read_bytes())
     change(fields)
@@ -136,12 +136,12 @@ def edited(folder, copy, change):
 
 
 def test_a_run_of_version_3_1_is_verified_as_before(tmp_path):
-    """Its sections that follow from others are not read; an edit of any other value is refused."""
+    """Sections that follow from others are not read. An edit of any other value is refused."""
     folder = ROOT / "tests" / "data" / "pendulum_3_1"
     found = dd.verify(folder)
     assert found.record.schema_version == "3.1.0"
     assert found.complaints == ()
-    reasons = ("steps that the search takes", "contents not checked: schema 3.1.0 has")  # other words, of that version
+    reasons = ("steps that the search takes", "contents not checked: schema 3.1.0 has")  # that version used other words
     assert found.holds or found.notes or all(any(why in line for why in reasons) for line in found.undecided)
     assert len(found.record.gradient.final_state_norms) == 21
     assert found.record.gradient.stationarity < 1e-6

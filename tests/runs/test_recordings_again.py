@@ -1,4 +1,4 @@
-"""What a comparison says of recordings and their causes is made again from its directory, and a lie is found."""
+"""Check that verification repeats a comparison's recordings and causes from its directory, and finds changes."""
 
 import json
 import shutil
@@ -31,7 +31,7 @@ def recorded(**changes):
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
-    """A comparison with a pendulum that has twice the damping, with its cause."""
+    """Save a comparison with a pendulum that has twice the damping, with its cause."""
     folder = tmp_path_factory.mktemp("compared") / "run"
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.01)
     found = dd.compare(model, ["numpy"], recordings=[recorded()])
@@ -46,7 +46,7 @@ def copy(saved, tmp_path):
 
 @pytest.fixture(scope="module")
 def known(saved):
-    """The searches that were made: each is of one model and recording, and is the same whenever it is made."""
+    """Return a cache of the searches. A search depends only on its model and recording."""
     return {}
 
 
@@ -61,7 +61,7 @@ def once(known, monkeypatch):
 
 
 def forge(folder, **changes):
-    """The record with another row of the recording, all hashes made to fit."""
+    """Change the row of the recording in the record, with correct hashes, and verify the directory."""
     record = load_record(folder)
     row = record.engines[-1]
     rows = [*record.engines[:-1], row.model_copy(update=changes)]
@@ -80,7 +80,7 @@ def test_a_cause_comes_out_again_in_a_process_of_its_own(saved):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_whatever_number_or_name_of_a_cause_is_planted_it_is_refused(saved, seed):
-    """A hundredth of half the interval, or of a number that has none, is a lie; a thousandth of it is rounding."""
+    """A change by 1 % of the interval's half-width, or of a number without one, is refused. 0.1 % is rounding."""
     rng = np.random.default_rng(seed)
     told = load_record(saved).engines[-1].cause
     for _ in range(50):

@@ -1,4 +1,4 @@
-"""The exported bag: read back by another library than the one that wrote it, number for number."""
+"""Check that an exported bag, read by another library than its writer, has the same numbers."""
 
 import sys
 
@@ -28,7 +28,7 @@ def bag(run, tmp_path_factory):
 
 
 def messages(bag, topic):
-    """Time [ns] and message, by the `mcap` project's ROS 2 decoder, every checksum checked."""
+    """Return times [ns] and messages from the `mcap` project's ROS 2 decoder, with all checksums checked."""
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
@@ -46,8 +46,8 @@ def test_joint_states_are_the_trace_s_bit_for_bit(run, bag):
     assert xs.tobytes() == trace.xs.tobytes()
     efforts = np.array([m.effort for _, m in found[:-1]])
     assert efforts[:, 0].tobytes() == trace.us[:, 0].tobytes()
-    assert np.isnan(efforts[:, 1]).all()  # nothing drives the hinge
-    assert list(found[-1][1].effort) == []  # no step begins at the last state
+    assert np.isnan(efforts[:, 1]).all()  # the hinge has no actuator
+    assert list(found[-1][1].effort) == []  # the last state has no step
     assert (found[3][1].header.stamp.sec, found[3][1].header.stamp.nanosec) == (0, 60_000_000)
 
 
@@ -69,7 +69,7 @@ def test_frames_inputs_and_diagnostics_are_the_trace_s(run, bag):
 
 @pytest.mark.solve
 def test_contacts_and_events_are_the_trace_s(load, tmp_path):
-    """Of a hopper that stands on its foot."""
+    """The hopper stands on its foot."""
     from drake_diff.runs import measure
     from drake_diff.runs.trace import write_trace
 

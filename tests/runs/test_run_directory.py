@@ -1,4 +1,4 @@
-"""A run is written beside its directory and takes its place whole: nothing that was there is lost, whatever fails."""
+"""Check that a run is written next to its directory and then replaces it, so that no failure loses files."""
 
 import json
 import os
@@ -69,7 +69,7 @@ def saved(solutions, tmp_path_factory):
 
 @pytest.fixture
 def run(saved, tmp_path, monkeypatch):
-    """A run, alone in a folder of its own."""
+    """Copy a run into a folder of its own."""
     (tmp_path / "runs").mkdir()
     (tmp_path / "kept").mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "kept"))
@@ -100,7 +100,7 @@ def test_what_breaks_off_leaves_the_old_run_and_says_where_its_own_files_are(run
     assert raised.value.__notes__ == [f"what was written is in {left}"]
     with pytest.raises(ZeroDivisionError):
         breaks_off(None)
-    assert (goal_of(run), names(run.parent)) == (OLD, ["run", left.name])  # where nothing was written nothing is left
+    assert (goal_of(run), names(run.parent)) == (OLD, ["run", left.name])  # an empty partial run is removed
 
 
 def test_a_file_system_that_cannot_exchange_names_keeps_the_old_one_until_the_new_is_there(run, solutions, monkeypatch):
@@ -202,7 +202,7 @@ def test_of_two_at_a_time_each_is_whole_or_refused(run, solutions, monkeypatch):
 
 
 def calls_of(run, solution, **how):
-    """The calls that a save makes below the folder of `run`, which is as before after that."""
+    """Return the calls that a save makes below the folder of `run`, and restore the folder."""
     copy = shutil.copytree(run, run.parent.parent / "copy")
     found = tried(lambda: dd.save(solution, run), run.parent, **how)["found"]
     shutil.rmtree(run)
@@ -211,11 +211,11 @@ def calls_of(run, solution, **how):
 
 
 def check(run, solutions, at, fault, *, exchanges=True):
-    """One fault in one save: the old run is there or the new one, and the new plan is where the message says."""
+    """Inject one fault into one save. A run remains, and the new plan is at the place that the message names."""
     kept = run.parent.parent / "kept"
     told = tried(lambda: dd.save(solutions[1], run), run.parent, at, fault, exchanges=exchanges)
     left = [path for path in run.parent.iterdir() if path.name.startswith("run.")]
-    if not run.exists():  # only where names cannot be exchanged, in the moment between two renames
+    if not run.exists():  # only without an exchange of names, between two renames
         assert not exchanges
         assert fault in (KILLED, KILLED_AFTER)
         assert sorted(goal_of(path) for path in left) == [OLD, NEW]
@@ -242,7 +242,7 @@ def check(run, solutions, at, fault, *, exchanges=True):
 @pytest.mark.slow
 @pytest.mark.parametrize("exchanges", [True, False])
 def test_a_fault_in_any_call_loses_nothing(run, solutions, monkeypatch, exchanges):
-    """Each call that writes meets one fault. The faults take turns, so that neighbouring calls meet all of them."""
+    """Every writing call gets one fault. Faults alternate, so that adjacent calls cover all of them."""
     quick_pages(monkeypatch)
     faults = FAULTS if exchanges else (*ERRORS[:1], KILLED)
     count = len(calls_of(run, solutions[1], exchanges=exchanges))
@@ -299,7 +299,7 @@ def test_a_signal_before_the_search_leaves_the_guess_as_a_plan(solutions, tmp_pa
 
 @each_row("method", ["collocation", "shooting", "in phases"])
 def test_a_signal_as_a_search_ends_is_not_lost(solutions, monkeypatch, method):
-    """It would be noted by what looks at it no more, and the run would go on as if nobody had pressed Ctrl-C."""
+    """A signal after the search's last check would be recorded but never read, and Ctrl-C would have no effect."""
     owner, name = SEARCHES[method]
     real = getattr(owner, name)
 

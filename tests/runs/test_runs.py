@@ -1,4 +1,4 @@
-"""Runs side by side, and the commands verify, list and compare-runs: what they print and their exit status."""
+"""Check the comparison of runs, and the output and exit status of `verify`, `list` and `compare-runs`."""
 
 import shutil
 import sys
@@ -27,7 +27,7 @@ def solve(**changes):
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """A run, the same with another goal, one that failed, one that did not end, one that is none."""
+    """Write a run, one with another goal, a failed one, unfinished ones, and directories that are no run."""
     folder = tmp_path_factory.mktemp("runs")
     solution = solve()
     dd.save(solution, folder / "a")
@@ -61,7 +61,7 @@ def test_two_runs_differ_in_what_was_changed_and_what_that_changed(runs):
     found = compare_runs(runs / "a", runs / "b")
     configuration = {d.key: (d.a, d.b) for d in found.configuration}
     assert configuration.pop("problem.x_goal[0]") == (1.0, 0.5)
-    assert set(configuration) == {"inputs.initial_guess", "inputs.initial_guess_sha256"}  # how many steps iLQR took
+    assert set(configuration) == {"inputs.initial_guess", "inputs.initial_guess_sha256"}  # names iLQR's number of steps
     assert found.versions == ()
     assert "cost [1]" in {d.key for d in found.metrics}
     assert found.comparable
@@ -97,7 +97,7 @@ def test_the_record_of_an_error_has_a_label_and_the_message(runs):
 
 @pytest.mark.slow
 def test_the_commands_print_and_exit_as_they_should(runs, tmp_path, monkeypatch, capsys):
-    """The first in a process of its own, as a shell starts it."""
+    """The first command runs in a separate process, as from a shell."""
     done = drake_diff("verify", runs / "a", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert "values came out; the run's verdict: pass" in " ".join(done.stdout.split())
@@ -164,7 +164,7 @@ solve_options = {{"method": "shooting"}}
     assert done.returncode == 2, done.stdout
     assert "cost (task.py:7): expected" in done.stderr
     assert "ZeroDivisionError: late" in done.stderr
-    assert dd.verify(tmp_path / "run").complaints == ()  # the earlier one
+    assert dd.verify(tmp_path / "run").complaints == ()  # the earlier run is unchanged
     (left,) = tmp_path.glob("run.partial-*")
     assert str(left) in done.stderr
     record = dd.load_record(left)

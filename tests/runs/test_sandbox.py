@@ -1,4 +1,4 @@
-"""What a stranger's model does to the process that reads it stays there, and is reported."""
+"""Check that faults of an untrusted model stay in the process that reads it, and are reported."""
 
 import ctypes
 import os
@@ -60,7 +60,7 @@ def leave():
 
 
 def ask(function, monkeypatch, seconds=20.0, **arguments):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))  # the child imports what this process can
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))  # the child can import what this process can
     return call(f"test_sandbox:{function.__name__}", arguments, seconds)
 
 
@@ -125,7 +125,7 @@ def test_limits_and_folders_that_are_none_are_refused(run, tmp_path):
 @pytest.mark.long
 @each_row("words, refused", [(["--every-model", "--count", "12"], 8), (["--count", "25"], 8)])
 def test_no_strange_directory_ends_this_process_or_leads_the_reader_out(words, refused):
-    """The program fails for a crash, a hang, an opened canary, an error without a name, an accepted robot file."""
+    """The program fails on crashes, hangs, opened canaries, errors without a name, and accepted robot files."""
     done = subprocess.run([sys.executable, FUZZ, *words], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert int(re.search(r"(\d+) verify: exit status 1", done.stdout)[1]) > refused

@@ -1,4 +1,4 @@
-"""Metrics of a measurement beside the same taken a second time: by NumPy, and by pydrake's own plant and context."""
+"""Compare a measurement's metrics with a second measurement by NumPy and pydrake's own plant and context."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ pytestmark = pytest.mark.solve
 
 
 def by_hand(model, random, x0=None, steps=8, off=0.01):
-    """A plan that is not quite a motion of the model, and misses all that was asked by some hundredths."""
+    """Return a plan that is not exactly a motion of the model and misses each requirement by a few hundredths."""
     xs = dd.rollout(
         model, state_in_range(model, random) if x0 is None else x0, random.normal(size=(steps, model.nu))
     ).xs
@@ -24,12 +24,12 @@ def by_hand(model, random, x0=None, steps=8, off=0.01):
         model, x0=xs[0], x_goal=xs[-1], num_steps=steps, running_cost=cost, final_cost=cost, bounds=bounds
     )
     solution = dd.Solution(problem, "shooting", "none", dd.Status.CONVERGED, "by hand", plan, us)
-    vars(solution)["replays"] = ()  # they are no part of what is measured here, and take most of the time
+    vars(solution)["replays"] = ()  # the replays are not measured and take most of the time
     return solution
 
 
 class Referee:
-    """The plant of a model with a context of its own."""
+    """The plant of a model with its own context."""
 
     def __init__(self, model):
         self.plant, self.root = model.plant, model.diagram.CreateDefaultContext()
@@ -68,7 +68,7 @@ class Referee:
 
 
 def as_turned(model, x, goal):
-    """The state with its free bodies' quaternions as long as the goal's: a step lets them grow, and turns nothing."""
+    """Scale the free bodies' quaternions to the goal's norm, as steps change the norm but not the rotation."""
     x = np.array(x)
     for body in (model.plant.get_body(i) for i in model.plant.GetFloatingBaseBodies()):
         start = body.floating_positions_start()
@@ -77,7 +77,7 @@ def as_turned(model, x, goal):
 
 
 def second_measurement(solution):
-    """{metric: value}."""
+    """Return the metrics as {name: value}."""
     problem, xs, us = solution.problem, np.asarray(solution.xs), np.asarray(solution.us)
     b, h, referee, replay = problem.bounds, problem.model.time_step, Referee(problem.model), solution.replay
     running, final = problem.running_cost, problem.final_cost
@@ -111,7 +111,7 @@ def test_metrics_agree_with_a_second_measurement(name, seed):
     solution = by_hand(model, random, state_in_contact(model, random) if floating else None)
     metrics = {m.name: m.value for m in measure(solution).metrics}
     second = second_measurement(solution)
-    if model.num_constraints:  # of Panda's fingers, which are coupled: pydrake does not tell their violation
+    if model.num_constraints:  # Panda's fingers are coupled, and pydrake does not report the violation
         assert metrics["joint limit violation"] is None
         del second["joint limit violation"]
     for metric, value in second.items():

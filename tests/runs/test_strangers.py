@@ -1,4 +1,4 @@
-"""A directory that a stranger made is refused by name: nothing is waited for, followed or unpacked unseen."""
+"""Check that an untrusted directory is refused with a named error, before anything is waited for or unpacked."""
 
 import json
 import os
@@ -39,14 +39,14 @@ def fifo(path):
 
 def listening(path):
     here = os.getcwd()
-    os.chdir(path.parent)  # the name of a socket has at most 107 bytes
+    os.chdir(path.parent)  # the path of a socket has at most 107 bytes
     socket.socket(socket.AF_UNIX).bind(path.name)
     os.chdir(here)
 
 
 def larger(path):
     path.touch()
-    os.truncate(path, 2**40)  # it takes no room on the disk
+    os.truncate(path, 2**40)  # a sparse file uses no disk space
 
 
 ODD = {
@@ -77,7 +77,7 @@ def test_a_run_with_such_a_file_is_broken_and_listed(tmp_path, told, name):
 
 
 def test_a_run_whose_files_are_too_much_to_read_is_broken(tmp_path, monkeypatch):
-    """A thousand files of 1 GiB that are holes take no room, and an hour."""
+    """A thousand sparse files of 1 GiB use no disk space, but take an hour to read."""
     folder = Path(shutil.copytree(RUN, tmp_path / "run"))
     monkeypatch.setattr("drake_diff.runs.directory.MOST_READ", (folder / "plan.npz").stat().st_size)
     found = dd.verify(folder)
@@ -86,7 +86,7 @@ def test_a_run_whose_files_are_too_much_to_read_is_broken(tmp_path, monkeypatch)
 
 
 def test_a_log_of_more_messages_than_there_is_memory_for_is_refused_before_it_is_used_up(tmp_path, monkeypatch):
-    """Protobuf's C ends the process where it gets no memory: by SIGSEGV, of 4.9 million messages and 4 GiB."""
+    """Without memory, Protobuf's C code ends the process with SIGSEGV, for 4.9 million messages in 4 GiB."""
     monkeypatch.setattr("drake_diff._base.sandbox.NEARLY", 1e-9)
     with memory_at_most(2**40), pytest.raises(MemoryError):
         read_mcap(RUN / "trace.mcap")
@@ -105,7 +105,7 @@ def test_a_link_to_a_folder_is_not_followed_and_a_folder_has_a_most_of_files(tmp
 
 
 def npz(path, files, lie=None):
-    """An archive of these members; its index says `lie` where they have another size."""
+    """Write an archive of these members. With `lie`, the index has this size instead of the actual one."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in files.items():
             archive.writestr(name, data)
@@ -182,7 +182,7 @@ def test_a_record_that_no_program_of_ours_writes_is_refused(tmp_path, text):
 
 
 def test_a_number_that_a_record_writes_in_full_can_be_put_into_one_that_is_sealed(tmp_path):
-    """The hash is of what Python reads: 1e999 has none, and is no accident."""
+    """The hash covers the values that Python reads. 1e999 has no hash, and verification reports it in its sentence."""
     folder = Path(shutil.copytree(RUN, tmp_path / "run"))
     fields = json.loads((folder / "record.json").read_text())
     (folder / "record.json").write_text(json.dumps(fields).replace('"duration_s": ', '"duration_s": 1e999, "x": '))
@@ -190,7 +190,7 @@ def test_a_number_that_a_record_writes_in_full_can_be_put_into_one_that_is_seale
 
 
 def chunk(data, size, compression=b"zstd"):
-    """A file of one chunk that says that it unpacks to `size` bytes."""
+    """Return a file of one chunk that declares an unpacked size of `size` bytes."""
     body = struct.pack("<QQQII", 0, 0, size, 0, len(compression)) + compression + struct.pack("<Q", len(data)) + data
     return b"\x89MCAP0\r\n" + b"\x06" + struct.pack("<Q", len(body)) + body
 
@@ -224,7 +224,7 @@ def test_a_log_is_not_unpacked_before_its_size_is_known(tmp_path, made):
 
 
 def test_what_a_log_makes_of_itself_in_memory_is_limited():
-    """A command that reads one may take some GiB; here it is what is taken already."""
+    """A command that reads a log may use some GiB. The test allows only the memory that is already in use."""
     before = resource.getrlimit(resource.RLIMIT_DATA)
     with memory_at_most(2**20), pytest.raises(MemoryError):
         bytearray(2**28)

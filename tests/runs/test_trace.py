@@ -1,4 +1,4 @@
-"""trace.mcap: a Solution's numbers come back bit for bit, other tools read it, and nothing in it does harm."""
+"""Check that trace.mcap round-trips a solution bit for bit, is readable by other tools, and is safe to read."""
 
 import dataclasses
 import importlib.util
@@ -35,7 +35,7 @@ def pendulum(folder=MODELS, name="pendulum.urdf", **options):
 
 
 def solution_of(problem, **fields):
-    """A Solution of `problem` that no solver found: its own guess, or what `fields` say."""
+    """Return a solution of `problem` that no solver found, with its own guess or the given `fields`."""
     found = {"xs": np.zeros((problem.num_steps + 1, problem.model.nx)), "us": problem.us, "message": "made by hand"}
     return Solution(problem, "shooting", "none", dd.Status.ITERATION_LIMIT, **(found | fields))
 
@@ -46,7 +46,7 @@ def bits(value):
 
 @pytest.fixture(scope="module")
 def collocated():
-    """Free horizon, inputs at the midpoints."""
+    """Return a collocated solution with a free horizon and midpoint inputs."""
     solution = dd.solve(pendulum(horizon=(0.5, 3.0)), method="collocation", options=Options(scheme="hermite_simpson"))
     assert solution.us_mid is not None
     assert solution.free_horizon is not None
@@ -62,7 +62,7 @@ def trace_of_collocated(collocated, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def thrown(tmp_path_factory):
-    """A ball that falls 0.05 m onto the ground: saved."""
+    """Return a solution and trace of a ball that falls 0.05 m onto the ground."""
     model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.005)
     x0 = model.default_state
     x0[6] = 0.15
@@ -88,7 +88,7 @@ def test_a_collocated_plan_comes_back_as_the_same_solution(collocated, tmp_path)
 
 
 def test_parameters_that_were_found_come_back_and_move_the_frames(tmp_path, load):
-    """Hanging at q = 0 the lower link's frame is where the elbow is."""
+    """Hanging at q = 0, the lower link's frame is at the elbow's position."""
     problem = dd.Problem(
         load("double_pendulum.urdf"),
         x0=[0] * 4,
@@ -106,7 +106,7 @@ def test_parameters_that_were_found_come_back_and_move_the_frames(tmp_path, load
     assert [lower.x, lower.y, lower.z] == pytest.approx([0.1, 0.0, -0.9], abs=1e-12)
 
 
-# What a solver that diverged leaves. Not beyond 1e6: squares that overflow are warnings of the replay, not of the log.
+# Values after divergence, up to 1e6: overflowing squares give warnings of the replay instead of the log.
 NUMBERS = st.floats(-10, 10) | st.sampled_from([np.nan, np.inf, -np.inf, -0.0, 5e-324, 1e6])
 
 
@@ -117,7 +117,7 @@ def test_any_plan_round_trips_whatever_its_numbers(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("trace") / "trace.mcap"
     count = data.draw(st.integers(1, 8))
     problem = dd.Problem(pendulum().model, x0=[0, 0], num_steps=count, final_cost=lambda x: x[0])
-    number = data.draw(st.sampled_from([NUMBERS, st.floats(-10, 10)]))  # those of the second can be stepped
+    number = data.draw(st.sampled_from([NUMBERS, st.floats(-10, 10)]))  # the second strategy can be stepped
     fields = {
         "xs": data.draw(arrays(float, (count + 1, 2), elements=number)),
         "us": data.draw(arrays(float, (count, 1), elements=number)),
@@ -152,7 +152,7 @@ def test_a_plan_whose_motion_differs_has_a_ghost_and_one_that_does_not_has_none(
     assert [name.startswith("planned/") for name in frames] == [False, True]
     assert frames[1] == "planned/" + frames[0]
     assert log.channel_metadata["/tf"]["ghost"] == "planned/"
-    half_angle = collocated.xs[3, 0] / 2  # the pole turns by q about +y; either sign is the same rotation
+    half_angle = collocated.xs[3, 0] / 2  # the pole rotates by q about +y; either sign is this rotation
     rotation = log.messages["/tf"][3][1].transforms[1].rotation
     assert abs(rotation.w * np.cos(half_angle) + rotation.y * np.sin(half_angle)) == pytest.approx(1, abs=1e-12)
     still = solution_of(pendulum())
@@ -173,7 +173,7 @@ def test_every_replay_has_its_row(collocated, trace_of_collocated):
 
 
 def test_contact_made_and_broken_are_events_at_the_steps_where_they_happen(thrown):
-    """The ball's lowest point starts 0.05 m above the ground: it falls for sqrt(2 * 0.05 / 9.81) = 0.101 s."""
+    """The ball's lowest point starts 0.05 m above the ground and falls for sqrt(2 * 0.05 / 9.81) = 0.101 s."""
     solution, log = thrown
     events = log.arrays("/events")
     made = events["kind"].index("contact_made")
@@ -186,7 +186,7 @@ def test_contact_made_and_broken_are_events_at_the_steps_where_they_happen(throw
 
 
 def test_arrows_start_at_the_contact_and_point_along_the_force(thrown):
-    """The arrow is drawn along +x: turned by its quaternion, that is the force's direction."""
+    """The arrow is drawn along +x. Rotated by its quaternion, it points along the force."""
     _, log = thrown
     found = log.arrays("/contacts")
     for k, (_, scene) in enumerate(log.messages["/scene/contacts"]):
@@ -195,7 +195,7 @@ def test_arrows_start_at_the_contact_and_point_along_the_force(thrown):
         x_axis = [1 - 2 * (q.y**2 + q.z**2), 2 * (q.x * q.y + q.w * q.z), 2 * (q.x * q.z - q.w * q.y)]
         size = float(np.linalg.norm(force))
         if size == 0:
-            continue  # the first touch: no direction to point in
+            continue  # first contact with zero force: no direction
         assert np.allclose(x_axis, np.array(force) / size, rtol=0, atol=1e-9)
         assert arrow.shaft_length == pytest.approx(0.02 * size, rel=1e-12)
         assert scene.entities[0].lifetime.nanos == 5_000_000
@@ -272,4 +272,4 @@ def test_rerun_checks_the_trace_in_full_and_finds_every_channel(trace_of_colloca
     damaged[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
     trace_of_collocated.with_name("damaged.mcap").write_bytes(damaged)
     done = rerun("check", "--full", path=trace_of_collocated.with_name("damaged.mcap"))
-    assert "Failed" in done.stdout + done.stderr or done.returncode  # Rerun 0.41 may exit with 0 all the same
+    assert "Failed" in done.stdout + done.stderr or done.returncode  # Rerun 0.41 may exit with 0 anyway

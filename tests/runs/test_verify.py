@@ -1,4 +1,4 @@
-"""`verify`: whatever is changed in a run directory is found, a lie in a whole one too, and nothing else is refused."""
+"""Check that `verify` finds every change of a run directory, also with correct hashes, and refuses nothing else."""
 
 import dataclasses
 import json
@@ -44,7 +44,7 @@ EVIL = """<robot name="&lt;script&gt;alert(1)&lt;/script&gt;"><link name="[red]a
 
 
 def swing_up(model=None, **changes):
-    """A pendulum on its way up in 0.4 s."""
+    """Solve a pendulum's upward motion in 0.4 s."""
     model = model or dd.load_model(MODELS / "pendulum.urdf", time_step=0.02)
     options = {"x0": [0, 0], "x_goal": [1.0, 0], "num_steps": 20, "running_cost": dd.QuadraticCost(R=[[1.0]])}
     return dd.solve(dd.Problem(model, **{**options, **changes}), method="shooting")
@@ -81,7 +81,7 @@ def test_a_run_holds_and_comes_out_again_to_the_last_bit(run):
 
 
 def test_the_reference_run_of_this_repository_holds():
-    """On other versions of Drake or NumPy it is not called a lie: `notes` says which it was recorded with."""
+    """With other versions of Drake or NumPy, the run is not called broken. `notes` names the recorded versions."""
     result = dd.verify(ROOT / "artifacts" / "pendulum_swing_up")
     assert result.complaints == ()
     assert result.holds or result.notes
@@ -89,7 +89,7 @@ def test_the_reference_run_of_this_repository_holds():
 
 
 def corruptions(count):
-    """(how, file, seed), seeded."""
+    """Yield (how, file, seed) from seeded draws."""
     rng = random.Random(0)
     kinds = ("flip", "flip", "flip", "cut", "grow", "swap", "delete", "extra", "number", "text")
     for seed in range(count):
@@ -108,7 +108,7 @@ def corrupt(directory, other, how, name, seed):
         data += b"\n" if seed % 2 else b"\0"
     elif how == "swap":
         data = bytearray((other / name).read_bytes())
-        if data == path.read_bytes():  # the schema is the same in every run
+        if data == path.read_bytes():  # the schema is the same in all runs
             data = bytearray((other / "plan.npz").read_bytes())
     elif how == "number":
         data = edited(data, rng, lambda v: isinstance(v, float), lambda v: v + 1e-9 * max(abs(v), 1.0))
@@ -124,7 +124,7 @@ def corrupt(directory, other, how, name, seed):
 
 
 def edited(data, rng, wanted, change):
-    """The record with one of its values changed, written as drake_diff writes it."""
+    """Return the record with one changed value, in drake_diff's format."""
     fields = json.loads(data)
     places = []
 
@@ -166,7 +166,7 @@ def test_a_number_edited_and_hashed_again_is_not_what_the_trace_carries(run, cop
 
 
 def lying(section, change):
-    """A `record_of` that makes a whole, consistent artifact out of a record with a lie in it."""
+    """Return a `record_of` that creates a complete, consistent artifact from a record with a false value."""
     honest = evidence.record_of
 
     def record_of(measurement, folder):
@@ -231,7 +231,7 @@ def test_a_forged_motion_in_the_trace_is_found_although_all_hashes_are_right(sol
 
 
 def test_a_run_that_stopped_far_from_its_goal_cannot_say_that_it_converged(solution, tmp_path, monkeypatch):
-    """Failing metrics gone, status and verdict changed, the record carried by the trace, all hashes right."""
+    """Failed metrics are removed, status and verdict changed, the trace has the record, and all hashes are correct."""
     stopped = dd.solve(dataclasses.replace(solution.problem, x_goal=[2.2, 0]), method="ilqr", max_iterations=1)
     assert stopped.goal_error > 1e-2
     honest = evidence.record_of
@@ -274,7 +274,7 @@ def test_exchanged_pages_are_found_although_all_hashes_are_right_and_a_file_more
 
 
 def numbers_changed(by):
-    """Every number of double precision in the commands to a viewer changed `by` a function."""
+    """Return a page edit that applies `by` to every double-precision number in the commands to a viewer."""
 
     def change(_, data):
         for i in range(len(data) - 8):
@@ -291,12 +291,12 @@ def numbers_changed(by):
     [
         (with_scene_of, "broken"),
         (numbers_changed(lambda value: value * (1 + 1e-4)), "broken"),
-        (numbers_changed(lambda value: value * (1 + 1e-9)), "holds"),  # as machines round
+        (numbers_changed(lambda value: value * (1 + 1e-9)), "holds"),  # like rounding on another machine
         (lambda page, _: with_commands(page, lambda i, data: b"" if i == 3 else data), "broken"),
         (lambda page, _: with_commands(page, lambda i, data: data[:-1] if i == 3 else data), "broken"),
         (lambda page, _: with_scripts(page, lambda script: script + "//" + "a" * 50), "broken"),
         (lambda page, _: page.replace("'sha256-", f"'sha256-{'a' * 43}=' 'sha256-"), "broken"),
-        (lambda page, _: page.replace("6b3d943b", "6b3d943c"), "broken"),  # of the model, in the record in the report
+        (lambda page, _: page.replace("6b3d943b", "6b3d943c"), "broken"),  # the model's hash in the record
     ],
 )
 def test_a_scene_that_is_not_the_runs_is_found_although_all_hashes_are_right(run, other_run, copy, forge, verdict):
@@ -314,7 +314,7 @@ def test_a_scene_that_is_not_the_runs_is_found_although_all_hashes_are_right(run
 
 
 def test_an_older_schema_is_no_excuse_for_another_page_or_sentence(run, other_run, copy):
-    """What versions word otherwise cannot be told from a forgery: it is not checked, and does not hold."""
+    """Wording that differs between versions cannot be told from a forgery, so the verdict is undecided."""
     record = dd.load_record(copy).model_copy(update={"schema_version": "3.1.0"})
     seal(copy, record.model_dump(mode="json"))
     result = verify_own(copy)
@@ -340,7 +340,7 @@ def test_an_older_schema_is_no_excuse_for_another_page_or_sentence(run, other_ru
     ),
 )
 def test_a_trace_with_something_left_out_is_found(copy, change, told):
-    """Written again by the mcap package alone, as whole as before."""
+    """The mcap package rewrites the file, so it is as complete as before."""
     rewrite(copy / "trace.mcap", **change)
     dd.load_record(copy).write(copy)
     result = dd.verify(copy)
@@ -447,7 +447,7 @@ KINDS["certification"] = "record.schema.json"
 
 @pytest.fixture(scope="module")
 def kinds(run, solution, tmp_path_factory):
-    """A directory of each kind."""
+    """Write a directory of each kind."""
     folder = tmp_path_factory.mktemp("kinds")
     model = solution.problem.model
     shutil.copytree(run, folder / "plan")
@@ -459,7 +459,7 @@ def kinds(run, solution, tmp_path_factory):
 
 
 def test_every_kind_of_directory_is_known_read_and_listed(kinds):
-    """Comparisons and trials are not run again, and nothing says that they hold."""
+    """Comparisons and trials are not run again, so their verdict is not "holds"."""
     verdicts = {kind: dd.verify(kinds / kind).verdict for kind in KINDS}
     assert verdicts == {"plan": "holds", "comparison": "intact", "robustness": "intact", "certification": "holds"}
     assert {kind: dd.load_record(kinds / kind).subject for kind in KINDS} == {kind: kind for kind in KINDS}
@@ -489,7 +489,7 @@ def test_a_changed_directory_of_any_kind_is_refused_and_the_file_named(kinds, ki
 @pytest.mark.slow
 @each_row("kind", ["comparison", "robustness"])
 def test_pages_and_sentences_of_what_is_not_run_again_follow_from_the_record(kinds, kind, tmp_path):
-    """Plots and scenes do not: the verdict says that contents are not checked."""
+    """Plots and scenes do not follow from the record, so the verdict says that contents are not checked."""
     copy = Path(shutil.copytree(kinds / kind, tmp_path / kind))
     fields = json.loads((copy / "record.json").read_text())
 
@@ -600,7 +600,7 @@ def test_quantities_of_the_toolkit_are_recorded_and_run_again(tmp_path):
     told = record.problem["constraints"][0]
     assert told["quantity"] == {"frame_position": {"frame": "pole", "point": [0, 0, -0.5], "relative_to": "world"}}
     assert (told["knots"], told["every_knot"]) == ([10, 20], False)
-    lowered = {**told, "upper": [1, 1, -0.49]}  # which the plan breaks
+    lowered = {**told, "upper": [1, 1, -0.49]}  # the plan violates this bound
     problem = {**record.problem, "constraints": [lowered, *record.problem["constraints"][1:]]}
     record.model_copy(update={"problem": problem}).write(tmp_path / "run")
     assert not dd.verify(tmp_path / "run").holds
@@ -608,7 +608,7 @@ def test_quantities_of_the_toolkit_are_recorded_and_run_again(tmp_path):
 
 @pytest.mark.slow
 def test_a_given_guess_and_the_problems_own_are_run_again(solution, tmp_path):
-    """Arrays, a solution on another mesh, first inputs of the problem, and stages of a continuation."""
+    """Guesses are arrays, a solution on another mesh, the problem's inputs, and stages of a continuation."""
     model = solution.problem.model
     cost = dd.QuadraticCost(R=[[1.0]])
     free = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=cost, horizon=(0.3, 0.5))

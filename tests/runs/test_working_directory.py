@@ -1,4 +1,4 @@
-"""A command runs nothing that the working directory, which may be a stranger's, names: each of its files is a trap."""
+"""Check that a command runs no file that the (possibly untrusted) working directory names. Each test sets traps."""
 
 import os
 import shutil
@@ -18,7 +18,7 @@ TRAP = "import pathlib\npathlib.Path({!r}).touch()\n"
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """An empty working directory and a file beside it, which a trap creates."""
+    """Create an empty working directory, and return it with the path of a file that a trap creates."""
     folder, sprung = tmp_path / "here", tmp_path / "sprung"
     folder.mkdir()
     monkeypatch.chdir(folder)
@@ -45,7 +45,7 @@ def test_the_commit_of_a_checkout_and_whether_it_differs(here):
     folder, _ = here
     assert provenance_of().git is None
     git("init", "-q")
-    assert provenance_of().git is None  # nothing is committed
+    assert provenance_of().git is None  # the repository has no commit
     head = commit("text")
     assert provenance_of().git == {"commit": head, "dirty": False}
     (folder / "untracked").touch()
@@ -82,7 +82,7 @@ def test_settings_of_a_checkout_run_no_drake_diff(here):
     assert provenance_of().git == {"commit": head, "dirty": True}
     assert not sprung.exists()
     subprocess.run(["git", "status"], check=False)
-    assert sprung.exists()  # the traps are set
+    assert sprung.exists()  # the traps work
 
 
 def test_ipopt_reads_no_options(here):
