@@ -1,9 +1,9 @@
-"""Swing up an acrobot: two links, and a motor at the elbow only.
+"""Swing up an acrobot, a double pendulum with a motor only at the elbow.
 
-The plan is in continuous time. On the plant it holds under feedback, better in shorter steps.
+The plan is in continuous time. In time steps it holds under feedback, with smaller errors for shorter steps.
 
     drake-diff run examples/acrobot_swing_up.py     writes artifacts/acrobot_swing_up
-    python examples/acrobot_swing_up.py             prints what the plan does, and its replays under feedback
+    python examples/acrobot_swing_up.py             prints the largest torque and the replays under feedback
 """
 
 from pathlib import Path
@@ -20,7 +20,7 @@ solve_options: dict[str, Any] = {"method": "collocation"}
 
 
 def problem() -> dd.Problem:
-    """From hanging at rest to standing at rest, with little torque."""
+    """Pose the swing-up from hanging at rest to upright at rest, with little torque."""
     return dd.Problem(
         dd.load_model(MODEL, time_step=HORIZON / NUM_STEPS),
         x0=[0, 0, 0, 0],

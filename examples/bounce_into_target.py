@@ -1,7 +1,7 @@
-"""A ball is thrown so that it bounces once and then flies through a target.
+"""Throw a ball so that it bounces once and then flies through a target.
 
-The bounce is that of the compliant contact in continuous time (motion="continuous"): the search follows its own
-derivative, and the plan is a success only where another integration of the same law replays it.
+The bounce follows the compliant contact law in continuous time (motion="continuous"). The search uses the derivative of
+this motion. The plan is verified only if it also passes a replay with another integration of the same law.
 
     drake-diff run examples/bounce_into_target.py   writes artifacts/bounce_into_target
     python examples/bounce_into_target.py           prints the throw
@@ -19,7 +19,7 @@ X, Z, VX, VZ = 4, 6, 10, 12  # in Drake's state: quaternion, position, angular v
 
 
 def problem() -> dd.Problem:
-    """From 1 m above the ground; the velocity in the plane may change."""
+    """Pose the throw from 1 m above the ground; the initial velocity in the x-z plane is free."""
     model = dd.load_model(MODEL, time_step=TIME_STEP, contact_approximation="lagged")
     x0, goal, free = np.array(model.default_state), np.full(13, np.nan), np.zeros(13, dtype=bool)
     x0[[X, Z, VX, VZ]] = 0.0, 1.0, 1.0, -1.0

@@ -1,10 +1,10 @@
-"""Swing up a cart-pole through Drake's own discrete steps, and check the gradients that did it.
+"""Swing up a cart-pole through Drake's own discrete steps, and certify the gradients.
 
 The problem is Kelly's ("An Introduction to Trajectory Optimization", SIAM Review 59(4), 2017): from hanging at rest
-to upright at rest 1 m to the right in 2 s, least integral of the squared force.
+to upright at rest 1 m to the right in 2 s, with the least integral of the squared force.
 
     drake-diff run examples/cart_pole_swing_up.py       writes artifacts/cart_pole_swing_up
-    python examples/cart_pole_swing_up.py               prints how the methods compare
+    python examples/cart_pole_swing_up.py               compares collocation and shooting
 """
 
 from pathlib import Path
@@ -31,7 +31,7 @@ def problem(num_steps: int = 100) -> dd.Problem:
 
 
 def main() -> None:
-    """Shooting through the discrete step against collocation of the continuous motion, cost J in N^2 s."""
+    """Compare shooting through the discrete step with collocation of the continuous motion; the cost J is in N^2 s."""
     print("the best motion known of the continuous problem has J = 57.9448; from u = 0 another is found, of 58.8077")
     for num_steps in (50, 100):
         for method in ("collocation", "shooting"):

@@ -1,9 +1,9 @@
-"""A crane moves its load by two metres in three seconds.
+"""Move the load of a crane by two metres in three seconds.
 
-Its rope may not sway by more than 0.14 rad on the way, and hangs at rest in the end.
+The rope may sway by at most 0.14 rad on the way, and must hang at rest at the end.
 
     drake-diff run examples/crane_without_sway.py   writes artifacts/crane_without_sway
-    python examples/crane_without_sway.py           prints the sway, with and without that limit
+    python examples/crane_without_sway.py           prints the sway with and without this limit
 """
 
 from pathlib import Path
@@ -12,12 +12,12 @@ import numpy as np
 
 import drake_diff as dd
 
-MODEL = Path(__file__).parent.parent / "models" / "cart_pole.urdf"  # its pole hangs: a load on a stiff rope
+MODEL = Path(__file__).parent.parent / "models" / "cart_pole.urdf"  # its hanging pole is the load on a stiff rope
 TIME_STEP, NUM_STEPS, SWAY = 0.02, 150, 0.14  # [s], steps, [rad]
 
 
 def problem(sway: float = SWAY) -> dd.Problem:
-    """From rest to rest with little force."""
+    """Pose the motion from rest to rest with little force."""
     return dd.Problem(
         dd.load_model(MODEL, time_step=TIME_STEP),
         x0=[-1, 0, 0, 0],

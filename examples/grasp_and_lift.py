@@ -1,10 +1,10 @@
-"""Two fingers close on a box and lift it, held by friction at its sides, from a guess that knows no forces.
+"""Grasp a box with two fingers and lift it by friction, from an initial guess without contact forces.
 
-The guess takes the fingers to the box's sides and up with it. The first stages look for a motion by inverse dynamics,
-with contact at a distance, of a shorter reach in each; the last one is on the true plant, and is what is told.
+In the guess the fingers move to the box's sides and lift it. The early stages search by inverse dynamics, with contact
+forces at a distance whose range decreases. The last stage uses the true plant, and its plan is the result.
 
     drake-diff run examples/grasp_and_lift.py    writes artifacts/grasp_and_lift
-    python examples/grasp_and_lift.py            prints the stages, and when the box is off the ground
+    python examples/grasp_and_lift.py            prints the stages and the time at which the box leaves the ground
 """
 
 from pathlib import Path
@@ -15,14 +15,14 @@ import numpy as np
 import drake_diff as dd
 
 MODEL = Path(__file__).parent.parent / "models" / "two_fingers.sdf"
-TIME_STEP, NUM_STEPS, STANDS, HEIGHT = 0.02, 100, 0.099, 0.18  # [s], [m]: the box's middle at first, and at last
-GRIP, CARRIED = 2.5, 9.81 * 0.101  # [N] of a finger on the box; the weight of a finger
-LEFT, RIGHT, SIDE = -0.13, 0.15, 0.07  # [m] the fingertips at first, and beside the box
+TIME_STEP, NUM_STEPS, STANDS, HEIGHT = 0.02, 100, 0.099, 0.18  # [s], steps, first and last height of the box [m]
+GRIP, CARRIED = 2.5, 9.81 * 0.101  # [N] grip force of a finger, and its weight
+LEFT, RIGHT, SIDE = -0.13, 0.15, 0.07  # [m] x of the fingertips, initially and in contact with the box (SIDE)
 EFFORT = [GRIP, CARRIED, -GRIP, CARRIED]
 
 
 def guess() -> tuple[np.ndarray, np.ndarray]:
-    """The fingers go to the box's sides in 0.8 s, then up with it."""
+    """Return states (N+1, nx) and inputs (N, nu): the fingers reach the box's sides in 0.8 s, then lift it."""
     part = np.linspace(0, 1, NUM_STEPS + 1)
     z = np.interp(part, [0, 0.4, 0.9], [STANDS, STANDS, HEIGHT])
     left, right = np.interp(part, [0, 0.4], [LEFT, -SIDE]), np.interp(part, [0, 0.4], [RIGHT, SIDE])
@@ -38,7 +38,7 @@ solve_options: dict[str, Any] = {
 
 
 def problem() -> dd.Problem:
-    """In the last 0.2 s the box is to be 8 cm up; efforts are told from those of a grip, and leaning costs."""
+    """Lift the box by 8 cm for the last 0.2 s; deviations from the efforts of a grip, and tilt, have a cost."""
     return dd.Problem(
         dd.load_model(MODEL, time_step=TIME_STEP),
         x0={"z": STANDS, "left_x": LEFT, "left_z": STANDS, "right_x": RIGHT, "right_z": STANDS},
@@ -55,7 +55,7 @@ def main() -> None:
         reach = "" if stage["distance"] is None else f" {1000 * stage['distance']:.1f} mm"
         print(f"  stage {stage['number']}  {stage['kind'] + reach:18s}  {stage['status']}, {stage['iterations']} steps")
     print(f"{solution.message}")
-    motion: Any = solution.replay  # None only of a search without a plan
+    motion: Any = solution.replay  # None only if the search found no plan
     ground = [k for k, found in enumerate(motion.contacts) if any("ground" in str(c) for c in found)]
     print(f"off the ground from {(max(ground) + 1) * TIME_STEP:.2f} s; at the end z = {motion.xs[-1][1]:.4f} m")
 

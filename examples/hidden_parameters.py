@@ -1,8 +1,8 @@
-"""Find hidden parameters again from a motion: masses, a link length, and friction through contact.
+"""Recover hidden parameters from a motion: masses, a link length, and friction in contact.
 
-A motion is simulated with parameters that the search does not see. `solve` then moves all of them at once, from a
-wrong start, until the simulator's own steps repeat the motion: gradients by AutoDiffXd for what Drake carries, by
-differences of the double step for what it does not (friction), as the printed source of each column says.
+A motion is simulated with parameters that the search does not know. From wrong initial values, `solve` changes all of
+them together until the simulator's own steps reproduce the motion. Gradients are from AutoDiffXd where Drake supports
+it, and otherwise (friction) from finite differences of the step. The source of each column is printed.
 
     python examples/hidden_parameters.py
 """
@@ -14,19 +14,19 @@ import numpy as np
 
 import drake_diff as dd
 
-PRECISION = 1e-2  # of the measured motion [m, rad, and per s]: what counts as a deviation of 1
+PRECISION = 1e-2  # of the measured motion [m, rad, and per s]: a deviation of this size counts as 1
 MODELS = Path(__file__).parent.parent / "models"
 
 
 def swinging() -> tuple[dd.Model, np.ndarray, np.ndarray]:
-    """A double pendulum that two motors shake for a second."""
+    """Return a double pendulum, its initial state, and one second of inputs of its two motors."""
     model = dd.load_model(MODELS / "double_pendulum.urdf", time_step=0.01)
     t = model.time_step * np.arange(100)
     return model, np.array([0.4, -0.3, 0.0, 0.0]), np.column_stack([2 * np.sin(9 * t), 0.5 * np.cos(7 * t)])
 
 
 def sliding() -> tuple[dd.Model, np.ndarray, None]:
-    """A ball thrown along the ground, while it slides. (The step in which it starts to roll makes the cost jump.)"""
+    """Return a ball that slides along the ground. (The cost would jump at the step in which it starts to roll.)"""
     model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.005)
     x0 = model.default_state
     x0[6], x0[10] = 0.1 - 9.81 / 1e4, 2.0  # resting height [m], speed [m/s]
@@ -36,7 +36,7 @@ def sliding() -> tuple[dd.Model, np.ndarray, None]:
 def problem(
     model: dd.Model, x0: np.ndarray, us: np.ndarray | None, hidden: dict[str, object], start: dict[str, object]
 ) -> dd.Problem:
-    """From `start`, the parameters under which the motion is that of the `hidden` ones."""
+    """Search from `start` for the parameters that reproduce the motion with the `hidden` parameters."""
     steps = 20 if us is None else len(us)
     measured = dd.rollout(model, x0, us, num_steps=steps, parameters=hidden).xs
     return dd.Problem(

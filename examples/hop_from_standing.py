@@ -1,10 +1,10 @@
-"""A hopper that stands hops half a metre on and lands, from a guess that stays on the ground.
+"""Hop forward by half a metre from standing and land, from an initial guess that stays on the ground.
 
-The guess is a straight line to the goal, which no force makes. The first stages look for a motion by inverse dynamics,
-with contact at a distance, of a shorter reach in each; the last one is on the true plant, and is what is told.
+The guess is a straight line to the goal that ignores the dynamics. The early stages search by inverse dynamics, with
+contact forces at a distance whose range decreases. The last stage uses the true plant, and its plan is the result.
 
     drake-diff run examples/hop_from_standing.py    writes artifacts/hop_from_standing
-    python examples/hop_from_standing.py            prints the stages, and when the foot is in the air
+    python examples/hop_from_standing.py            prints the stages and the flight time
 """
 
 from pathlib import Path
@@ -16,7 +16,7 @@ import drake_diff as dd
 
 MODEL = Path(__file__).parent.parent / "models" / "hopper.sdf"
 TIME_STEP, NUM_STEPS, WAY, CLEARANCE = 0.01, 100, 0.5, 0.05
-HEIGHT, LEG = 0.5, 0.45 + 12 / 2e4  # [m] the foot is pressed 0.6 mm into the ground, which carries 12 N
+HEIGHT, LEG = 0.5, 0.45 + 12 / 2e4  # [m] the foot penetrates the ground by 0.6 mm, which carries 12 N
 
 solve_options: dict[str, Any] = {
     "method": "ilqr",
@@ -26,7 +26,7 @@ solve_options: dict[str, Any] = {
 
 
 def problem() -> dd.Problem:
-    """After 1 s it is to stand 0.5 m further on; at 0.6 s there are 5 cm under its foot. Least effort."""
+    """Stand 0.5 m further after 1 s with least effort; at 0.6 s the foot is 5 cm above the ground."""
     goal = {"x": WAY, "z": HEIGHT, "x_v": 0.0, "z_v": 0.0, "swing_v": 0.0, "leg_v": 0.0}
     return dd.Problem(
         dd.load_model(MODEL, time_step=TIME_STEP),
@@ -44,7 +44,7 @@ def main() -> None:
         reach = "" if stage["distance"] is None else f" {1000 * stage['distance']:.1f} mm"
         print(f"  stage {stage['number']}  {stage['kind'] + reach:18s}  {stage['status']}, {stage['iterations']} steps")
     print(f"{solution.message}")
-    motion: Any = solution.replay  # None only of a search without a plan
+    motion: Any = solution.replay  # None only if the search found no plan
     flight = [k * TIME_STEP for k, contacts in enumerate(motion.contacts) if not contacts]
     print(f"in the air from {flight[0]:.2f} s to {flight[-1]:.2f} s; at the end x = {motion.xs[-1][0]:.6f} m")
 

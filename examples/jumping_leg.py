@@ -1,10 +1,10 @@
-"""Co-design: the lengths of a leg, the spring at its knee and the torques, for the highest jump.
+"""Co-design of a leg for the highest jump: link lengths, knee spring and torques.
 
-From a crouch the leg is to come as high as it can in the same crouch, so that no spring gives energy for nothing: what
-it adds to the push, the motor puts in again in the air. A long leg is a slow gear, too weak for its weight; in a short
-one, a fast gear, damping takes the motor's work. So the best design lies in between.
+The leg jumps from a crouch and must return to the same crouch in the air. The motor then puts the spring's energy back,
+so that a spring gives no free energy. With a long leg the motor is too weak for the weight. With a short leg the knee
+turns fast, and damping dissipates the motor's work. The best length is between these extremes.
 
-    drake-diff run examples/jumping_leg.py    writes artifacts/jumping_leg, which `drake-diff verify` makes again
+    drake-diff run examples/jumping_leg.py    writes artifacts/jumping_leg, which `drake-diff verify` reproduces
     python examples/jumping_leg.py            prints the design and the heights of its replays
 """
 
@@ -17,7 +17,7 @@ import drake_diff as dd
 
 MODEL = Path(__file__).parent.parent / "models" / "jumper.sdf"
 START, CROUCH, NUM_STEPS = [0.0287, 1.9, 0, 0], 1.9, 50  # foot [m], knee [rad], and their rates
-BOUNDS = {  # [m], along z of the link before; [N m/rad]
+BOUNDS = {  # [m], along z of the previous link; [N m/rad]
     "knee.offset": ([0, 0, 0.05], [0, 0, 0.8]),
     "hip.offset": ([0, 0, 0.05], [0, 0, 0.8]),
     "knee.spring_stiffness": (0.1, 30.0),
@@ -30,7 +30,7 @@ solve_options: dict[str, Any] = {
 
 
 def problem() -> dd.Problem:
-    """The foot as near to 1 m as it gets, which is out of reach, and a little for the effort."""
+    """Minimize the squared distance of the foot from 1 m, which is out of reach, plus a small cost of effort."""
     return dd.Problem(
         dd.load_model(MODEL, time_step=0.01, mimic="reduce"),
         x0=START,

@@ -1,7 +1,7 @@
-"""A policy of 36 weights that lands from a fall and comes to rest at 0.75 m, trained by gradients through the landing.
+"""Train a policy of 36 weights by gradients through a landing; after a fall the body comes to rest at 0.75 m.
 
-drake-diff run examples/landing_policy.py    trains, and writes the plan that the policy makes, which `verify` accepts
-python examples/landing_policy.py            beside Powell's search, by values alone, and as many simulated steps
+drake-diff run examples/landing_policy.py    trains the policy, and writes its motion as a plan that `verify` reproduces
+python examples/landing_policy.py            compares with Powell's derivative-free method at as many simulated steps
 """
 
 import warnings
@@ -14,15 +14,15 @@ from scipy.optimize import minimize
 import drake_diff as dd
 from drake_diff.motion import ParametricPolicy
 
-HEIGHT, HIDDEN, DROPS, UNSEEN = 0.75, 6, (0.6, 0.75, 0.9), (0.65, 0.85)  # [m] where to, and where the body falls from
-FIRST = np.random.default_rng(0).normal(0, np.repeat([0.5, 0.1], [5 * HIDDEN, HIDDEN]))  # the weights
-warnings.simplefilter("ignore", dd.exceptions.GradientWarning)  # mostly of the first state, which nobody moves
+HEIGHT, HIDDEN, DROPS, UNSEEN = 0.75, 6, (0.6, 0.75, 0.9), (0.65, 0.85)  # heights [m]: final, and initial
+FIRST = np.random.default_rng(0).normal(0, np.repeat([0.5, 0.1], [5 * HIDDEN, HIDDEN]))  # the initial weights
+warnings.simplefilter("ignore", dd.exceptions.GradientWarning)  # mostly about the initial state, which is fixed
 model = dd.load_model(Path(__file__).parent.parent / "models/hopper.sdf", time_step=0.02, fix_joints=("x", "swing"))
-miss = dd.QuadraticCost(Q=np.diag([1, 0, 0.05, 0]), x_ref=[HEIGHT, 0, 0, 0])  # at rest at the height after 0.8 s
+miss = dd.QuadraticCost(Q=np.diag([1, 0, 0.05, 0]), x_ref=[HEIGHT, 0, 0, 0])  # at rest at HEIGHT after 0.8 s
 
 
 def network(x: np.ndarray, t: float, weights: np.ndarray) -> np.ndarray:
-    """The force of the leg [N] (1,): a spring, a damper and a network on top."""
+    """Return the force of the leg [N] (1,): a spring, a damper and a network."""
     inner, bias, outer = np.split(weights, [4 * HIDDEN, 5 * HIDDEN])
     hidden = np.tanh(inner.reshape(HIDDEN, 4) @ ((x - [0.6, 0.5, 0, 0]) * [3, 3, 0.5, 0.5]) + bias)
     return np.array([12 - 100 * (x[1] - 0.45) - 3 * x[3] + 30 * (outer @ hidden)])
@@ -45,7 +45,7 @@ def train(evaluations: int, *, gradients: bool = True) -> np.ndarray:
 
 
 def problem(weights: np.ndarray | None = None) -> dd.Problem:
-    """The policy's motion after the first drop, to be followed: its own inputs do that at no cost."""
+    """Pose the tracking of the policy's motion from the first height; the policy's own inputs have zero cost."""
     motion = fall(dd.rollout, train(16) if weights is None else weights, DROPS[0])
     table = motion.times, motion.xs, np.vstack([motion.us, motion.us[-1:]])
     follow = dd.optimize.TrackingCost(table, Q=np.eye(4), R=[[1.0]])

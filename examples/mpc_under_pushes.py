@@ -1,8 +1,8 @@
-"""MPC of a cart-pole's swing-up, of a crane whose load may sway a little and of a Panda arm, all pushed, in real time?
+"""Measure MPC against real time under pushes: a cart-pole swing-up, a crane with limited sway, and a Panda arm.
 
     python examples/mpc_under_pushes.py
 
-The Panda is that of the Python package example-robot-data (`pip install example-robot-data`).
+The Panda model is from the Python package example-robot-data (`pip install example-robot-data`).
 """
 
 import tempfile
@@ -18,11 +18,11 @@ MOTOR = """<transmission><type>transmission_interface/SimpleTransmission</type><
 <hardwareInterface>EffortJointInterface</hardwareInterface></joint><actuator name="motor{i}"/></transmission>
 """
 SWAY = 0.14  # [rad]
-POSE = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])  # [rad] the arm's usual one, elbow up
+POSE = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])  # [rad] a usual posture of the arm, elbow up
 
 
 def cart_pole() -> tuple[dd.loop.MPC, dd.Problem, dd.loop.Loop, int]:
-    """(controller, problem, loop, steps): pushed on its way up and when it stands."""
+    """Return (controller, problem, loop, steps); pushes act during the swing-up and at the upright position."""
     model = dd.load_model(CART_POLE, time_step=0.02)
     problem = dd.Problem(
         model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], num_steps=100, running_cost=dd.QuadraticCost(R=[[1.0]])
@@ -33,7 +33,7 @@ def cart_pole() -> tuple[dd.loop.MPC, dd.Problem, dd.loop.Loop, int]:
 
 
 def crane() -> tuple[dd.loop.MPC, dd.Problem, dd.loop.Loop, int]:
-    """The same cart with its load hanging, which may not sway by more than 0.14 rad, however it is pushed."""
+    """Return the same for a cart with a hanging load, which may sway by at most 0.14 rad under pushes."""
     model = dd.load_model(CART_POLE, time_step=0.02)
     limits = dd.Bounds(x_lower=[-1.2, -SWAY, -np.inf, -np.inf], x_upper=[1.2, SWAY, np.inf, np.inf])
     problem = dd.Problem(
@@ -45,7 +45,7 @@ def crane() -> tuple[dd.loop.MPC, dd.Problem, dd.loop.Loop, int]:
 
 
 def panda(path: Path) -> tuple[dd.loop.MPC, dd.Problem, dd.loop.Loop, int]:
-    """The same of an arm of seven joints that turns 0.3 rad about its base, pushed at its hand on the way."""
+    """Return the same for an arm of seven joints that turns by 0.3 rad about its base; a push acts on its hand."""
     model = dd.load_model(path, time_step=0.02, weld_base="panda_link0")
     goal = np.concatenate([POSE, np.zeros(7)])
     x0 = goal - 0.3 * np.eye(14)[0]
@@ -57,15 +57,15 @@ def panda(path: Path) -> tuple[dd.loop.MPC, dd.Problem, dd.loop.Loop, int]:
 
 
 def holding(model: dd.Model, x: np.ndarray) -> np.ndarray:
-    """(nu,) the torques [N m] that stand up to gravity."""
+    """Return (nu,) the torques [N m] that compensate gravity."""
     context = model.plant.CreateDefaultContext()
     model.plant.SetPositionsAndVelocities(context, x)
     return -model.plant.CalcGravityGeneralizedForces(context)
 
 
 def panda_file(folder: Path) -> Path:
-    """The arm of example-robot-data with a motor in each joint, and with fingers that are fixed: one mimics the other,
-    which is a constraint for which there are no derivatives here."""
+    """Write the arm of example-robot-data with a motor at each joint and with fixed fingers; return the file's path.
+    The fingers are fixed because one mimics the other, which is a constraint without derivatives here."""
     path = next(Path(str(f.locate())) for f in files("example-robot-data") or () if str(f).endswith("/panda.urdf"))
     lines = [line for line in path.read_text().splitlines() if "<mimic" not in line]
     text = "\n".join(lines).replace('type="prismatic"', 'type="fixed"')
@@ -75,7 +75,7 @@ def panda_file(folder: Path) -> Path:
 
 
 def told(name: str, run: dd.loop.ClosedLoop, problem: dd.Problem) -> str:
-    """Where it ended and what the controller took, against its period."""
+    """Describe the error of the last state, and the controller's latency compared with its period."""
     period, error = problem.model.time_step, np.abs(problem.goal_error(run.motion.xs[-1])).max()
     median, most, worst = np.percentile(run.latencies, [50, 95, 100])
     if median > period:

@@ -1,9 +1,9 @@
 """Train a small neural network to balance the cart-pole, by gradient descent through Drake's simulator.
 
 u = W2 tanh(W1 e + b1) + b2 with e = x - upright: 4 inputs, 16 hidden units, 1 force, 97 parameters, in plain NumPy.
-The gradient of the loss by all 97 comes from one pass back through the steps of each rollout; Adam uses it.
+Reverse differentiation through each rollout gives the gradient with respect to all 97 parameters, for Adam.
 
-    python examples/neural_network_policy.py   trains, then balances from initial states that it never saw
+    python examples/neural_network_policy.py   trains, then tests with unseen initial states
 """
 
 from pathlib import Path
@@ -15,28 +15,28 @@ from drake_diff.motion import ParametricPolicy
 
 MODEL = Path(__file__).parent.parent / "models" / "cart_pole.urdf"
 TIME_STEP, HIDDEN, STEP_SIZE = 0.02, 16, 0.03
-STAGES = ((30, 30), (60, 20), (120, 20))  # (steps of a rollout, iterations): short first, for what falls says little
+STAGES = ((30, 30), (60, 20), (120, 20))  # (steps of a rollout, iterations): short at first, because poles fall
 UPRIGHT = np.array([0.0, np.pi, 0.0, 0.0])  # cart [m], angle [rad], and their rates
-SPREAD = np.array([0.2, 0.2, 0.2, 0.4])  # initial states are within this of upright
-LIMITS = np.array([2.0, 0.5])  # of cart [m] and angle [rad]: beyond is fallen
+SPREAD = np.array([0.2, 0.2, 0.2, 0.4])  # largest deviation of an initial state from upright
+LIMITS = np.array([2.0, 0.5])  # of cart [m] and angle [rad]; a larger deviation counts as fallen
 
 
 def network(x: np.ndarray, t: float, parameters: np.ndarray) -> np.ndarray:
-    """The force [N] (1,) at state x (4,); floats or AutoDiffXd."""
+    """Return the force [N] (1,) at state x (4,), for floats or AutoDiffXd."""
     w1, b1, w2, b2 = np.split(parameters, np.cumsum([4 * HIDDEN, HIDDEN, HIDDEN]))
     hidden = np.tanh(w1.reshape(HIDDEN, 4) @ (x - UPRIGHT) + b1)
     return 10 * w2.reshape(1, HIDDEN) @ hidden + b2
 
 
 def loss(xs: np.ndarray, us: np.ndarray) -> float:
-    """The mean over the motion of the weighted squared distance from upright, and a little for the force."""
+    """Return the mean weighted squared distance from upright over the motion, plus a small cost of the force."""
     e = xs - UPRIGHT
     return ((e**2) @ [1.0, 10.0, 0.1, 0.1]).mean() + 1e-3 * (us**2).mean()
 
 
 def first_parameters(random: np.random.Generator) -> np.ndarray:
     parameters = 0.5 * random.standard_normal(6 * HIDDEN + 1)
-    parameters[5 * HIDDEN :] *= 0.1  # little force at first
+    parameters[5 * HIDDEN :] *= 0.1  # small initial forces
     return parameters
 
 
@@ -47,14 +47,14 @@ def initial_states(random: np.random.Generator, count: int) -> np.ndarray:
 def loss_and_gradient(
     model: dd.Model, parameters: np.ndarray, starts: np.ndarray, num_steps: int
 ) -> tuple[float, np.ndarray]:
-    """The mean over rollouts from `starts` (m, 4) of the loss, and its gradient by the parameters (97,)."""
+    """Return the mean loss of rollouts from `starts` (m, 4), and its gradient (97,) with respect to the parameters."""
     policy = ParametricPolicy(network, parameters)
     found = [dd.differentiate_rollout(model, x0, None, loss, policy=policy, num_steps=num_steps) for x0 in starts]
     return float(np.mean([g.loss for g in found])), np.mean([g.by_policy for g in found], axis=0)
 
 
 def train(model: dd.Model, parameters: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """The trained parameters: Adam, on rollouts that grow longer from stage to stage."""
+    """Train by Adam, with longer rollouts in each stage, and return the parameters."""
     mean, square, i = np.zeros_like(parameters), np.zeros_like(parameters), 0
     for num_steps, iterations in STAGES:
         for _ in range(iterations):
@@ -69,7 +69,7 @@ def train(model: dd.Model, parameters: np.ndarray, starts: np.ndarray) -> np.nda
 
 
 def survivors(model: dd.Model, parameters: np.ndarray, starts: np.ndarray, seconds: float = 5.0) -> int:
-    """From how many of `starts` (m, 4) the pole stays up and the cart on its rail for that long."""
+    """Count the `starts` (m, 4) from which the pole stays up and the cart on its rail for `seconds`."""
     policy, steps = ParametricPolicy(network, parameters), round(seconds / TIME_STEP)
     motions = [dd.rollout(model, x0, policy=policy, num_steps=steps).xs for x0 in starts]
     return sum(bool(np.all(np.abs(xs - UPRIGHT)[:, :2] < LIMITS)) for xs in motions)

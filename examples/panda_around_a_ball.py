@@ -1,9 +1,9 @@
-"""A Panda arm takes its hand around a ball that hangs in its way.
+"""Move the hand of a Panda arm around a ball.
 
-No link may come nearer to the ball than 3 cm, between the knots of the plan too.
+Each link keeps a distance of at least 3 cm from the ball, also between the knots of the plan.
 
     drake-diff run examples/panda_around_a_ball.py  writes artifacts/panda_around_a_ball
-    python examples/panda_around_a_ball.py          prints how near it comes, and how near if nobody told it of the ball
+    python examples/panda_around_a_ball.py          prints the smallest distances, with and without the obstacle
 """
 
 from typing import Any
@@ -19,7 +19,7 @@ BALL = dd.SphereObstacle([0.6, 0.0, 0.45], 0.1, margin=0.03, name="ball")  # [m]
 
 
 def problem(goals: tuple[dd.SphereObstacle, ...] = (BALL,)) -> dd.Problem:
-    """From rest to rest in 2 s, the hand at its target in the end."""
+    """Pose the motion from rest to rest in 2 s that ends with the hand at its target."""
     model = dd.example_model("panda", time_step=TIME_STEP)
     return dd.Problem(
         model,

@@ -1,4 +1,4 @@
-"""Choose the launch velocity of a projectile so that it comes down at x = 6: by hand and through Drake, side by side.
+"""Find the launch velocity of a projectile that lands at x = 6, by hand and through Drake.
 
 300 steps of 0.01 s of semi-implicit Euler, v+ = v - g h, p+ = p + h v+. The loss is (x_T - 6)^2 / 2, and since
 x_T = x_0 + 3 v_x, its derivative by hand is d loss / d v_x = (x_T - 6) * 3.0.
@@ -19,7 +19,7 @@ X, VX, VZ = 4, 10, 12  # in Drake's state: quaternion, position, angular velocit
 
 
 def launch(vx: float) -> np.ndarray:
-    """The state at x = z = 0 with a vertical velocity that brings it back to z = 0 at the last step."""
+    """Return the state at x = z = 0 with a vertical velocity that leads back to z = 0 at the last step."""
     x = np.zeros(13)
     x[0] = 1
     x[VX], x[VZ] = vx, GRAVITY * TIME_STEP * (NUM_STEPS + 1) / 2
@@ -45,7 +45,7 @@ def problem() -> dd.Problem:
 
 
 def hand_built(vx: float) -> tuple[float, float, np.ndarray]:
-    """(loss, d loss / d vx, final x and z) of the same motion in NumPy, its derivative by hand."""
+    """Return (loss, d loss / d vx, final x and z) of the same motion in NumPy, with the derivative by hand."""
     p, v = np.zeros(2), launch(vx)[[VX, VZ]]
     for _ in range(NUM_STEPS):
         v = v + TIME_STEP * np.array([0.0, -GRAVITY])

@@ -1,11 +1,11 @@
-"""Push a ball to where it should be, from a guess that never touches it.
+"""Push a ball to a goal, from an initial guess without contact.
 
-The motor moves the pusher alone. At zero input nothing touches, and no input has any effect on the ball: every
-gradient to the goal is zero, and shooting and iLQR end as `no_gradient`. A continuation solves the problem first with
-a force at a distance between the two, of a shorter reach in each stage, and in the last one on the true plant.
+The motor moves only the pusher. At zero input the bodies do not touch, and no input affects the ball. All gradients of
+the goal are then zero, and shooting and iLQR end with the status `no_gradient`. A continuation adds a force at a
+distance between the two bodies. Its range decreases from stage to stage, and the last stage uses the true plant.
 
     drake-diff run examples/push_without_touching.py    writes artifacts/push_without_touching
-    python examples/push_without_touching.py            prints the stages, and what the true plant does
+    python examples/push_without_touching.py            prints the stages and the motion of the true plant
 """
 
 from pathlib import Path
@@ -24,7 +24,7 @@ solve_options: dict[str, Any] = {"method": "ilqr", "max_iterations": 100, "optio
 
 
 def problem() -> dd.Problem:
-    """The ball, at rest 0.3 m from the pusher, is to pass x = 1 m after 1 s; least effort."""
+    """Move the ball, at rest 0.3 m from the pusher, to x = 1 m after 1 s with least effort."""
     goal = np.full(4, np.nan)
     goal[BALL] = GOAL
     return dd.Problem(
@@ -49,7 +49,7 @@ def main() -> None:
             f"cost {stage['cost']:.6f}  goal error {stage['goal_error']:.1e}"
         )
     print(f"{solution.message}")
-    motion: Any = solution.replay  # None only of a search without a plan
+    motion: Any = solution.replay  # None only if the search found no plan
     touches = [k for k, contacts in enumerate(motion.contacts) if contacts]
     x = motion.xs[-1][BALL]
     print(f"the true plant under these inputs: the ball is at x = {x:.9f} m; it is touched in {len(touches)}")

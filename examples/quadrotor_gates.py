@@ -1,10 +1,10 @@
-"""Fly a quadrotor through three gates: its rotors are forces on the body, which the model file does not have.
+"""Fly a quadrotor through three gates. The model file has no rotors, which are added as forces on the body.
 
-The quadrotor is Drake's (0.775 kg, arms of 0.15 m); each rotor pushes up to 5 N, and turns the body by 0.0245 m times
-its thrust. From hovering to hovering 6 m further in 3 s, through gates to the left, to the right and higher.
+The quadrotor is Drake's (0.775 kg, arms of 0.15 m). Each rotor has a thrust of up to 5 N and a moment of 0.0245 m times
+the thrust. In 3 s it flies from hovering to hovering 6 m further, through gates on the left, on the right and higher.
 
     drake-diff run examples/quadrotor_gates.py       writes artifacts/quadrotor_gates
-    python examples/quadrotor_gates.py               says where it passes the gates
+    python examples/quadrotor_gates.py               prints where it passes the gates
 """
 
 from pathlib import Path
@@ -20,12 +20,12 @@ HORIZON, NUM_STEPS = 3.0, 100
 ARM, MOMENT_RATIO, MOST = 0.15, 0.0245, 5.0  # [m], [m], [N]
 HOVER = 0.775 * 9.81 / 4  # [N] of each rotor
 GATES = {25: (1.5, 0.8, 1.5), 50: (3.0, -0.8, 1.0), 75: (4.5, 0.5, 1.8)}  # [m] by knot
-OPENING = 0.15  # [m] how far from a gate's middle the quadrotor may pass
+OPENING = 0.15  # [m] largest distance from the centre of a gate
 solve_options: dict[str, Any] = {"method": "collocation"}
 
 
 def rotors() -> list[BodyForce]:
-    """One at the end of each arm, neighbours turning opposite ways."""
+    """Return a rotor for the end of each arm; neighbouring rotors turn in opposite directions."""
     points = [(ARM, 0, 0), (0, ARM, 0), (-ARM, 0, 0), (0, -ARM, 0)]
     ratios = [MOMENT_RATIO, -MOMENT_RATIO] * 2
     return [BodyForce(f"rotor_{i + 1}", "body", points[i], moment_ratio=ratios[i], upper=MOST) for i in range(4)]

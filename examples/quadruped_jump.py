@@ -1,11 +1,11 @@
-"""A quadruped jumps forward, from a schedule of which foot stands when.
+"""Jump forward with a quadruped, from a contact schedule: the feet on the ground in each phase.
 
-The schedule makes the first motion: forces at the feet that bring the centre of mass through the air and to rest,
-joints by inverse kinematics, motors by inverse dynamics. iLQR on Drake's own steps then needs a few iterations. The
-schedule is a goal too: the plan and its replays are held to it.
+The schedule computes the initial guess: foot forces that move the centre of mass through the air and to rest, joints by
+inverse kinematics, and motors by inverse dynamics. iLQR on Drake's own steps then needs a few iterations. The schedule
+is also a goal: the plan and its replays must satisfy it.
 
     drake-diff run examples/quadruped_jump.py    writes artifacts/quadruped_jump
-    python examples/quadruped_jump.py            prints how high and how far it jumps
+    python examples/quadruped_jump.py            prints the height and the length of the jump
 """
 
 from pathlib import Path

@@ -1,10 +1,10 @@
-"""A quadruped trots three steps, from a schedule of which foot stands when.
+"""Trot three steps with a quadruped, from a contact schedule: the feet on the ground in each phase.
 
-Two feet stand while the other two swing. The schedule makes the first motion, and is a goal too: in the plan and in its
-replays a standing foot touches the ground and does not slip, and a swinging one clears it.
+Two feet stand while the other two swing. The schedule computes the initial guess, and is also a goal. In the plan and
+its replays, standing feet touch the ground and do not slip, and swinging feet are above the ground.
 
     drake-diff run examples/quadruped_trot.py    writes artifacts/quadruped_trot
-    python examples/quadruped_trot.py            prints how far it goes
+    python examples/quadruped_trot.py            prints the distance
 """
 
 from pathlib import Path

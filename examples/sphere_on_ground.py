@@ -1,8 +1,8 @@
-"""What contact does to a gradient: a ball thrown along the ground, and certificates before, at and after touching.
+"""Show the effect of contact on a gradient: certificates of a ball before, at and after touchdown.
 
-Free motion and lasting contact have a derivative that differences confirm. Exactly at touchdown there is none, and
-the certificate says so. Through a whole bounce the derivative is that of the discrete, compliant contact, which is
-not the rigid bounce's: see the last table.
+In free motion and lasting contact, finite differences confirm the derivative. Exactly at touchdown it does not exist,
+and the certificate is "discontinuous". Through a bounce, the derivative is that of the discrete, compliant contact. It
+differs from the derivative of a rigid bounce: see the last table.
 
     drake-diff run examples/sphere_on_ground.py         writes artifacts/sphere_on_ground
     python examples/sphere_on_ground.py                 prints the certificates
@@ -27,7 +27,7 @@ def ball(z: float, vx: float = 0.0, vz: float = 0.0) -> np.ndarray:
 
 
 def problem() -> dd.Problem:
-    """Throw the ball from 0.2 m so that it has rolled to x = 1 m after 1 s: find its horizontal velocity."""
+    """Find the horizontal velocity with which a ball from a height of 0.2 m is at x = 1 m after 1 s."""
     model = dd.load_model(MODEL, time_step=0.005)
     free = np.zeros(13, dtype=bool)
     free[VX] = True
@@ -44,7 +44,7 @@ def problem() -> dd.Problem:
 def main() -> None:
     model = dd.load_model(MODEL, time_step=0.005)
     print(model.contract)
-    static = 1.0 * GRAVITY / 1e4  # m g / k of the pair: where the ball rests
+    static = 1.0 * GRAVITY / 1e4  # m g / k of the pair: penetration of the ball at rest
     cases = {
         "in flight": ball(0.3, vx=1, vz=-1),
         "resting": ball(RADIUS - static),

@@ -1,10 +1,10 @@
-"""An arm throws a ball, which lies in its cup, into a target beyond its reach.
+"""Throw a ball from a cup on an arm into a target beyond the arm's reach.
 
-The guess is drawn: the cup goes along a curve to where it lets go, with the speed that the ball needs there, and stops;
-the ball flies on. The first stages make a motion of it with contact at a distance; the last is on the true plant.
+In the guess, the cup moves along a curve to the release point with the velocity that the ball needs there, and stops.
+The ball flies on. The early stages use contact forces at a distance, and the last stage uses the true plant.
 
     drake-diff run examples/throw_into_target.py    writes artifacts/throw_into_target
-    python examples/throw_into_target.py            prints when the ball leaves the cup, and where it comes
+    python examples/throw_into_target.py            prints when the ball leaves the cup, and where it ends
 """
 
 from pathlib import Path
@@ -26,7 +26,7 @@ solve_options: dict[str, Any] = {
 
 
 def guess() -> np.ndarray:
-    """(N+1, 12) the states of a throw as one would draw it."""
+    """Return (N+1, 12) the states of a throw from kinematics alone."""
     t = TIME_STEP * np.arange(SWING + FLY + 1)[:, None]
     swing, fly = SWING * TIME_STEP, FLY * TIME_STEP
     release = START + 0.4 * swing * ((TARGET - START) / fly + [0, GRAVITY * fly / 2])
@@ -56,7 +56,7 @@ def problem() -> dd.Problem:
 
 def main() -> None:
     solution = dd.solve(problem(), **solve_options)
-    motion: Any = solution.replay  # None only of a search without a plan
+    motion: Any = solution.replay  # None only if the search found no plan
     last = max(k for k, contacts in enumerate(motion.contacts) if contacts)
     print(f"{solution.message}\nit leaves the cup at {last * TIME_STEP:.2f} s, ends at {solution.xs[-1][3:5]} m")
 

@@ -1,7 +1,7 @@
-"""Identify a real cube's contact from motion-captured tosses, and predict tosses that were not used.
+"""Identify the contact of a real cube from motion-captured tosses, and predict other tosses.
 
-How it falls says how long the cameras' metre is; how it bounces, its contact and size. `python examples/tossed_cube.py`
-takes 80 seconds, and `drake-diff verify --time-limit 600 artifacts/tossed_cube/impacts` fits again what it wrote.
+The fall determines the cameras' unit of length, and the bounces determine contact and size. The script takes 80 s:
+`python examples/tossed_cube.py`. To repeat the fit: `drake-diff verify --time-limit 600 artifacts/tossed_cube/impacts`.
 """
 
 from pathlib import Path
@@ -14,7 +14,7 @@ from drake_diff.identification.impacts import first_state, flights_of
 
 FOLDER, OUT = Path(__file__).parent / "cube_tosses", Path("artifacts/tossed_cube")
 RATE, STEPS = 148, 2  # [Hz], and steps between samples
-PADS, WIDTH = 0.0474, 0.1048  # [m] from the cube's middle to those of the pads on its faces; the width as published
+PADS, WIDTH = 0.0474, 0.1048  # [m] from the cube's centre to the centres of the pads on its faces; the published width
 NAMES = ["cube.friction", "pads.friction", "cube.stiffness", "cube.radius", "pads.radius"]
 
 
@@ -23,8 +23,8 @@ def recording(name: str, xs: np.ndarray) -> dd.Recording:
 
 
 def in_the_air(model: dd.Model, log: dd.Recording) -> dd.Recording:
-    """The poses before the first contact; velocities were differences of them."""
-    xs = log.xs[: flights_of(model, log.xs)[0][1] + 1].copy()  # each toss begins in the air
+    """Return the poses before the first contact, without the velocities, which are differences of poses."""
+    xs = log.xs[: flights_of(model, log.xs)[0][1] + 1].copy()  # each toss starts in the air
     xs[:, 7:] = np.nan
     return recording(log.name, xs)
 
@@ -34,7 +34,7 @@ def main(fit: int = 8, unseen: int = 8) -> None:
     xs, ends = data["state"].astype(float), np.cumsum(data["length"])[:-1]
     pose = Rotation.from_quat(xs[:, [1, 2, 3, 0]])
     turn = Rotation.from_rotvec(np.outer(np.repeat(data["quarter"], data["length"]), [np.pi / 2, 0, 0]))
-    xs[:, :4], xs[:, 7:10] = (pose * turn).as_quat()[:, [3, 0, 1, 2]], pose.apply(xs[:, 7:10])  # as Drake has them
+    xs[:, :4], xs[:, 7:10] = (pose * turn).as_quat()[:, [3, 0, 1, 2]], pose.apply(xs[:, 7:10])  # in Drake's convention
     logs = [recording(f"toss {n}", part) for n, part in zip(data["number"], np.split(xs, ends), strict=True)]
     model = dd.load_model(FOLDER / "cube.sdf", time_step=1 / RATE / STEPS)
     air = [part for part in (in_the_air(model, log) for log in logs[:-unseen]) if len(part.xs) >= 10]
@@ -48,9 +48,9 @@ def main(fit: int = 8, unseen: int = 8) -> None:
     dd.save(fall, OUT / "fall")
     dd.save(impacts, OUT / "impacts")
     for told, values in (("by hand", {}), ("as identified", dict(impacts.values))):
-        errors = []  # [% of the width] the distance of the centre from where it was measured, on average over a toss
+        errors = []  # [% of the width] mean distance of the centre from the measured one over a toss
         for log in logs[-unseen:]:
-            x0 = first_state(model, log, parameters=values)  # by what is before the first contact
+            x0 = first_state(model, log, parameters=values)  # estimated from the samples before the first contact
             motion = dd.rollout(model, x0, num_steps=STEPS * len(log.us), parameters=values).xs[::STEPS]
             errors.append(100 * metre / WIDTH * np.linalg.norm(motion[:, 4:7] - log.xs[:, 4:7], axis=1).mean())
         print(f"Tosses not used, {told}: {np.mean(errors):.1f} % of the width off on average, {np.round(errors, 1)}")

@@ -1,11 +1,11 @@
-"""The contact table: one ball in seven textbook cases, in every engine, beside the answer of rigid contact.
+"""Compare engines with the solution of rigid contact, for one ball in seven textbook cases.
 
-    python examples/studies/contact_table.py                      Drake's three approximations and what is installed
-    python examples/studies/contact_table.py drake:lagged mujoco  these engines
+    python examples/studies/contact_table.py                      Drake's three approximations and all installed engines
+    python examples/studies/contact_table.py drake:lagged mujoco  only these engines
 
-Rest, stop, slide, hold, roll, bounce, and a bounce with damping. On rails (x and z, or z alone) the ball slides like a
-block. On an incline gravity is turned, not the ground. The answers for "stop" hold for steps of the time step h,
-v' = v + h a and q' = q + h v', so that what differs from them is due to the contact law.
+The cases are rest, stop, slide, hold, roll, bounce, and a bounce with damping. On rails (x and z, or only z) the ball
+slides like a block. For an incline, gravity is rotated instead of the ground. The solution of "stop" is that of time
+steps h, v' = v + h a and q' = q + h v', so that differences from it are due to the contact law.
 """
 
 import sys
@@ -28,13 +28,13 @@ from drake_diff.exceptions import DrakeDiffError, MissingDependencyError
 
 GRAVITY, MASS, RADIUS = 9.81, 1.0, 0.1  # [m/s^2], [kg], [m]
 ENGINES = ("drake", "drake:similar", "drake:lagged", "mujoco", "newton", "sapien", "pybullet")
-IMPEDANCE = 0.9  # of the MJCF that drake_diff writes for MuJoCo
-Force = Callable[[float, float], float]  # [N] by the depth [m] and its rate [m/s], while it is positive
+IMPEDANCE = 0.9  # in the MJCF file that drake_diff writes for MuJoCo
+Force = Callable[[float, float], float]  # [N] as a function of depth [m] and its rate [m/s], while positive
 
 
 @dataclass(frozen=True)
 class Case:
-    """One case; stiffness, dissipation and relaxation time are those of the pair of ball and ground."""
+    """A case; stiffness, dissipation and relaxation time are those of the pair of ball and ground."""
 
     axes: str  # of the rails; "r" is a hinge about y
     time_step: float  # [s]
@@ -49,17 +49,17 @@ class Case:
 
     @property
     def duration(self) -> float:
-        """[s]"""
+        """The duration [s]."""
         return self.num_steps * self.time_step
 
     @property
     def resting_depth(self) -> float:
-        """[m] m g / k: at rest the spring carries the weight."""
+        """The penetration at rest [m], m g / k."""
         return MASS * GRAVITY * cos(self.slope) / self.stiffness
 
     @property
     def x0(self) -> NDArray[np.float64]:
-        """(nx,) the start: as deep as it rests, or `height` above the ground."""
+        """The initial state (nx,): at the resting depth, or `height` above the ground."""
         x = np.zeros(2 * len(self.axes))
         x[self.axes.index("z")] = RADIUS + (self.height or -self.resting_depth)
         if "x" in self.axes:
@@ -67,7 +67,7 @@ class Case:
         return x
 
     def model(self, approximation: str = "sap") -> dd.Model:
-        """The ball on its rails over a half space, in Drake."""
+        """Build Drake's model of the ball on its rails over a half space."""
         builder = DiagramBuilder()
         config = MultibodyPlantConfig(
             time_step=self.time_step,
@@ -85,7 +85,7 @@ class Case:
             joint = RevoluteJoint if axis == "r" else PrismaticJoint
             plant.AddJoint(joint(f"ball_{axis}", parent, body.body_frame(), direction))
             parent = body.body_frame()
-        # Of each side: Drake adds relaxation times, halves equal stiffnesses and averages the rest.
+        # Values of each shape: Drake adds relaxation times, halves equal stiffnesses and averages the others.
         surface, mu = ProximityProperties(), CoulombFriction(self.friction, self.friction)
         AddContactMaterial(
             dissipation=self.dissipation, point_stiffness=2 * self.stiffness, friction=mu, properties=surface
@@ -106,7 +106,7 @@ CASES = {
     "bounce": Case("z", 2e-4, 1000, dissipation=0.0, relaxation_time=0.0, height=0.05),
     "damped bounce": Case("z", 2e-4, 1000, dissipation=0.3, relaxation_time=2e-3, height=0.05),
 }
-QUANTITIES = {  # what is measured, and the derivative
+QUANTITIES = {  # the measured quantity, and its derivative
     "rest": ("depth at rest [m]", "d z_N / d z_0"),
     "stop": ("stopping distance [m]", "d x_N / d v_0 [s]"),
     "slide": ("speed after sliding down [m/s]", "d v_N / d v_0"),
@@ -125,7 +125,7 @@ class Answer(NamedTuple):
 
 
 def rigid_answer(name: str, case: Case) -> Answer:
-    """What rigid contact gives in closed form; for "rest", a rigid weight on the spring."""
+    """Return the solution of rigid contact in closed form; for "rest", that of a rigid weight on the spring."""
     g, mu, v, h = GRAVITY, case.friction, case.speed, case.time_step
     match name:
         case "rest":
@@ -139,7 +139,7 @@ def rigid_answer(name: str, case: Case) -> Answer:
             return Answer(0.0, 0.0)
         case "roll":  # 2/5 m r^2 is a solid ball's inertia
             return Answer(5 / 7 * g * sin(case.slope) * case.duration, 5 / 7)
-    # e from Hunt and Crossley without gravity: d v (1 + e) = log((1 + d v) / (1 - e d v)), by bisection.
+    # e by Hunt and Crossley's law without gravity: d v (1 + e) = log((1 + d v) / (1 - e d v)), by bisection.
     v = sqrt(2 * g * case.height)
     s, low, high = case.dissipation * v, 0.0, min(1.0, 1 / max(case.dissipation * v, 1e-300))
     for _ in range(100 if s else 0):
@@ -151,7 +151,7 @@ def rigid_answer(name: str, case: Case) -> Answer:
 
 
 def bounce_by_law(engine: str, case: Case) -> Answer | None:
-    """The bounce by the engine's contact law, m z'' = -m g + f, integrated with error control."""
+    """Integrate the bounce by the engine's contact law, m z'' = -m g + f, with error control."""
     k, tau, d = case.stiffness, case.relaxation_time, case.dissipation
     s, r = (1 - IMPEDANCE) * k / MASS, (1 - IMPEDANCE) / IMPEDANCE / MASS  # MuJoCo's direct solref: s, 2 sqrt(s)
     laws: dict[str, Force] = {
@@ -170,7 +170,7 @@ def bounce_by_law(engine: str, case: Case) -> Answer | None:
     left.terminal = True  # type: ignore[attr-defined]
 
     def fly(height: float) -> tuple[float, float]:
-        """The height of the rebound, and where the ball is at the end."""
+        """Return the rebound height and the final height of the ball."""
         v = sqrt(2 * GRAVITY * height)
         rest = case.duration - v / GRAVITY
         end = solve_ivp(
@@ -186,13 +186,13 @@ def bounce_by_law(engine: str, case: Case) -> Answer | None:
 
 
 def load(engine: str, case: Case) -> dd.engines.Engine:
-    """The engine of a name, such as mujoco or drake:lagged."""
+    """Load an engine by name, such as mujoco or drake:lagged."""
     name, _, approximation = engine.partition(":")
     return dd.engines.load_engine(name, case.model(approximation or "sap"))
 
 
 def run(engine: dd.engines.Engine, case: Case) -> NDArray[np.float64]:
-    """(N+1, nx) the motion."""
+    """Simulate the case; return the states (N+1, nx)."""
     xs = [case.x0]
     for _ in range(case.num_steps):
         xs.append(engine.step(xs[-1], np.zeros(0)))
@@ -200,7 +200,7 @@ def run(engine: dd.engines.Engine, case: Case) -> NDArray[np.float64]:
 
 
 def value_of(name: str, case: Case, xs: NDArray[np.float64]) -> float:
-    """The measured quantity of a motion."""
+    """Return the measured quantity of a motion."""
     z = case.axes.index("z")
     if name == "rest":
         return RADIUS - float(xs[-1, z])
@@ -211,12 +211,12 @@ def value_of(name: str, case: Case, xs: NDArray[np.float64]) -> float:
     up = np.flatnonzero((xs[:, 0] > RADIUS) & (xs[:, 1] > 0))
     if not len(up):
         return 0.0
-    height, v = xs[up[0]]  # free flight in steps keeps z + v^2 / (2 g) - h v / 2
+    height, v = xs[up[0]]  # free flight in time steps conserves z + v^2 / (2 g) - h v / 2
     return float(height - RADIUS + v**2 / (2 * GRAVITY) - case.time_step * v / 2)
 
 
 def gradient_of(name: str, case: Case, engine: dd.engines.Engine, xs: NDArray[np.float64]) -> float:
-    """The derivative of `QUANTITIES`, as a product of the Jacobians of the steps."""
+    """Return the derivative in `QUANTITIES` as a product of the Jacobians of the steps."""
     v = len(case.axes)
     row, column = {"stop": (0, v), "hold": (0, v), "slide": (v, v), "roll": (v, v)}.get(name, (0, 0))
     tangent = np.eye(len(case.x0))[:, column]
@@ -226,12 +226,12 @@ def gradient_of(name: str, case: Case, engine: dd.engines.Engine, xs: NDArray[np
 
 
 def measure(name: str, engine: str, case: Case | None = None) -> Answer:
-    """Value and gradient of a case in an engine; the gradient is NaN where the engine has none."""
+    """Return value and gradient of a case in an engine; the gradient is NaN if the engine has no derivative."""
     case = case or CASES[name]
     simulator = load(engine, case)
     xs = run(simulator, case)
     value = value_of(name, case, xs)
-    if "bounce" in name:  # from h and h / 2: the error of its height is of first order
+    if "bounce" in name:  # extrapolated from h and h / 2, since the error of the height is of first order
         half = replace(case, time_step=case.time_step / 2, num_steps=2 * case.num_steps)
         value = 2 * value_of(name, half, run(load(engine, half), half)) - value
     try:
@@ -258,7 +258,7 @@ def main() -> None:
 
 
 def is_installed(engine: str) -> bool:
-    """Whether the engine can be loaded."""
+    """Return whether the engine can be loaded."""
     try:
         load(engine, CASES["rest"])
     except MissingDependencyError:

@@ -1,12 +1,12 @@
-"""The gradient panel: derivatives or values, which of the two gives the better gradient of a smoothed loss?
+"""Compare gradients of a smoothed loss that are estimated from derivatives and from values.
 
     python examples/studies/gradient_panel.py            all cases, some minutes
-    python examples/studies/gradient_panel.py wall push  these cases
+    python examples/studies/gradient_panel.py wall push  only these cases
 
-The gradient of F(x) = E[f(x + w)], w normal of deviation sigma, is estimated from derivatives of f (first order), from
-values of f (zeroth order) and from both (blend), after Suh et al., "Do differentiable simulators give better policy
-gradients?", ICML 2022. Each estimate takes 30 samples. The truth is a closed form, or zeroth order with 1000 samples.
-Cost is counted in calls of f and of its derivative.
+The gradient of F(x) = E[f(x + w)], with w normal of standard deviation sigma, is estimated from derivatives of f (first
+order), from values (zeroth order), and from both (blend), after Suh et al., "Do differentiable simulators give better
+policy gradients?", ICML 2022. Each estimate takes 30 samples. The reference is a closed form, or zeroth order with 1000
+samples. Cost is counted in calls of f and of its derivative.
 """
 
 import sys
@@ -29,42 +29,42 @@ from drake_diff.motion import Gaussian, smooth
 
 Array = NDArray[np.float64]
 GRAVITY, MASS, RADIUS, ROD = 9.81, 1.0, 0.1, 0.5
-SAMPLES, SEEDS, BUDGET, BATCH = 30, 10, 300, 10  # the last two in calls of a descent and samples of its step
+SAMPLES, SEEDS, BUDGET, BATCH = 30, 10, 300, 10  # BUDGET: calls in a descent; BATCH: samples of each step
 TRUTH_SAMPLES, TRUTH_SEED = 1000, 2**32 - 1
 ORDERS = ("first", "zeroth", "blend")
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A loss and its derivative; a descent by x - rate * gradient has arrived where F is at most `goal`."""
+    """A loss and its derivative; a descent by x - rate * gradient succeeds if F is at most `goal`."""
 
     about: str
     f: Callable[[Array], float]
     derivative: Callable[[Array], Array]
     start: Array
-    sigmas: tuple[float, ...]  # the descent takes the last
+    sigmas: tuple[float, ...]  # the descent uses the last
     rate: float
     goal: float
     closed_form: Callable[[Array, float], tuple[float, Array]] | None = None  # (x, sigma) -> F, dF/dx
 
 
 class Quality(NamedTuple):
-    """The estimates of one order against the truth; the cosine is their mean."""
+    """The quality of the estimates of one order, compared with the reference; `cosine` is a mean."""
 
     variance: float  # of one estimate, summed over the entries
     bias: Array
     bias_error: Array
     cosine: float
-    mean_squared_error: float  # at equal cost; with the bias where an entry is off by 3 of its errors
+    mean_squared_error: float  # at equal cost; includes the bias only if `biased`
 
     @property
     def biased(self) -> bool:
-        """Whether an entry is off by more than 3 standard errors."""
+        """Whether the bias of an entry exceeds 3 standard errors."""
         return bool(np.any(np.abs(self.bias) > 3 * self.bias_error))
 
 
 def truth_of(case: Case, x: Array, sigma: float, samples: int = TRUTH_SAMPLES) -> tuple[float, Array, Array]:
-    """F, its gradient and the standard errors of that."""
+    """Return F, its gradient, and the standard errors of the gradient."""
     if case.closed_form:
         value, gradient = case.closed_form(x, sigma)
         return value, gradient, np.zeros(len(x))
@@ -73,7 +73,7 @@ def truth_of(case: Case, x: Array, sigma: float, samples: int = TRUTH_SAMPLES) -
 
 
 def estimate(case: Case, order: str, x: Array, sigma: float, samples: int, seed: int) -> tuple[Array, Array, int]:
-    """The gradient (n,), its variance (n,), and the calls that it took."""
+    """Return the gradient (n,), its variance (n,), and the number of calls."""
     derivative = None if order == "zeroth" else case.derivative
     found = smooth(case.f, x, derivative, noise=Gaussian(sigma), samples=samples, seed=seed, method=order)
     calls = {"first": samples, "zeroth": samples + 1, "blend": 2 * samples + 2}[order]
@@ -81,7 +81,7 @@ def estimate(case: Case, order: str, x: Array, sigma: float, samples: int, seed:
 
 
 def quality(case: Case, order: str, sigma: float, samples: int = SAMPLES, seeds: int = SEEDS) -> Quality:
-    """What estimates at the start are worth."""
+    """Measure the quality of the estimates at the initial point."""
     _, truth, error = truth_of(case, case.start, sigma)
     rows = [estimate(case, order, case.start, sigma, samples, seed) for seed in range(seeds)]
     gradients, variance = np.array([row[0] for row in rows]), np.mean([row[1] for row in rows], axis=0)
@@ -96,7 +96,7 @@ def quality(case: Case, order: str, sigma: float, samples: int = SAMPLES, seeds:
 
 
 def descend(case: Case, order: str, seed: int, *, budget: int = BUDGET, batch: int = BATCH) -> bool:
-    """Whether gradient descent arrives within its budget of calls."""
+    """Return whether gradient descent reaches the goal within its budget of calls."""
     x, sigma, spent, step = case.start, case.sigmas[-1], 0, 0
     try:
         while True:
@@ -106,12 +106,12 @@ def descend(case: Case, order: str, seed: int, *, budget: int = BUDGET, batch: i
             if spent > budget:
                 return truth_of(case, x, sigma, TRUTH_SAMPLES // 10)[0] <= case.goal
             x = x - case.rate * gradient
-    except DrakeDiffError:  # it left the numbers, or what Drake can simulate
+    except DrakeDiffError:  # x diverged, or Drake cannot simulate it
         return False
 
 
 def plant(time_step: float) -> tuple[DiagramBuilder, Any]:
-    """A builder with an empty plant."""
+    """Return a builder and its empty plant."""
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(
         time_step=time_step, discrete_contact_approximation="sap", use_sampled_output_ports=False
@@ -120,7 +120,7 @@ def plant(time_step: float) -> tuple[DiagramBuilder, Any]:
 
 
 def ball(time_step: float, axes: str, stiffness: float = 0.0, friction: float = 0.0, motor: bool = False) -> dd.Model:
-    """A ball on rails along `axes`, with a motor on the first, over a ground where there is a stiffness [N/m]."""
+    """Build a ball on rails along `axes`; `motor` drives the first axis, and a `stiffness` [N/m] adds a ground."""
     builder, tree = plant(time_step)
     parent = tree.world_frame()
     for axis in axes:
@@ -149,7 +149,7 @@ def rollout_case(
     x0: Array | None = None,
     **fields: Any,
 ) -> Case:
-    """The loss of the last state, from x0 + states z under the inputs z: (nx, n) and (N, n)."""
+    """Return the case of a loss of the last state, from x0 + states z, (nx, n), under inputs z, (N, n)."""
     start = np.zeros(model.nx) if x0 is None else x0
     moved = np.zeros((model.nx, inputs.shape[1])) if states is None else states
 
@@ -167,7 +167,7 @@ def rollout_case(
 
 
 def double_integrator() -> Case:
-    """Two forces [N], each for half of a second, bring a mass to x = 1 m."""
+    """Return the case of two forces [N], each for half a second, that move a mass to x = 1 m."""
     return rollout_case(
         ball(0.1, "x", motor=True),
         lambda x: (x[0] - 1) ** 2 + 0.1 * x[1] ** 2,
@@ -181,11 +181,11 @@ def double_integrator() -> Case:
 
 
 def wall(sigmas: tuple[float, ...] = (0.05, 0.1, 0.2), start: float = 0.6) -> Case:
-    """The angle [rad] of a throw at 1 m/s, as far as it goes; a wall stops what flies below its top: f jumps there."""
+    """Return the case of the angle [rad] of the farthest throw at 1 m/s; f jumps where the ball just clears a wall."""
     distance, height = 0.06, 0.02
     a = GRAVITY * distance**2 / 2
     root, kink = np.sqrt(distance**2 - 4 * a * (a + height)), np.arcsin(GRAVITY * distance) / 2
-    # Angles [rad], of a period of pi, at which the ball just clears the wall, and at which it just reaches it.
+    # Angles [rad] with period pi: at the first two the ball just clears the wall, at the others it just reaches it.
     edges = np.array([*np.arctan((distance + root * np.array([-1, 1])) / (2 * a)), kink, np.pi / 2 - kink])
 
     def land(theta: Array) -> tuple[Array, Array]:
@@ -196,7 +196,7 @@ def wall(sigmas: tuple[float, ...] = (0.05, 0.1, 0.2), start: float = 0.6) -> Ca
         return np.where(stopped, -(distance**2), -(reach**2)), np.where(stopped, 0.0, slope)
 
     def closed_form(x: Array, sigma: float) -> tuple[float, Array]:
-        """Gauss-Legendre between the edges, to 10 sigma; dF/dx = E[f(x + w) w] / sigma^2."""
+        """Integrate by Gauss-Legendre between the edges up to 10 sigma, with dF/dx = E[f(x + w) w] / sigma^2."""
         low, high = x[0] - 10 * sigma, x[0] + 10 * sigma
         inner = np.ravel(edges + np.pi * np.arange(np.floor(low / np.pi) - 1, np.ceil(high / np.pi) + 1)[:, None])
         breaks = np.unique([*np.linspace(low, high, 41), *inner[(inner > low) & (inner < high)]])
@@ -222,7 +222,7 @@ def wall(sigmas: tuple[float, ...] = (0.05, 0.1, 0.2), start: float = 0.6) -> Ca
 
 
 def bounce(stiffness: float) -> Case:
-    """The height [m] to drop a ball from, so that after 0.2 s it is 0.15 m high."""
+    """Return the case of the initial height [m] of a dropped ball that is 0.15 m high after 0.2 s."""
     return rollout_case(
         ball(0.01, "z", stiffness),
         lambda x: 100 * (x[0] - 0.15) ** 2,
@@ -237,7 +237,7 @@ def bounce(stiffness: float) -> Case:
 
 
 def push() -> Case:
-    """A force [N] that slides a ball by 0.3 m: friction holds it up to 4.9 N, the start is 2 N."""
+    """Return the case of a force [N], initially 2 N, that slides a ball by 0.3 m; it sticks up to 4.9 N."""
     return rollout_case(
         ball(0.02, "xz", 1e4, friction=0.5, motor=True),
         lambda x: 10 * (x[0] - 0.3) ** 2,
@@ -252,7 +252,7 @@ def push() -> Case:
 
 
 def double_pendulum(num_steps: int, rate: float = 0.05, goal: float = 0.4) -> Case:
-    """The angles [rad] to let a double pendulum go from, so that its tip is far to one side at the end."""
+    """Return the case of the initial angles [rad] of a double pendulum that moves its tip far to one side."""
     builder, tree = plant(0.02)
     end, frame = np.array([0, 0, -ROD]), tree.world_frame()
     for name in ("upper", "lower"):
