@@ -1,10 +1,10 @@
 """Build the gallery: run each example, verify its run, take a picture of the motion, and write the page.
 
-    python docs/gallery.py              all of them: half an hour
-    python docs/gallery.py NAME ...     these; the others stay as they are
+    python docs/gallery.py              all examples, in half an hour
+    python docs/gallery.py NAME ...     only these examples
 
-It needs Chromium and selenium, of the extra `test`. Pages and pictures go to docs/gallery. The runs go to
-docs/gallery/runs, which git leaves out: a site that is built here has their reports.
+The script needs Chromium, and selenium from the extra `test`. It writes the page and pictures to docs/gallery, and the
+runs to docs/gallery/runs, which git ignores. A site that is built in the same checkout includes their reports.
 """
 
 import base64
@@ -18,59 +18,59 @@ import drake_diff as dd
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs/gallery"
-LONGEST = 3600.0  # [s] that making a run again may take
-SIZE, QUALITY = (640, 400), 0.85  # of a picture [pixels], and of its JPEG
+LONGEST = 3600.0  # [s] time limit to verify a run
+SIZE, QUALITY = (640, 400), 0.85  # size of a picture [pixels] and quality of its JPEG
 
 
 class Entry(NamedTuple):
-    """An example: its script's name, what to call it, what is seen, and at which part of the motion its picture is."""
+    """An example: name of its script, title, description, and time of its picture as a fraction of the motion."""
 
     name: str
     title: str
     text: str
     part: float
-    writes: tuple[str, str] = ("", "")  # the run and the page, below artifacts/, of a script that writes them itself
-    verdict: str = "pass"  # what the run's record says: real data may leave a model "fail", which is no less true
+    writes: tuple[str, str] = ("", "")  # run and page below artifacts/, if the script writes them itself
+    verdict: str = "pass"  # verdict in the run's record; "fail" can be the right verdict for a model of real data
 
     @property
     def run(self) -> str:
-        """The run's directory, below the gallery's."""
+        """The run's directory, relative to the gallery's directory."""
         return f"runs/artifacts/{self.writes[0] or self.name}"
 
     @property
     def report(self) -> str:
-        """The page that the picture opens, below the gallery's directory."""
+        """The page that the picture links to, relative to the gallery's directory."""
         return f"runs/artifacts/{self.writes[1] or f'{self.name}/report.html'}"
 
 
 ENTRIES = (
-    Entry("cart_pole_swing_up", "Cart-pole", "A cart swings its pole up and stops 1 m further, in 2 s.", 0.75),
-    Entry("acrobot_swing_up", "Acrobot", "Two links, and a motor at the elbow only: from hanging to standing.", 0.8),
-    Entry("crane_without_sway", "Crane", "A load goes 2 m in 3 s; its rope may sway by 0.14 rad at most.", 0.35),
-    Entry("panda_around_a_ball", "Panda arm", "Its hand reaches a place; no link comes near the ball.", 0.5),
-    Entry("quadrotor_gates", "Quadrotor", "Three gates in 3 s, with propellers that the model file lacks.", 0.5),
-    Entry("bounce_into_target", "Bounce", "A ball bounces once and flies through its target.", 0.85),
+    Entry("cart_pole_swing_up", "Cart-pole", "A cart swings up its pole and stops 1 m further after 2 s.", 0.75),
+    Entry("acrobot_swing_up", "Acrobot", "Two links with one actuator, at the elbow, swing up.", 0.8),
+    Entry("crane_without_sway", "Crane", "A load moves 2 m in 3 s. Its rope sways by at most 0.14 rad.", 0.35),
+    Entry("panda_around_a_ball", "Panda arm", "The hand reaches a position. All links avoid the ball by 3 cm.", 0.5),
+    Entry("quadrotor_gates", "Quadrotor", "It flies through three gates, with propellers added to the file.", 0.5),
+    Entry("bounce_into_target", "Bounce", "A ball bounces once and then flies through its target.", 0.85),
     Entry(
         "push_without_touching",
         "Push",
-        "A ball is pushed to where it should be, from a guess that never touches it.",
+        "A pusher moves a ball to a goal. The initial guess does not touch it.",
         0.8,
     ),
-    Entry("hop_from_standing", "Hopper", "It hops half a metre and lands, from a guess that stays on the ground.", 0.6),
-    Entry("quadruped_jump", "Quadruped", "It jumps forward, from a schedule of which foot stands when.", 0.5),
+    Entry("hop_from_standing", "Hopper", "It hops 0.5 m and lands. The initial guess stays on the ground.", 0.6),
+    Entry("quadruped_jump", "Quadruped", "It jumps forward, with a schedule of its contacts.", 0.5),
     Entry(
         "tossed_cube",
         "Tossed cube",
-        "A real cube's friction, size and stiffness from its tosses. Its record says what they leave unexplained.",
+        "Friction, size and stiffness of a real cube are identified from tosses. The record lists unexplained errors.",
         0.0,
         ("tossed_cube/impacts", "tossed_cube/impacts/report.html"),
         "fail",
     ),
-    Entry("jumping_leg", "Co-design", "The lengths of a leg, its spring and its torques, for a high jump.", 0.55),
+    Entry("jumping_leg", "Co-design", "Lengths, spring and torques of a leg are optimized for a high jump.", 0.55),
     Entry(
         "pushed_cart_pole",
         "MPC under pushes",
-        "Model predictive control, pushed harder and harder. The report has its trials; `verify` made its plan again.",
+        "Model predictive control under increasing pushes. The report shows the trials. `verify` reproduced the plan.",
         0.6,
         ("pushed_cart_pole", "pushed_cart_pole_trials/robustness.html"),
     ),
@@ -78,7 +78,7 @@ ENTRIES = (
 
 
 def build(entry: Entry, folder: Path) -> None:
-    """Run an example, verify what it wrote, and take its picture. RuntimeError where that does not succeed."""
+    """Run an example, verify its run and take its picture, or raise RuntimeError if a step fails."""
     runs, run = folder / "runs", folder / entry.run
     runs.mkdir(parents=True, exist_ok=True)
     script = ROOT / "examples" / f"{entry.name}.py"
@@ -98,7 +98,7 @@ def build(entry: Entry, folder: Path) -> None:
 
 
 def picture(report: Path, part: float) -> bytes:
-    """A JPEG of the 3D view of a report at a part of its motion; of its first plots where it has no view."""
+    """Return a JPEG of a report's 3D view at a fraction of its motion, or of its first plots if it has no view."""
     from selenium import webdriver
     from selenium.webdriver.chrome.service import Service
     from selenium.webdriver.support.ui import WebDriverWait
@@ -111,8 +111,8 @@ def picture(report: Path, part: float) -> bytes:
         ready = "return document.documentElement.dataset.ready === 'yes'"
         WebDriverWait(browser, 60).until(lambda b: b.execute_script(ready))
         if browser.execute_script("return !document.getElementById('view')"):
-            browser.set_window_size(1100, 4000)  # so that nothing is scrolled
-            browser.execute_async_script("setTimeout(arguments[0], 1000)")  # until the plots are laid out
+            browser.set_window_size(1100, 4000)  # so that the page needs no scrolling
+            browser.execute_async_script("setTimeout(arguments[0], 1000)")  # wait for the layout of the plots
             place = "const r = document.querySelector('.plots').getBoundingClientRect(); return [r.x, r.y, r.width]"
             x, y, width = browser.execute_script(place)
             scale = SIZE[0] / width
@@ -127,7 +127,7 @@ def picture(report: Path, part: float) -> bytes:
             "slider.value = part * slider.max; slider.dispatchEvent(new Event('input'));"
         )
         browser.execute_script(show, *SIZE, part)
-        browser.execute_async_script("setTimeout(arguments[0], 1000)")  # two frames and more, on a slow machine
+        browser.execute_async_script("setTimeout(arguments[0], 1000)")  # at least two frames on a slow machine
         draw = (
             "const viewer = document.getElementById('view').contentWindow.viewer; viewer.render();"
             "return viewer.renderer.domElement.toDataURL('image/jpeg', arguments[0])"
@@ -136,7 +136,7 @@ def picture(report: Path, part: float) -> bytes:
 
 
 def page() -> str:
-    """The gallery's Markdown."""
+    """Return the gallery's page in Markdown."""
     cards = [
         f"-   ![{e.title}]({e.name}.jpg)<!-- {e.report} -->\n\n"
         f"    **{e.title}.** {e.text}\n\n    `examples/{e.name}.py`\n"
@@ -147,16 +147,16 @@ def page() -> str:
 
 INTRO = """# Gallery
 
-Each picture shows a run of a short script. `drake-diff verify` reproduced every run. If this site was built with the
-runs, a picture opens the report.
+Each picture shows a run of a script. `drake-diff verify` reproduced every run. If this site was built with the runs,
+click a picture to open its report.
 
 ```sh
 drake-diff run examples/cart_pole_swing_up.py
 python docs/gallery.py
 ```
 
-The first command makes one run, with its report in `artifacts/cart_pole_swing_up/`. The second makes all of them,
-and this page. Build the site after it.
+The first command writes one run, with its report in `artifacts/cart_pole_swing_up/`. The second writes all runs and
+this page. Then build the site.
 
 <div class="grid cards" markdown>
 
@@ -164,7 +164,7 @@ and this page. Build the site after it.
 
 
 def main(names: list[str]) -> None:
-    """Build the entries of these names, or all, and the page."""
+    """Build the entries with these names, or all entries, and write the page."""
     if unknown := set(names) - {entry.name for entry in ENTRIES}:
         raise SystemExit(f"no such entry: {', '.join(sorted(unknown))}")
     for entry in ENTRIES:

@@ -27,6 +27,7 @@ from drake_diff._base.values import Refusal
 from drake_diff.mechanics.description import Link, RigidLink, read_links, springs_of
 from drake_diff.mechanics.tree import TreeModel, tree_for, tree_of
 from drake_diff.model.equations import EquationsOfMotion
+from drake_diff.model.inputs import BodyForce
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterCoordinates, ParameterVector, applied
 from drake_diff.model.plant import actuators, labelled
@@ -70,10 +71,9 @@ def symbolic_plant(
 def _compared(
     model: Model, vector: ParameterVector | None, coordinates: ParameterCoordinates | None
 ) -> PlantFunctions | Refusal:
-    tree = tree_for(model)
-    if tree is None:
-        read = tree_of(model)
-        return read if isinstance(read, Refusal) else Refusal("its tree differs from Drake's inverse dynamics")
+    tree = tree_for(model) or tree_of(model, free=True, body_forces=True)
+    if isinstance(tree, Refusal):
+        return tree
     equations, random = EquationsOfMotion(model), np.random.default_rng(1)
     here = model.double.state()
     tail = np.zeros(0) if coordinates is None else coordinates.from_values(coordinates.start.values)
@@ -111,53 +111,55 @@ def _values(coordinates: ParameterCoordinates, c: Any) -> Any:
 
 
 def _functions(plant: "SymbolicTree", model: Model, c: Any, actuation: Any) -> PlantFunctions:
-    n, width, more = model.nv, model.nx + model.nu, c.numel()
-    xu, weights, mu, a = (ca.SX.sym(s, k) for s, k in (("knot", width), ("w", 2 * n), ("mu", n), ("a", n)))
+    nq, n, nx, nu, width, more = model.nq, model.nv, model.nx, model.nu, model.nx + model.nu, c.numel()
+    xu, weights, mu, a = (ca.SX.sym(s, k) for s, k in (("knot", width), ("w", nx), ("mu", n), ("a", n)))
     knot = ca.vertcat(xu, c)
-    q, v, u = xu[:n], xu[n : 2 * n], xu[2 * n :]
+    q, v, u = xu[:nq], xu[nq:nx], xu[nx:]
     pace = Pace()
     moving = plant.at(q, v)
-    mass, residual = moving.mass(), moving.residual
+    rates = v if nq == n else moving.position_rates
+    driven = actuation @ u
+    for force, value in zip(model.body_forces, u.elements()[nu - len(model.body_forces) :], strict=True):
+        driven += moving.body_force(force) * value
+    mass, r = moving.mass(), moving.residual(a) - driven
     pace.go_on()
     factors = ca.ldl(mass)
-    solved = ca.ldl_solve(actuation @ u - residual(ca.SX.zeros(n)), *factors)
+    solved = ca.ldl_solve(driven - moving.residual(ca.SX.zeros(n)), *factors)
     pace.go_on()
-    r, rows = residual(a), []
+    rows = []
     for i in range(n):
         check_time()
         rows.append(ca.gradient(r[i], knot).T)  # reverse mode: a fifth shorter than with CasADi's default choice
     pace.go_on()
     slopes = ca.Function("slopes", [knot, a], [ca.vertcat(*rows)])
     pace.go_on()
-    slope = ca.gradient(ca.dot(mu, r), ca.vertcat(q, v, a, c))  # mu' r is linear in a; its factor depends on q and c
-    by_v = ca.jacobian(slope[n : 2 * n], v)
+    slope = ca.gradient(ca.dot(mu, r), ca.vertcat(xu, a, c))  # mu' r is linear in a and u; the factors have q and c
+    by_v = ca.jacobian(slope[nq:nx], v)
     pace.go_on()
     curves = ca.Function("curves", [knot, a, mu], [ca.jacobian(slope, q), by_v, ca.jacobian(slope, c)])
     pace.go_on()
-    driven = ca.horzcat(ca.SX(n, 2 * n), actuation, ca.SX(n, more))
-    by_knot = -ca.ldl_solve(slopes(knot, solved) - driven, *factors)
+    by_knot = -ca.ldl_solve(slopes(knot, solved), *factors)
     pace.go_on()
-    identity = ca.horzcat(ca.SX(n, n), ca.SX.eye(n), ca.SX(n, model.nu + more))
-    jacobian = ca.Function("jacobian", [knot], [ca.vertcat(identity, by_knot)])
+    jacobian = ca.Function("jacobian", [knot], [ca.vertcat(ca.jacobian(rates, knot), by_knot)])
     pace.go_on()
     rows = ca.SX.sym("rows", jacobian.sparsity_out(0))
-    by_q, by_v, by_c = curves(knot, solved, ca.ldl_solve(weights[n:], *factors))
-    qv, aq = by_q[n : 2 * n, :].T, by_q[2 * n : 3 * n, :]
-    qc, vc, ac, cc = by_c[:n, :], by_c[n : 2 * n, :], by_c[2 * n : 3 * n, :], by_c[3 * n :, :]
-    S = ca.vertcat(aq.T @ rows[n:, :], ca.SX(n + model.nu, width + more), ac.T @ rows[n:, :])
-    qu, uc = ca.SX(n, model.nu), ca.SX(model.nu, more)
+    by_q, by_v, by_c = curves(knot, solved, ca.ldl_solve(weights[nq:], *factors))
+    ends = [nq, nx, width, width + n]
+    (_, vq, uq, aq, _), (qc, vc, uc, ac, cc) = (ca.vertsplit(by, [0, *ends, width + n + more]) for by in (by_q, by_c))
+    turns = ca.jacobian(ca.gradient(ca.dot(weights[:nq], rates), v), q)  # 0 unless quaternions turn
+    S = ca.vertcat(aq.T @ rows[nq:, :], ca.SX(n + nu, width + more), ac.T @ rows[nq:, :])
     H = ca.blockcat(
         [
-            [by_q[:n, :], qv, qu, qc],
-            [qv.T, by_v, qu, vc],
-            [qu.T, qu.T, ca.SX(model.nu, model.nu), uc],
+            [by_q[:nq, :], (vq - turns).T, uq.T, qc],
+            [vq - turns, by_v, ca.SX(n, nu), vc],
+            [uq, ca.SX(nu, n), ca.SX(nu, nu), uc],
             [qc.T, vc.T, uc.T, cc],
         ]
     )
     pace.go_on()
     hessian = -(H + S + S.T)
     return PlantFunctions(
-        ca.Function("plant", [knot], [ca.vertcat(v, solved)]),
+        ca.Function("plant", [knot], [ca.vertcat(rates, solved)]),
         jacobian,
         ca.Function("hessian", [knot, weights, rows], [ca.triu(hessian)]),
     )
@@ -375,6 +377,15 @@ class MovingTree:
             rates[link.q : link.q + 4] = ca.vertcat(-ca.dot(x[1:], w), x[0] * w - ca.cross(x[1:], w)) / 2
             rates[link.q + 4 : link.q + 7] = self.v[link.v + 3 : link.v + 6]
         return rates
+
+    def body_force(self, force: BodyForce) -> Any:
+        """Return the generalized force (nv,) of a BodyForce of 1 N, in a tree without coupling."""
+        R, p, dofs = self.body(force.body)
+        axis = R @ (ca.DM(list(force.direction)) / np.linalg.norm(force.direction))
+        wrench = ca.vertcat(force.moment_ratio * axis + ca.cross(p + R @ ca.DM(list(force.point)), axis), axis)
+        column = ca.SX(self.nv, 1)
+        column[dofs] = self.S[:, dofs].T @ wrench
+        return column
 
     def residual(self, a: Any) -> Any:
         """Return r (nv,) at the acceleration a (nv,)."""

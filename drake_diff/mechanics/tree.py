@@ -246,12 +246,12 @@ class ForwardDynamics:
         return by_qq, by_vq, by_aq, by_aq + by_aq.swapaxes(1, 2) - twice
 
 
-def _links_of(model: Model, free: bool) -> list[Any] | Refusal:
+def _links_of(model: Model, free: bool, body_forces: bool) -> list[Any] | Refusal:
     """Return all links of the model, or a Refusal that names the unsupported element."""
     plant = model.plant
     if model.forces:
         return Refusal("forces are added to Drake's")
-    if model.systems_act:
+    if model.systems_act and not (body_forces and model.body_forces and model.coupling is None):
         return Refusal(model.systems_act)
     kinds = ("revolute", "prismatic", "quaternion_floating") if free else ("revolute", "prismatic")
     for joint in sorted((j for j in joints(plant) if j.num_velocities()), key=lambda j: j.velocity_start()):
@@ -261,12 +261,12 @@ def _links_of(model: Model, free: bool) -> list[Any] | Refusal:
     return springs if isinstance(springs, Refusal) else read_links(plant, springs)
 
 
-def tree_of(model: Model, *, free: bool = False) -> TreeModel | Refusal:
+def tree_of(model: Model, *, free: bool = False, body_forces: bool = False) -> TreeModel | Refusal:
     """Read the tree of a model without comparing it with Drake, or return a Refusal that names the unsupported element.
 
-    The tree may have hinges and slides, and with `free` also free bodies.
+    The tree may have hinges and slides, and with `free` also free bodies. `body_forces` are no part of the tree.
     """
-    every = _links_of(model, free)
+    every = _links_of(model, free, body_forces)
     if isinstance(every, Refusal):
         return every
     plant, n = model.plant, model.plant.num_velocities()

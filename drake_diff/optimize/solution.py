@@ -118,7 +118,7 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         multipliers: multipliers of the bounds and rows in collocation or iLQR, which warm-start a search from here.
         optima: with `restarts`, the verified solutions that differ in cost or motion, the cheapest first.
         search: the arguments of `solve`, or None if the solution was not made by `solve`.
-        cross_checks: replays in other plants, if `artifact.cross_check` returned this solution.
+        cross_checks: replays in other plants, if `drake_diff.runs.cross_check` returned this solution.
         notes: sentences about the search: the solver's message, results of other guesses, suggestions.
 
     Example:

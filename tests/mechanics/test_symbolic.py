@@ -12,13 +12,14 @@ from helpers.plants import floating, random_tree
 from helpers.table import each_row
 from helpers.transcription import move, own_derivatives, solved
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
-from pydrake.multibody.tree import QuaternionFloatingJoint
+from pydrake.multibody.tree import QuaternionFloatingJoint, RpyFloatingJoint
 
 import drake_diff as dd
 from drake_diff._base.values import Refusal
 from drake_diff.mechanics import casadi_tree as symbolic_tree
 from drake_diff.mechanics.casadi_tree import PlantFunctions, symbolic_plant
 from drake_diff.model.equations import EquationsOfMotion
+from drake_diff.model.inputs import BodyForce
 from drake_diff.optimize.problem.dynamics import Dynamics, plant_dynamics
 from drake_diff.optimize.program import Limits, Outcome
 from drake_diff.optimize.transcription.collocation import Transcription
@@ -95,6 +96,15 @@ def test_an_expression_with_other_values_is_refused():
 def model_named(name):
     if name.startswith("tree"):
         return random_tree(int(name[-1]))
+    if name.startswith("floating"):
+        return floating(QuaternionFloatingJoint, int(name[-1]))
+    if name.startswith("jets"):  # two forces on one body, which no actuator moves, and an actuator
+        forces = [BodyForce("jet", "upper", (0.1, -0.2, 0.3), (1, 2, -2), moment_ratio=0.7)]
+        forces += [BodyForce("fan", "lower", (0, 0.1, 0), (0, 0, -3), moment_ratio=-0.2, lower=-1.0)]
+        return dd.load_model(MODELS / "double_pendulum.urdf", time_step=0.01, body_forces=forces)
+    if name == "quadrotor.urdf":
+        rotors = [BodyForce(f"rotor_{i}", "body", p, moment_ratio=0.02 * (-1) ** i) for i, p in enumerate(np.eye(3))]
+        return dd.load_model(MODELS / name, time_step=0.01, body_forces=rotors)
     if name.endswith("robot.urdf"):
         return dd.load_model(robot_file(name), time_step=0.01)
     return dd.load_model(MODELS / name, time_step=0.01)
@@ -103,7 +113,10 @@ def model_named(name):
 PLANTS = ["pendulum.urdf", "cart_pole.urdf", "acrobot.xml", "double_pendulum.urdf", "mass_spring_damper.sdf"]
 
 
-@each_row("name", [*PLANTS, "ur5_robot.urdf", "tree0", "tree1", "tree2"])
+OTHERS = ["ur5_robot.urdf", "tree0", "tree1", "tree2", "floating0", "floating1", "jets", "quadrotor.urdf"]
+
+
+@each_row("name", [*PLANTS, *OTHERS])
 def test_a_plants_expression_and_its_derivative_are_drakes(name):
     """The tolerance is 1e-9 of the largest entry, as the trees' mass matrices have condition numbers up to 1e5."""
     model, random = model_named(name), np.random.default_rng(5)
@@ -154,10 +167,16 @@ def test_a_plants_expression_that_leaves_something_out_is_refused(monkeypatch, l
     assert symbolic_plant(model) == Refusal("its symbolic form differs from Drake's plant")
 
 
-def test_a_model_that_is_no_tree_of_hinges_and_slides_has_none():
-    why = symbolic_plant(floating(QuaternionFloatingJoint, 0))
+def test_a_body_force_that_is_one_percent_off_is_refused(monkeypatch):
+    right = symbolic_tree.MovingTree.body_force
+    monkeypatch.setattr(symbolic_tree.MovingTree, "body_force", lambda self, force: 0.99 * right(self, force))
+    assert symbolic_plant(model_named("jets")) == Refusal("its symbolic form differs from Drake's plant")
+
+
+def test_a_model_with_other_joints_has_none():
+    why = symbolic_plant(floating(RpyFloatingJoint, 0))
     assert isinstance(why, Refusal)
-    assert "quaternion_floating" in why.reason
+    assert "rpy_floating" in why.reason
 
 
 # ------------------------------------------------------------------------------ solves without expressions
@@ -207,13 +226,14 @@ def test_both_routes_find_the_same_swing_up(scheme):
     assert a.transcribed.nodes == pytest.approx(b.transcribed.nodes, abs=1e-4)
 
 
-def test_a_floating_body_goes_the_other_way():
-    """The cheapest motion has no input. The body has a quaternion, for which there is no expression."""
-    model = floating(QuaternionFloatingJoint, 0)
+@each_row("joint, derivatives", [(QuaternionFloatingJoint, EXACT), (RpyFloatingJoint, "rpy_floating")])
+def test_a_floating_body_has_an_exact_hessian_with_a_quaternion_only(joint, derivatives):
+    """The cheapest motion has no input."""
+    model = floating(joint, 0)
     dynamics = plant_dynamics(model)
     x = model.default_state
     motion = solved(dynamics, x0=x, num_steps=3, horizon=0.1, running_cost=dd.QuadraticCost(R=np.eye(model.nu)))
-    assert "quaternion_floating" in motion.options["derivatives"]
+    assert derivatives in motion.options["derivatives"]
     assert motion.cost == pytest.approx(0, abs=1e-8)
 
 

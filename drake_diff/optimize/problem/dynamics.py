@@ -400,7 +400,7 @@ class PlantKnots:
     def __init__(self, model: Model, vector: ParameterVector):
         self.equations, self.model, self.vector = EquationsOfMotion(model), model, vector
         self.tree = None if vector.parameters else tree_for(model)
-        self.may_jump = self.equations.systems
+        self.may_jump = self.equations.systems and not model.body_forces
         self.width = model.nx + model.nu
 
     def values(self, knots: Array) -> Array:
