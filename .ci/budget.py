@@ -3,7 +3,7 @@
     python .ci/budget.py [--root DIRECTORY]
 
 Prints a table with each count, its limit and its target, and exits with status 1 if a count is above its limit. A limit
-is what the tree has reached, a target is what the architecture asks for. Lower a limit when a count falls.
+is the count that the tree has reached, a target is required by the architecture. Lower a limit when its count falls.
 """
 
 import argparse
@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-# Names that say nothing about a value or an action. Counted where a function binds them: locals, arguments, functions.
+# Names that do not describe a value or an action. They are counted where they name a local, an argument or a function.
 VAGUE_NAMES = frozenset(["found", "told", "one", "each", "own", "said", "at", "of", "part", "place", "kept"])
 
 
@@ -32,7 +32,7 @@ def count_words(paths: list[Path]) -> int:
 
 
 def count_vague_names(tree: ast.AST) -> int:
-    """Bindings of a name in `VAGUE_NAMES`: assigned locals, arguments and functions."""
+    """Count the bindings of names in `VAGUE_NAMES`: assigned locals, arguments and functions."""
     names: list[str] = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
@@ -45,7 +45,7 @@ def count_vague_names(tree: ast.AST) -> int:
 
 
 def count_constants(tree: ast.Module) -> int:
-    """Assignments of a number, or of a tuple with a number, at the level of the module."""
+    """Count the assignments of a number, or of a tuple with a number, at module level."""
     values = [node.value for node in tree.body if isinstance(node, ast.Assign | ast.AnnAssign) and node.value]
     return sum(any(_is_number(item) for item in _items(value)) for value in values)
 
@@ -61,7 +61,7 @@ def _is_number(value: ast.expr) -> bool:
 
 
 def count_repeated_classes(trees: list[ast.Module]) -> int:
-    """Public class names that more than one module defines."""
+    """Count the public class names that more than one module defines."""
     counts = Counter(name for tree in trees for name in _public_classes(tree))
     return sum(count > 1 for count in counts.values())
 
@@ -76,7 +76,7 @@ def count_root_names(root: Path) -> int:
 
 
 def measure(root: Path, packages: Iterable[str]) -> dict[str, tuple[int, ...]]:
-    """The counts by name; the counts of a package are its modules and its lines."""
+    """Return the counts by name. A package has two counts, its modules and its lines."""
     source = root / "drake_diff"
     paths = modules(source)
     trees = [ast.parse(path.read_text()) for path in paths]
@@ -100,14 +100,14 @@ def measure(root: Path, packages: Iterable[str]) -> dict[str, tuple[int, ...]]:
 
 
 def unlisted_packages(root: Path, packages: Iterable[str]) -> list[str]:
-    """Packages of drake_diff that no row of the budget names."""
+    """Return the packages of drake_diff that no row of the budget lists."""
     listed = {name for row in packages for name in row.split("+")}
     folders = {path.relative_to(root / "drake_diff").parts[0] for path in modules(root / "drake_diff")}
     return sorted(name for name in folders - listed if not name.endswith(".py"))
 
 
 def rows(root: Path) -> Iterator[tuple[str, int, int, int]]:
-    """The name, count, limit and target of each row of the budget."""
+    """Yield the name, count, limit and target of each row of the budget."""
     budget = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["drake_diff"]["budget"]
     counts = measure(root, budget["packages"])
     for name in unlisted_packages(root, budget["packages"]):

@@ -1,10 +1,10 @@
-"""Checks the style of messages and pages, or with --list lists the messages of the package.
+"""Check the style of messages and pages, or list the messages of the package with --list.
 
     python .ci/prose.py [--list]
 
-A message is a string of four words or more that is no docstring. Pages are the Markdown files of the repository, without
-their code and tables of numbers. Exits with 1 where a text has a fault. `typos` and `proselint` check spelling and usage,
-and the build of the site checks links.
+A message is a string of at least four words that is not a docstring. Pages are the Markdown files of the repository,
+without their code and tables. The exit status is 1 if a text has a fault. `typos` and `proselint` check spelling and
+usage, and the build of the site checks links.
 """
 
 import ast
@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "drake_diff"
 PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/**/*.md")
 LONGEST = 240  # characters of a message in the source, with its expressions
-LONGEST_SENTENCE = 45  # words of a sentence of a page: the docs of Drake, JAX and diffrax have one in 100 above it
+LONGEST_SENTENCE = 45  # words per sentence of a page; 1 in 100 sentences in the docs of Drake, JAX and diffrax has more
 WORDS = 4
 FAULTS = {
     "begins without a noun": re.compile(r"^(What|That|None|Of|Those) (?!.*\?$)"),
@@ -26,9 +26,9 @@ FAULTS = {
     "an inverted sentence": re.compile(r"\b(is not to be|are not to be|is to be told|may not be asked)\b"),
     "a private word": re.compile(r"\b(told|tells of|apart from that|strangers?|elsewhere|untold|dry|marks)\b"),
 }
-IN_MESSAGES = {"begins without a noun": re.compile(r"^It ")}  # a message stands alone: nothing precedes its pronoun
-# How the texts of each file begin that are no sentences (CSS, patterns, policies, README of an export), or that schemas
-# and records store word for word.
+IN_MESSAGES = {"begins without a noun": re.compile(r"^It ")}  # no sentence precedes the pronoun of a message
+# Beginnings of texts, by file, that are not sentences (CSS, patterns, policies, README of an export) or that
+# schemas and records store verbatim.
 LEFT_OUT: dict[str, tuple[str, ...]] = {
     "_base/values.py": ("white-space:",),
     "export/export.py": ("# {name}", "- time step", "\n- Gazebo", "\n- `UrdfConverterCfg`", "positions uniform"),
@@ -37,14 +37,14 @@ LEFT_OUT: dict[str, tuple[str, ...]] = {
     "runs/fields.py": ("This is version",),
     "runs/plan_record.py": ("cost per s and squared unit",),
 }
-VECTOR = re.compile(r"\[[^\]]*\]")  # [q; v], whose semicolons join no clauses
+VECTOR = re.compile(r"\[[^\]]*\]")  # such as [q; v], whose semicolon does not join clauses
 CODE = re.compile(r"^(\s*)(```|~~~).*?^\s*\2|<!--.*?-->|<[^>]+>|\$\$.*?\$\$", re.M | re.S)
 BLOCK = re.compile(r"\n\s*\n|\n(?=\s*(?:[-*|#]|\d+\.) ?)")  # a paragraph, an item, a heading, or a row of a table
 SENTENCE = re.compile(r"(?<=[.!?:])\s+(?=[A-Z`\"(*\[])")
 
 
 def text_of(node: ast.expr) -> str:
-    """A string of the source, with its expressions in braces."""
+    """Return the string of a node with {} in place of its expressions, or "" if it is not a string."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return node.value
     if isinstance(node, ast.JoinedStr):
@@ -53,7 +53,7 @@ def text_of(node: ast.expr) -> str:
 
 
 def messages(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """The line and the text of each message in a module."""
+    """Yield the line and the text of each message in a module."""
     nodes = list(ast.walk(tree))
     statements = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
     inside = {
@@ -65,7 +65,7 @@ def messages(tree: ast.AST) -> Iterator[tuple[int, str]]:
 
 
 def sentences(page: str) -> Iterator[tuple[int, str]]:
-    """The line of the block and the text of each sentence in a page; rows of tables are left out."""
+    """Yield the line of the block and the text of each sentence in a page, except rows of tables."""
     page = CODE.sub(lambda code: "\n" * code[0].count("\n"), page)
     ends = [*(match.end() for match in BLOCK.finditer(page)), len(page)]
     for begin, end in zip([0, *ends], ends, strict=False):
@@ -76,7 +76,7 @@ def sentences(page: str) -> Iterator[tuple[int, str]]:
 
 
 def faults_in(text: str, extra: dict[str, re.Pattern[str]]) -> list[str]:
-    """The names of the faults of a text."""
+    """Return the names of the faults of a text."""
     text = re.sub(r"`[^`]*`", "`code`", VECTOR.sub("", text))
     return [fault for patterns in (FAULTS, extra) for fault, pattern in patterns.items() if pattern.search(text)]
 

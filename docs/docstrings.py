@@ -1,4 +1,4 @@
-"""What mkdocstrings has to be told of our docstrings: a section called Example is one of examples."""
+"""Extension of mkdocstrings that treats sections called "Example" as examples."""
 
 import re
 from typing import Any
@@ -7,9 +7,9 @@ import griffe
 
 
 class ExampleSections(griffe.Extension):
-    """Reads "Example:" as "Examples:", whose lines that begin with >>> are shown as code."""
+    """Extension that renames "Example:" to "Examples:", so that lines that begin with >>> are shown as code."""
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
-        """Rename the section in the docstring of anything that has one."""
+        """Rename the section in the docstring of an object."""
         if obj.docstring:
             obj.docstring.value = re.sub(r"^Example:$", "Examples:", obj.docstring.value, flags=re.MULTILINE)

@@ -1,6 +1,6 @@
-"""Looks at the site once it is built: does each link lead somewhere, and is nothing fetched from elsewhere?
+"""Check the built site: each link must have a target, and no page may fetch a resource from another site.
 
-mkdocs looks at the links of Markdown alone. This looks at the pages themselves: reference, notebooks and menus too.
+mkdocs only checks the links in Markdown. This hook checks the built pages, with reference, notebooks and menus.
 """
 
 import logging
@@ -21,13 +21,13 @@ LOADS = {
     "embed": "src",
     "object": "data",
 }
-FAR = re.compile(r"""(?:url\(|@import)\s*["']?((?:https?:)?//[^"')\s]+)""")  # what a style fetches
-NOT_LOADED = {"canonical", "prev", "next", "alternate"}  # of <link rel=...>
-LOG = logging.getLogger("mkdocs.hooks.links")  # a warning there ends a strict build
+FAR = re.compile(r"""(?:url\(|@import)\s*["']?((?:https?:)?//[^"')\s]+)""")  # other sites in a style
+NOT_LOADED = {"canonical", "prev", "next", "alternate"}  # values in <link rel=...>
+LOG = logging.getLogger("mkdocs.hooks.links")  # its warnings make a strict build fail
 
 
 class Page(HTMLParser):
-    """What a page can be linked to by, what it links to, and what a browser loads with it."""
+    """The anchors and links of a page, and the addresses that a browser loads with it."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -35,7 +35,7 @@ class Page(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Note the anchors and addresses of one element."""
+        """Collect the anchors and addresses of one element."""
         has = {name: value or "" for name, value in attrs}
         self.anchors |= {has[name] for name in ("id", "name") if name in has}
         self.loaded |= {each.split()[0] for each in has.get("srcset", "").split(",") if each.strip()}
@@ -46,17 +46,17 @@ class Page(HTMLParser):
 
 
 def fetched_by_styles(site: Path) -> Iterator[str]:
-    """A sentence for each thing that a style, in a page or in a file, would fetch from elsewhere."""
+    """Yield a sentence for each resource of another site that a style, in a page or a file, would fetch."""
     for path in (*sorted(site.rglob("*.html")), *sorted(site.rglob("*.css"))):
         if "runs" not in (name := path.relative_to(site)).parts:
             yield from (f"{name} would fetch {address}" for address in sorted(set(FAR.findall(path.read_text()))))
 
 
 def faults(site: Path) -> list[str]:
-    """A sentence for each link that leads nowhere, and for each thing that a page would fetch from elsewhere.
+    """Return a sentence for each link without a target, and for each resource of another site that a page would fetch.
 
-    The reports of the gallery's runs have tests of their own: only that they are there is looked at. What a script
-    fetches when it runs is not seen.
+    The reports of the gallery's runs have separate tests, so that only their existence is checked. Resources that a
+    script fetches at run time are not detected.
     """
     paths = [path for path in sorted(site.rglob("*.html")) if "runs" not in path.relative_to(site).parts]
     pages = {path.resolve(): Page(path.read_text()) for path in paths}
@@ -82,6 +82,6 @@ def faults(site: Path) -> list[str]:
 
 
 def on_post_build(config: Any) -> None:
-    """Warn of each fault."""
+    """Log a warning for each fault."""
     for fault in faults(Path(config.site_dir)):
         LOG.warning(fault)

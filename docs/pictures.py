@@ -18,13 +18,13 @@ from drake_diff.motion import RolloutGradient
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs/pictures"
 BALL, BLOCK = ROOT / "models/sphere_on_ground.sdf", ROOT / "models/sliding_block.sdf"
-X, Z, VX, VZ = 4, 6, 10, 12  # of a free body: quaternion, position, angular velocity, velocity
-RADIUS, GRAVITY, FRICTION = 0.1, 9.81, 0.4  # of the ball [m], [m/s^2], of the block
+X, Z, VX, VZ = 4, 6, 10, 12  # in a free body's state: quaternion, position, angular velocity, velocity
+RADIUS, GRAVITY, FRICTION = 0.1, 9.81, 0.4  # radius of the ball [m], [m/s^2], friction of the block
 BLUE, ORANGE, GREY = "#2060c0", "#d06000", "#707070"
 
 
 def state(model: dd.Model, **values: float) -> np.ndarray:
-    """The model's default state with some entries changed: z=..., vx=..., vz=..."""
+    """Return the model's default state with some entries replaced: z=..., vx=..., vz=..."""
     x = model.default_state.copy()
     for name, value in values.items():
         x[{"z": Z, "vx": VX, "vz": VZ}[name]] = value
@@ -32,11 +32,11 @@ def state(model: dd.Model, **values: float) -> np.ndarray:
 
 
 def shapes(axes: list[Axes]) -> None:
-    """A box that leans into the ground: what each model of contact sees of it. A drawing, no simulation."""
+    """Draw how each contact model represents a tilted box that penetrates the ground, without a simulation."""
     turn = np.array([[np.cos(0.2), -np.sin(0.2)], [np.sin(0.2), np.cos(0.2)]])
     corners = turn @ np.array([[-1.0, 1, 1, -1], [-0.5, -0.5, 0.5, 0.5]]) + [[0], [0.55]]
     low, right = corners[:, 0], corners[:, 1]
-    cross = low + (right - low) * (-low[1] / (right - low)[1])  # where its lower side leaves the ground
+    cross = low + (right - low) * (-low[1] / (right - low)[1])  # where the lower side of the box leaves the ground
     for axis, title in zip(axes, ("point contact", "corner spheres", "hydroelastic contact"), strict=True):
         axis.axhspan(-0.5, 0, color="#d8d8d0")
         axis.add_patch(Polygon(corners.T, fill=False, color=BLUE, lw=1.5))
@@ -58,17 +58,17 @@ def shapes(axes: list[Axes]) -> None:
 
 
 def bounces(axes: list[Axes]) -> None:
-    """A drop from 0.3 m: force beside depth of the first impact, and the height over time."""
+    """Plot a drop from 0.3 m: the force over the depth of the first impact, and the height over time."""
     for law, colour in (("sap", BLUE), ("lagged", ORANGE)):
         model = dd.load_model(BALL, time_step=1e-4, contact_approximation=law)
         xs = dd.rollout(model, state(model, z=0.3), num_steps=8000).xs
-        depth, force = RADIUS - xs[1:, Z], np.diff(xs[:, VZ]) / 1e-4 + GRAVITY  # of 1 kg
+        depth, force = RADIUS - xs[1:, Z], np.diff(xs[:, VZ]) / 1e-4 + GRAVITY  # for a mass of 1 kg
         first = slice(np.argmax(depth > 0), np.argmax(depth > 0) + 400)
         touching = depth[first] > -1e-3
         axes[0].plot(1e3 * depth[first][touching], force[first][touching], color=colour, label=law)
         axes[1].plot(1e-4 * np.arange(8001), xs[:, Z] - RADIUS, color=colour, label=law)
     times, gap = 1e-3 * np.arange(801), np.zeros(801)
-    start, gap_0, speed = 0.0, 0.3 - RADIUS, 0.0  # of the flight between two bounces
+    start, gap_0, speed = 0.0, 0.3 - RADIUS, 0.0  # at the start of a flight between two bounces
     while start < times[-1]:
         lands = start + (speed + np.sqrt(speed**2 + 2 * GRAVITY * gap_0)) / GRAVITY
         t = times[(times >= start) & (times <= lands)] - start
@@ -82,7 +82,7 @@ def bounces(axes: list[Axes]) -> None:
 
 
 def friction(axes: list[Axes]) -> None:
-    """A block that lies on the ground, given a speed: its speed one step later."""
+    """Plot the speed of a block on the ground after one step over its initial speed."""
     speeds = np.linspace(0, 0.1, 101)
     for law, colour in (("sap", BLUE), ("lagged", ORANGE)):
         model = dd.load_model(BLOCK, time_step=0.01, contact_approximation=law)
@@ -101,7 +101,7 @@ def friction(axes: list[Axes]) -> None:
 
 
 def touchdown(axes: list[Axes]) -> None:
-    """One step near the ground; then the height after half a second by the height at first."""
+    """Plot the speed after one step near the ground, and the height after half a second over the initial height."""
     ball = dd.load_model(BALL, time_step=0.005)
     gaps = np.linspace(-0.002, 0.01, 121)
     axes[0].plot(1e3 * gaps, [dd.step(ball, state(ball, z=RADIUS + gap, vz=-1.0))[VZ] for gap in gaps], color=BLUE)
@@ -134,7 +134,7 @@ PICTURES: dict[str, tuple[int, Callable[[list[Axes]], None]]] = {
 
 
 def draw(name: str, folder: Path) -> None:
-    """Write one picture as an SVG file, the same to the last byte each time."""
+    """Write one picture as an SVG file that is reproducible to the last byte."""
     count, paint = PICTURES[name]
     matplotlib.use("svg")
     with matplotlib.rc_context({"svg.hashsalt": name, "font.size": 9}):

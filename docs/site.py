@@ -1,4 +1,4 @@
-"""What of the site is written when it is built: reference, notebooks, files of the top folder."""
+"""Generate pages of the site during its build: reference, notebooks and files of the top folder."""
 
 import json
 import re
@@ -15,7 +15,7 @@ TOP = {"changelog.md": "CHANGELOG.md", "contributing.md": "CONTRIBUTING.md"}
 
 
 def names_of(package: str) -> dict[str, str]:
-    """Each public name of a package ("" for the root) with the module that defines it."""
+    """Return the full path of each public name of a package ("" for the root)."""
     folder = PACKAGE / package
     found = NAME.findall((folder / "__init__.pyi").read_text())
     prefix = ".".join(["drake_diff", *([package] if package else [])])
@@ -23,7 +23,7 @@ def names_of(package: str) -> dict[str, str]:
 
 
 def reference() -> dict[str, str]:
-    """Each page of the reference with its text: one for the names of `dd`, one for each package that has names."""
+    """Return the text of each reference page: one for the names of `dd`, one for each package with further names."""
     root = names_of("")
     pages = {}
     for stub in sorted(PACKAGE.glob("*/__init__.pyi")):
@@ -46,7 +46,7 @@ def _page(title: str, intro: str, prefix: str, names: dict[str, str]) -> str:
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add what is generated to the files of docs/."""
+    """Add the generated pages to the files of docs/."""
     for path, text in reference().items():
         files.append(File.generated(config, path, content=text))
     for path, name in TOP.items():
@@ -58,7 +58,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def page_of(notebook: Path) -> str:
-    """A notebook as a page: its text and its code, and the file itself to open in Jupyter."""
+    """Return a notebook as a page with its text, its code, and a link to the file for Jupyter."""
     parts = []
     for cell in json.loads(notebook.read_text())["cells"]:
         text = "".join(cell["source"])
@@ -69,7 +69,7 @@ def page_of(notebook: Path) -> str:
 
 
 def _to_pages(text: str) -> str:
-    """The same, with links to notebooks leading to their pages."""
+    """Replace links to notebooks by links to their pages."""
     return re.sub(r"\]\((\w+)\.ipynb\)", r"](\1.md)", text)
 
 
@@ -83,7 +83,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def with_reports(text: str, gallery: Path) -> str:
-    """The gallery with each picture opening its report, of those that docs/gallery.py has made here."""
+    """Link each picture of the gallery to its report, if docs/gallery.py has written the report."""
 
     def linked(found: re.Match[str]) -> str:
         picture, report = found.groups()

@@ -1,6 +1,6 @@
-"""Write artifacts/pendulum_swing_up again, from the root of the repository: python tests/make_reference_run.py
+"""Write artifacts/pendulum_swing_up again. Run in the root of the repository: python tests/make_reference_run.py
 
-The pages are left out, as each is 2 MB of viewer, and so the record does not list them.
+The pages are deleted, because each contains a viewer of 2 MB. The record therefore does not list them.
 """
 
 from pathlib import Path

@@ -421,12 +421,8 @@ class _PolicyProbe:
 
     def _staircase(self, k: int, way: Array, name: str, lengths: Sequence[float] = LENGTHS) -> str:
         jump = _stairs(self._along(k, way), self._least(k), lengths)
-        if not jump:
-            return ""
-        return (
-            f"the policy is a staircase: {self._jump_text(k, way, jump[:2])} "
-            f"in {jump[2]} of {ASK.cells} parts of {name}, first at {jump[0]:.3g}"
-        )
+        where = f"in {jump[2]} of {ASK.cells} parts of {name}, first at {jump[0]:.3g}" if jump else ""
+        return f"the policy is a staircase: {self._jump_text(k, way, jump[:2])} {where}" if jump else ""
 
     def _switch(self, k: int, way: Array, name: str) -> str:
         least = max(self._least(k), ASK.rounded * float(np.abs(self.g.us).max()))

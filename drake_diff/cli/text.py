@@ -20,7 +20,7 @@ from rich.text import Text
 from drake_diff.exceptions import InputError
 
 NOT_FOLDED = 160  # columns
-GREEN, RED, YELLOW = ("pass", "holds", "agree"), ("fail", "broken", "error", "damaged"), ("warning",)
+GREEN, RED = ("pass", "holds", "agree"), ("fail", "broken", "error", "damaged")
 
 RunDirectory = Annotated[Path, typer.Argument(metavar="RUN", help="A run directory.")]
 ModelFolder = Annotated[

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from drake_diff._base.arrays import Array, finite_array
 from drake_diff.derivatives.sources import check_method
 from drake_diff.derivatives.step import differentiate_step
-from drake_diff.engines.interface import EngineContract, StepJacobian, float_rows, floats, geometry_contracts
+from drake_diff.engines.interface import Arguments, EngineContract, StepJacobian, float_rows, floats, geometry_contracts
 from drake_diff.engines.load import reduced_contract
 from drake_diff.mechanics.description import Description, describe, joint_contracts
 from drake_diff.model.contact import penetration
@@ -17,7 +17,7 @@ from drake_diff.model.model import Model
 from drake_diff.model.step import set_state, step
 
 
-class DrakeEngine:
+class DrakeEngine(Arguments):
     """An engine that uses Drake, with `contact` sap, similar or lagged (default: the model's) and a step `method`."""
 
     version, status = version("drake"), "ok"
@@ -28,9 +28,6 @@ class DrakeEngine:
         self.model = model if contact in (None, approximation) else model.with_contact(str(contact))
         self.method = method
         self.name = f"drake ({self.model.contract.contact.approximation}, {method})"
-
-    def __repr__(self) -> str:
-        return f"Engine {self.name} {self.version} of {self.model}"
 
     @cached_property
     def description(self) -> Description:

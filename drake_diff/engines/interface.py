@@ -164,8 +164,7 @@ class Arguments:
     nu: int
 
     def __repr__(self) -> str:
-        sizes = f"nq={self.nq}, nv={self.nv}, nu={self.nu}"
-        return f"Engine {self.name} {self.version}: {sizes}; print(engine.contract) shows its properties"
+        return f"Engine {self.name} {self.version}; print(engine.contract) shows its properties"
 
     def _state(self, x: ArrayLike) -> tuple[Array, Array, Array]:
         """Return x (nx,), q (nq,) and v (nv,)."""

@@ -132,7 +132,6 @@ def _functions(plant: "SymbolicTree", model: Model, c: Any, actuation: Any) -> P
         rows.append(ca.gradient(r[i], knot).T)  # reverse mode: a fifth shorter than with CasADi's default choice
     pace.go_on()
     slopes = ca.Function("slopes", [knot, a], [ca.vertcat(*rows)])
-    pace.go_on()
     slope = ca.gradient(ca.dot(mu, r), ca.vertcat(xu, a, c))  # mu' r is linear in a and u; the factors have q and c
     by_v = ca.jacobian(slope[nq:nx], v)
     pace.go_on()

@@ -135,8 +135,7 @@ class ReplayPlan:
     cost: float
 
     def __repr__(self) -> str:
-        intervals = f"{self.problem.num_steps} intervals of {self.time_step:g} s"
-        return f"ReplayPlan of {self.problem.name}: {intervals}, cost {self.cost:g}; sample(1) returns (xs, us)"
+        return f"ReplayPlan of {self.problem.name}: cost {self.cost:g}; sample(1) returns (xs, us)"
 
     @cached_property
     def scale(self) -> Array:

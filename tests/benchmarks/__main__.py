@@ -1,12 +1,12 @@
-"""The benchmark suite: one command, one table, JSON where asked for.
+"""The benchmark suite: one command that prints one table and can write a JSON file.
 
     pip install -e '.[bench]'
     python tests/benchmarks [--quick] [--only panda,step_jacobian] [--out FILE.json]
     python tests/benchmarks --compare OLD.json NEW.json
 
-Models: cases.CASES and the whole solves of solves.SOLVES; quantities: those of peers.QUANTITIES, solve,
-start (of processes: imports and --help).
---quick takes less than two minutes: five models, short horizons, no MJX. Peers that are not installed are named;
+The models are cases.CASES, and the whole solves are solves.SOLVES. The quantities are peers.QUANTITIES, solve, and
+start (the time of a new process that imports a package or prints --help).
+--quick takes less than two minutes: five models, short horizons, no MJX. Peers that are not installed are listed.
 """
 
 import argparse
@@ -29,7 +29,7 @@ KINDS = (*QUANTITIES, "solve", "start")
 
 
 def chosen(only: str, quick: bool) -> tuple[list[str], list[str], list[str]]:
-    """Models, quantities and whole solves: those of the names given, all of a kind of which none is."""
+    """Return the models, quantities and whole solves that `only` names, or the defaults if it names none."""
     names = [name for name in only.split(",") if name]
     for name in names:
         if name not in (*CASES, *KINDS, *SOLVES):
@@ -42,7 +42,7 @@ def chosen(only: str, quick: bool) -> tuple[list[str], list[str], list[str]]:
 
 
 def run(only: str, quick: bool, out: Path | None) -> dict:
-    """The suite, as the JSON has it; `out` has what there is after each model."""
+    """Run the suite and return the JSON document. After each model, the results so far are saved to `out`."""
     models, kinds, solves = chosen(only, quick)
     before, quantities = machine(), [kind for kind in kinds if kind in QUANTITIES]
     found: list[Row | Missing] = []

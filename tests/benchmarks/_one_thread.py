@@ -1,4 +1,4 @@
-"""Import this before NumPy: small matrices are slower on threads."""
+"""Limit BLAS and OpenMP to one thread, which is faster for small matrices. Import this module before NumPy."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""What drake_diff can do, as one JSON file: run it before and after a change, and compare the two files.
+"""Measure what drake_diff can do and save it as JSON. Run this before and after a change, and compare the two files.
 
     pip install -e '.[test]'
     python tests/benchmarks/acceptance.py run --out after.json [--subset] [--only PATTERN] [--skip PATTERN] [--tree DIR]
@@ -6,17 +6,17 @@
     python tests/benchmarks/acceptance.py stable first.json second.json --out before.json
     python tests/benchmarks/acceptance.py status after.json
 
-The full run takes about an hour on two idle cores, --subset a quarter of it. An item is one case of one benchmark of
-this folder and runs in a process of its own; its name is KIND/CASE. `run` appends each result to --out and skips the
-items that are there, so that a run that was ended goes on; items that ended in an error run again with --retry.
---tree measures the drake_diff of another checkout with the benchmarks of this one. Load on the machine decides
-nothing: limits inside drake_diff count processor time (`processor_clock/`), and an item ends at LIMITS of it; its
-result says so. Processor seconds are recorded, not compared: only the ratios of the quick speed suite are.
+The full run takes about an hour on two idle cores, and --subset takes a quarter of that. An item is one case of one
+benchmark in this folder. It runs in its own process, and its name is KIND/CASE. `run` appends each result to --out and
+skips the items in that file, so an interrupted run can be continued. With --retry, items that ended in an error run
+again. --tree measures the drake_diff of another checkout with the benchmarks of this one. Load on the machine does not
+change the results: limits inside drake_diff count processor time (`processor_clock/`), and so do the LIMITS at which an
+item is ended, as its result states. Processor seconds are recorded. Only the ratios of the speed suite are compared.
 
-`compare` takes the items that both files hold. An item has outcomes (good, of): a task solved, a robot with a verified
-plan, planted errors detected, causes named. It exits with 1 where more than ALLOWED of the outcomes of a kind is lost,
-where a claim is false that was not, or where the second run is incomplete. `stable` keeps the items on which two runs
-of one tree agree, without the costs that differ in the sixth digit, and lists the others.
+`compare` uses the items that are in both files. An item has outcomes (good, of): a task solved, a robot with a verified
+plan, planted errors detected, causes named. The exit status is 1 if more than ALLOWED of the outcomes of a kind are
+lost, if a claim has become false, or if the second run is incomplete. `stable` keeps the items on which two runs of one
+tree agree, without the costs that differ when rounded to six digits, and lists the other items.
 """
 
 import argparse
@@ -44,14 +44,14 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests"))  # helpers
 
 LIMITS = {"tasks": 300, "zoo": 400, "trust": 1500, "identification": 600, "readme": 900, "wheel": 900, "speed": 900}
-STUCK = 4 * 3600  # [s] on the clock after which an item is ended, whatever processor time it took
-SOLVE_LIMIT = 200.0  # [s] of processor time of a task's solve
-ZOO_LIMIT = 240  # [s] of processor time of one `drake-diff plan`
+STUCK = 4 * 3600  # [s] of wall time after which an item is ended, whatever its processor time
+SOLVE_LIMIT = 200.0  # [s] of processor time for the solve of a task
+ZOO_LIMIT = 240  # [s] of processor time for one `drake-diff plan`
 STARTS = 5  # random starts of each task
 ALLOWED = 0.01  # share of the outcomes of a kind that may be lost
-SLOWER = 1.25  # a ratio that rose by this factor, its quartiles outside those of before, is lost
-COST_RISE = 0.01  # relative; listed, not counted as lost
-CLAIM = "no false claim"  # an outcome of which none may be lost
+SLOWER = 1.25  # a ratio is lost if its median rose by this factor and is above the old third quartile
+COST_RISE = 0.01  # relative; larger rises are listed, but are not counted as lost
+CLAIM = "no false claim"  # name of the outcomes of which no loss is allowed
 
 # Drawn with seed 0 from the 111 files of zoo.py in which a joint moves.
 ZOO = (
@@ -86,7 +86,7 @@ ZOO = (
     "example-robot-data/urdf/panda.urdf",
     "drake_diff/models/pendulum.urdf",
 )
-# How many seeds of so many cases of each module trust_NAME.
+# (number of seeds, number of cases for each seed) for each module trust_NAME.
 TRUST = {
     "certificate": (3, 30),
     "rollout": (2, 30),
@@ -103,9 +103,9 @@ TRUST = {
     "impact": (2, 30),
     "elsewhere": (2, 30),
 }
-IDENTIFIED = {"right": (0, 10), "single": (1, 20), "pair": (2, 20)}  # changes, cases
+IDENTIFIED = {"right": (0, 10), "single": (1, 20), "pair": (2, 20)}  # number of changes, number of cases
 COLUMNS, FITS = 12, 12
-# Sequences of the README's commands, run in one empty folder; {tree} is the checkout. Each with its exit statuses.
+# Sequences of the README's commands with their exit statuses. Each runs in an empty folder; {tree} is the checkout.
 COMMANDS: dict[str, list[tuple[str, tuple[int, ...]]]] = {
     "run_and_its_directory": [
         ("run {tree}/examples/cart_pole_swing_up.py --out swing", (0,)),
@@ -157,7 +157,7 @@ def matches(name: str, patterns: str) -> bool:
 
 
 def items(only: str, subset: bool) -> list[Item]:
-    """In the order in which they run: those of the subset first, speed last."""
+    """Return the items in the order in which they run: the subset first, the speed suite last."""
     all_items = [
         *(Item("readme", (name,)) for name in ("snippet", *COMMANDS)),
         *(Item("tasks", (name, start)) for start in range(STARTS) for name in import_module("tasks").TASKS),
@@ -175,11 +175,11 @@ def items(only: str, subset: bool) -> list[Item]:
     return sorted([*in_subset, *rest], key=lambda item: item.kind == "speed")
 
 
-# ------------------------------------------------------------------------------ what an item does
+# ------------------------------------------------------------------------------ measurements
 
 
 def run_task(name: str, start: int) -> Result:
-    """A solve with defaults only, and the referee's verdict."""
+    """Solve a task with default options and return the referee's verdict."""
     row = import_module("tasks").attempt(name, 0, start, SOLVE_LIMIT)
     is_false = bool(row["false"])
     return {
@@ -193,7 +193,7 @@ def run_task(name: str, start: int) -> Result:
 
 
 def run_robot(name: str) -> Result:
-    """`drake-diff plan FILE`."""
+    """Run `drake-diff plan FILE`."""
     zoo = import_module("zoo")
     zoo.CPU_LIMIT = ZOO_LIMIT
     paths = {f"{source}/{'/'.join(path.parts[-2:])}": path for source, path in zoo.files(None, Path())}
@@ -210,7 +210,7 @@ def run_robot(name: str) -> Result:
 
 
 def run_trust(name: str, seed: int) -> Result:
-    """Planted errors that are noticed, and right cases that pass; none may be lost where none was allowed."""
+    """Count planted errors that are detected and correct cases that pass. With a bound of 0, no loss is allowed."""
     outcomes = {}
     for figure in import_module(f"trust_{name}").measure(seed, TRUST[name][1]):
         good = figure.found if figure.at_least else figure.of - figure.found
@@ -220,7 +220,7 @@ def run_trust(name: str, seed: int) -> Result:
 
 
 def run_identification(name: str, i: int) -> Result:
-    """`dd.explain` of a recording, or `dd.identify` where `name` is "fit"."""
+    """Run `dd.explain` on a recording, or `dd.identify` if `name` is "fit"."""
     if name == "fit":
         fits = import_module("identify_fits")
         kind = ("changed", "right", "changed", "friction")[i % 4]
@@ -250,7 +250,7 @@ def verdict_of(kind: str) -> str:
 
 
 def run_readme(name: str) -> Result:
-    """The README's snippet with the output that it prints, or one of COMMANDS."""
+    """Run the README's snippet and compare its output with the README, or run one of COMMANDS."""
     tree = tree_under_test()
     outcomes, why = {}, []
     with tempfile.TemporaryDirectory() as folder:
@@ -285,7 +285,7 @@ def run_wheel(_: str) -> Result:
         subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(venv)], **quiet)
         python = venv / "bin" / "python"
         ours, its = (site_packages(Path(program)) for program in (sys.executable, python))
-        (its / "outer.pth").write_text(f"{ours}\n")  # the dependencies; its own .pth files, of checkouts, are not read
+        (its / "outer.pth").write_text(f"{ours}\n")  # for the dependencies; .pth files in it are not read
         wheel = next(wheels.glob("*.whl"))
         subprocess.run([*pip, "--python", str(python), "install", "--no-deps", "--no-index", str(wheel)], **quiet)
         clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
@@ -304,7 +304,7 @@ def site_packages(python: Path) -> str | Path:
 
 
 def run_speed(_: str) -> Result:
-    """The quick suite's ratios of drake_diff to Drake's, each with its quartiles."""
+    """Run the quick speed suite and return the ratios of drake_diff's times to Drake's, with quartiles."""
     with tempfile.TemporaryDirectory() as folder:
         saved = Path(folder) / "speed.json"
         quantities = "step,step_jacobian,linearization,rollout_gradient,solve"
@@ -329,7 +329,7 @@ RUN: dict[str, Callable[..., Result]] = {
     "wheel": run_wheel,
     "speed": run_speed,
 }
-# What is imported once, before processes are forked from this one.
+# Modules that are imported once, before processes are forked from this one.
 MODULES = {"tasks": ["tasks"], "identification": ["identify", "identify_columns", "identify_fits"], "zoo": ["zoo"]}
 
 
@@ -355,7 +355,7 @@ class Child:
 
 
 def start(item: Item, folder: Path) -> tuple[int, Child]:
-    """A process of its own, forked from this one, whose modules are there."""
+    """Fork a process that runs the item. It uses the modules that this process has imported."""
     stem = re.sub(r"\W", "_", item.name)
     child = Child(item, folder / f"{stem}.json", folder / f"{stem}.log", time.perf_counter())
     sys.stdout.flush()
@@ -372,7 +372,7 @@ def start(item: Item, folder: Path) -> tuple[int, Child]:
         os.dup2(log, 2)
         try:
             result = RUN[item.kind](*item.case)
-        except Exception as error:  # the item's result is that it failed
+        except Exception as error:  # the failure is the item's result
             result = {"outcomes": {}, "status": "error", "why": f"{type(error).__name__}: {error}"[:500]}
         save(child.answer, result)
     finally:
@@ -381,7 +381,7 @@ def start(item: Item, folder: Path) -> tuple[int, Child]:
 
 
 def end(child: Child, status: int, usage: resource.struct_rusage) -> Result:
-    """What the process said, or how it was ended."""
+    """Return the result that the process saved, or one that describes how the process ended."""
     if child.answer.is_file():
         result = json.loads(child.answer.read_text())
     else:
@@ -395,7 +395,7 @@ def end(child: Child, status: int, usage: resource.struct_rusage) -> Result:
 
 
 def run_all(queue: list[Item], workers: int) -> Iterator[tuple[Item, Result]]:
-    """Results as they come; speed runs alone."""
+    """Yield each item with its result when it ends. The speed suite runs alone."""
     children: dict[int, Child] = {}
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("terminated"))
     with tempfile.TemporaryDirectory() as name:
@@ -482,12 +482,12 @@ def read(path: Path) -> dict[str, Any]:
     return document
 
 
-# ------------------------------------------------------------------------------ two files
+# ------------------------------------------------------------------------------ comparison of two files
 
 
 @dataclass(frozen=True)
 class Change:
-    """Of one outcome of one item: how many of `of_all` cases are lost (negative: gained)."""
+    """The change of one outcome of one item: how many of `of_all` cases are lost (negative if gained)."""
 
     item: str
     outcome: str
@@ -502,7 +502,7 @@ class Change:
 
 
 def changes(before: dict[str, Result], after: dict[str, Result]) -> list[Change]:
-    """Of every outcome of the items in both files. An outcome that is no longer there is lost."""
+    """Return the change of every outcome of the items in both files. An outcome missing from `after` is lost."""
     rows = []
     for item in sorted(before.keys() & after.keys()):
         old, new = before[item], after[item]
@@ -523,7 +523,7 @@ def changes(before: dict[str, Result], after: dict[str, Result]) -> list[Change]
 
 
 def compare(given: argparse.Namespace) -> int:
-    """Print what was lost and gained; the exit status."""
+    """Print the lost and gained outcomes, and return the exit status."""
     first, second = read(given.before), read(given.after)
     before = {name: row for name, row in first["results"].items() if not matches(name, given.removed)}
     after = second["results"]
@@ -559,7 +559,7 @@ def compare(given: argparse.Namespace) -> int:
 
 
 def costs(before: dict[str, Result], after: dict[str, Result]) -> Iterator[str]:
-    """Costs that rose, and processor time: for information."""
+    """Yield lines that list the costs that rose and the processor time. They are for information only."""
     rises = []
     for item in sorted(before.keys() & after.keys()):
         old, new = before[item].get("cost"), after[item].get("cost")
@@ -604,12 +604,12 @@ def stable(given: argparse.Namespace) -> int:
 
 
 def widest(first: list[float], second: list[float]) -> list[float]:
-    """The larger median with the quartiles of both."""
+    """Return the larger median, the smaller first quartile and the larger third quartile."""
     return [max(first[0], second[0]), min(first[1], second[1]), max(first[2], second[2])]
 
 
 def status(given: argparse.Namespace) -> int:
-    """How many items are there, and which are not good."""
+    """Print the number of items of each kind, and the items with an outcome that is not good."""
     document = read(given.file)
     kinds: dict[str, Counter[str]] = defaultdict(Counter)
     for name, row in document["results"].items():

@@ -1,14 +1,14 @@
-"""Tasks of `contact_plans.py` with an arm: a ball is thrown into a target, one that flies is caught, a box is pushed.
+"""Tasks of `contact_plans.py` with an arm: throw a ball to a target, catch a flying ball, push a box.
 
-The guess of a throw is a curve of the cup to where it lets go, and the ball's parabola from there; of a catch, the
-ball's parabola, the cup's way to it, and a stop. Where they part or meet the cup is open along the ball's way. The arm
-follows by inverse kinematics. The cost is that of staying near the guess. A throw is searched from places alone, with
-relaxed contact first; a catch from the guess's states and the inputs of inverse dynamics, as contact that begins at
-2 m/s and more is stiffer than what is relaxed.
+The guess of a throw is a curve of the cup to the release point, and the ball's parabola from there. The guess of a
+catch is the ball's parabola, the path of the cup to it, and a stop. When they separate or meet, the cup is open along
+the ball's path. The arm follows by inverse kinematics. The cost keeps the motion near the guess. The search for a throw
+starts from positions only, with relaxed contact first. The search for a catch starts from the guess's states and the
+inputs of inverse dynamics, because contact that begins at 2 m/s or more is stiffer than relaxed contact.
 
-A UR5 of example-robot-data pushes a box on a table to a place. A file of directives puts the arm, a tip on its flange
-and the box together. The guess takes the tip straight behind the box and along the line to the place, by inverse
-kinematics, and then back: a tip that slows down with the box would barely touch it for long.
+A UR5 of example-robot-data pushes a box on a table to a goal. A file of model directives combines the arm, a tip on its
+flange and the box. The guess moves the tip straight behind the box and along the line to the goal, by inverse
+kinematics, and then back. A tip that slows down with the box would barely touch it for a long time.
 """
 
 import tempfile
@@ -27,25 +27,25 @@ from pydrake.solvers import Solve
 import drake_diff as dd
 
 ARM = Path(dd.__file__).parent / "models" / "arm_cup.sdf"
-LINK, REACH, GRAVITY = 0.35, 0.67, 9.81  # [m] of both links; of what a guess asks the arm; [m/s^2]
-SEAT = 0.04 + 0.035 * np.sqrt(2) - 0.1 * GRAVITY / 500  # [m] from the wrist up to the middle of a ball at rest in it
+LINK, REACH, GRAVITY = 0.35, 0.67, 9.81  # [m] of each link; [m] largest reach in a guess; [m/s^2]
+SEAT = 0.04 + 0.035 * np.sqrt(2) - 0.1 * GRAVITY / 500  # [m] from the wrist to the centre of a ball at rest in the cup
 OPTIONS = {"method": "ilqr", "continuation": "relaxed", "max_iterations": 150, "tolerance": 1e-2}
 AT_TARGET, AT_REST = 0.05, 0.05  # [m], [m/s]
-THROWN, CAUGHT = (1000, 1), (3000, 2.5)  # stiffness [N/m] of cup and ball, and in how many steps they relax
-MUCH = np.repeat([0.5, 0.2, 1e3, 5.0, 2.0, 1e3], [3, 2, 1, 3, 2, 1])  # of a state: what is far from the guess
+THROWN, CAUGHT = (1000, 1), (3000, 2.5)  # stiffness [N/m] of cup and ball, and their relaxation time in steps
+MUCH = np.repeat([0.5, 0.2, 1e3, 5.0, 2.0, 1e3], [3, 2, 1, 3, 2, 1])  # large deviations of a state from the guess
 MUCH_OF_PUSH = np.repeat([0.3, 0.1, 0.3, 1.0, 0.5, 3.0], [6, 2, 1, 6, 2, 1])
 EFFORT = 20.0  # [N m]
 UR5 = [f"{name}_joint" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")]
-ELBOW_UP = (0.2, -1.2, 1.8, -2.1, -1.57, 0)  # [rad] where its inverse kinematics begin
-SPEED, BACK, AWAY = 0.3, 0.4, 0.04  # [m/s] where a push ends, and [s] and [m] in which the tip then goes back
-SLOWS = 4.0  # [1/s] damping of the box by its mass
-HALF, TIP, AT_PLACE = 0.1, 0.03, 0.005  # [m] of the box and the tip; of the box's goal
-ALONG = 0.7  # of a ball's speed, which the cup has where they meet: with all of it they would barely touch
-LAST = 5  # knots in which a ball that is caught lies still
+ELBOW_UP = (0.2, -1.2, 1.8, -2.1, -1.57, 0)  # [rad] initial guess of the inverse kinematics
+SPEED, BACK, AWAY = 0.3, 0.4, 0.04  # [m/s] at the end of a push; [s] and [m] of the tip's retreat after it
+SLOWS = 4.0  # [1/s] damping of the box divided by its mass
+HALF, TIP, AT_PLACE = 0.1, 0.03, 0.005  # [m] half of the box, radius of the tip, tolerance of the box's goal
+ALONG = 0.7  # the cup's share of the ball's speed when they meet; at the full speed they would barely touch
+LAST = 5  # number of last knots in which a caught ball is at rest
 
 
 def arm_at(wrist: np.ndarray, pitch: np.ndarray) -> np.ndarray:
-    """(N, 3) the angles that put the wrist at (N, 2) places x and z, the nearest in reach, with the cup turned so."""
+    """Return angles (N, 3) for wrist positions x, z (N, 2), or the nearest in reach, and cup angles `pitch` (N,)."""
     far = np.linalg.norm(wrist, axis=1)
     wrist = wrist * np.minimum(1, REACH / far)[:, None]
     elbow = np.arccos(np.clip(np.sum(wrist**2, axis=1) / (2 * LINK**2) - 1, -1, 1))
@@ -54,23 +54,23 @@ def arm_at(wrist: np.ndarray, pitch: np.ndarray) -> np.ndarray:
 
 
 def seat(pitch: np.ndarray) -> np.ndarray:
-    """(..., 2) from the wrist to the middle of a ball in the cup."""
+    """Return the vector (..., 2) from the wrist to the centre of a ball in the cup."""
     return SEAT * np.stack([-np.sin(pitch), np.cos(pitch)], axis=-1)
 
 
 def motion_of(
     wrist: np.ndarray, pitch: np.ndarray, ball: np.ndarray, v0: np.ndarray, time_step: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(xs, us) of a wrist at (N+1, 2) places, a cup at (N+1,) angles and a ball at (N+1, 2) places."""
+    """Return (xs, us) for wrist positions (N+1, 2), cup angles (N+1,) and ball positions (N+1, 2). us is zero."""
     q = np.column_stack([arm_at(wrist, pitch), ball, np.zeros(len(ball))])
     v = np.vstack([v0, np.diff(q, axis=0) / time_step])
     return np.hstack([q, v]), np.zeros((len(q) - 1, 3))
 
 
 def efforts(model: dd.Model, xs: np.ndarray, hand: str, load: str) -> np.ndarray:
-    """(N, nu) torques within the limits that move an arm along xs, with what else its hand moves as a load on it.
+    """Return torques (N, nu) within the limits that move an arm along xs, with the object at its hand as a load.
 
-    The arm's joints come first in the state, and then two that move the load along x, and along z or y.
+    The first joints of the state are the arm's. The next two move the load along x, and along z or y.
     """
     plant, nq, n = model.plant, model.nq, model.nu
     context, world = plant.CreateDefaultContext(), plant.world_frame()
@@ -92,25 +92,25 @@ def efforts(model: dd.Model, xs: np.ndarray, hand: str, load: str) -> np.ndarray
 
 
 def near(guess: tuple[np.ndarray, np.ndarray], time_step: float, much: np.ndarray) -> dict[str, Any]:
-    """The cost of a Problem that stays near a guess."""
+    """Return the cost that keeps the motion of a Problem near a guess."""
     xs, us = guess
     table = time_step * np.arange(len(xs)), xs, np.vstack([us, us[-1:]])
     return {"running_cost": dd.optimize.TrackingCost(table, Q=np.diag(much**-2.0), R=np.eye(us.shape[1]) / EFFORT**2)}
 
 
 def flight(place: np.ndarray, velocity: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """(N, 2) places of a ball that flies."""
+    """Return positions (N, 2) of a flying ball."""
     return place + velocity * t[:, None] - [0, GRAVITY / 2] * t[:, None] ** 2
 
 
 def smooth(s: np.ndarray) -> np.ndarray:
-    """0 until 0, 1 from 1 on, without a corner."""
+    """Return a smooth step: 0 for s <= 0, 1 for s >= 1, with a continuous slope."""
     s = np.clip(s, 0, 1)
     return s**2 * (3 - 2 * s)
 
 
 def curve(t: np.ndarray, end: float, places: tuple[Any, Any], speeds: tuple[Any, Any]) -> np.ndarray:
-    """(N, 2) the cubic between two places with given speeds in the time 0 to end; before and after it stands there."""
+    """Return the cubic (N, 2) between two places with given velocities from time 0 to `end`, constant outside."""
     s = np.clip(t / end, 0, 1)[:, None]
     first, last = (np.asarray(place) for place in places)
     out, back = (end * np.asarray(speed) for speed in speeds)
@@ -120,7 +120,7 @@ def curve(t: np.ndarray, end: float, places: tuple[Any, Any], speeds: tuple[Any,
 
 
 def throw(random: np.random.Generator, time_step: float = 0.005) -> Task:
-    """A ball that lies in the cup is thrown so that it comes to a target beyond the arm's reach, 0.8 m with the cup."""
+    """Return the task of throwing a ball from the cup to a target beyond the arm's reach (0.8 m with the cup)."""
     model = softer(ARM, time_step, THROWN[0], THROWN[1])
     start = np.array([random.uniform(0.25, 0.35), random.uniform(-0.3, -0.2)])
     target = np.array([random.uniform(1.0, 1.5), random.uniform(-0.2, 0.2)])
@@ -131,7 +131,7 @@ def throw(random: np.random.Generator, time_step: float = 0.005) -> Task:
     release = start + 0.4 * swing * velocity
     release *= min(1.0, 0.9 * REACH / np.linalg.norm(release))
     velocity = (target - release) / fly + [0, GRAVITY * fly / 2]
-    along = -np.arctan2(velocity[0], velocity[1])  # in the end the cup is open to where the ball goes
+    along = -np.arctan2(velocity[0], velocity[1])  # at the end the cup is open in the direction of the flight
     pitch = along * smooth(t / swing)
     held = curve(t, swing, (start + seat(np.zeros(())), release), (np.zeros(2), velocity))
     last = release - seat(along)
@@ -154,7 +154,7 @@ def throw(random: np.random.Generator, time_step: float = 0.005) -> Task:
 
 
 def catch(random: np.random.Generator, time_step: float = 0.005) -> Task:
-    """A cup goes to where a ball comes down, and brings it to rest in it."""
+    """Return the task of moving the cup to a falling ball and bringing the ball to rest in it."""
     model = softer(ARM, time_step, CAUGHT[0], CAUGHT[1])
     start = np.array([random.uniform(0.3, 0.5), random.uniform(-0.2, 0.1)])
     place = np.array([random.uniform(1.1, 1.5), random.uniform(0.3, 0.5)])
@@ -165,7 +165,7 @@ def catch(random: np.random.Generator, time_step: float = 0.005) -> Task:
     velocity = (meet - place) / fly + [0, GRAVITY * fly / 2]
     comes = velocity - [0, GRAVITY * fly]
     there = ALONG * comes
-    against = -np.arctan2(-comes[0], -comes[1])  # the cup is open to where the ball comes from
+    against = -np.arctan2(-comes[0], -comes[1])  # the cup is open towards the incoming ball
     pitch = against * (1 - smooth((t - fly) / stop)) * smooth(t / fly)
     end = meet + there * stop / 3
     first = meet - seat(against)
@@ -196,7 +196,7 @@ def catch(random: np.random.Generator, time_step: float = 0.005) -> Task:
 
 
 def scene(time_step: float) -> dd.Model:
-    """The UR5 with a tip on its flange, and the box: of the arm's own shapes only the tip touches the box."""
+    """Load the UR5 with a tip on its flange, and the box. The tip is the only part of the arm that touches the box."""
     (arm,) = (file.locate() for file in files("example-robot-data") or () if str(file).endswith("/ur5_robot.urdf"))
     here = Path(__file__).parent
     text = f"""directives:
@@ -216,7 +216,7 @@ def scene(time_step: float) -> dd.Model:
 
 
 def tip_at(model: dd.Model, places: np.ndarray) -> np.ndarray:
-    """(N, 6) the UR5's angles with its tip at (N, 3) places, pointing down, each near the one before."""
+    """Return UR5 angles (N, 6) that put the tip, pointing down, at positions (N, 3), each near the previous one."""
     plant, found = model.plant, np.empty((len(places), 6))
     tip, world, last = plant.GetFrameByName("tip"), plant.world_frame(), np.zeros(model.nq)
     last[:6] = ELBOW_UP
@@ -235,13 +235,13 @@ def tip_at(model: dd.Model, places: np.ndarray) -> np.ndarray:
 
 
 def push(random: np.random.Generator, time_step: float = 0.02) -> Task:
-    """The tip of an arm that starts apart from a box pushes it to a place on the table."""
+    """Return the task of pushing a box on the table to a goal with the tip of an arm that starts apart from the box."""
     model, count = scene(time_step), round(1.5 / time_step)
     start = np.array([random.uniform(0.4, 0.5), random.uniform(-0.1, 0.1)])
     along, way, gap = random.uniform(-0.4, 0.4), random.uniform(0.1, 0.2), random.uniform(0.03, 0.08)
     line, turned = np.array([np.cos(along), np.sin(along)]), along + random.uniform(-0.1, 0.1)
     place = start + way * line
-    pushed = gap + way - SPEED / SLOWS * (1 - np.exp(-SLOWS * BACK))  # then the box glides on
+    pushed = gap + way - SPEED / SLOWS * (1 - np.exp(-SLOWS * BACK))  # then the box slides on
     t = np.arange(count + 1) * time_step
     until = t[-1] - BACK
     pushing = (t <= until)[:, None]
@@ -267,7 +267,7 @@ def push(random: np.random.Generator, time_step: float = 0.02) -> Task:
 
 
 def ball_off(place: np.ndarray, xs: np.ndarray, us: np.ndarray) -> float:
-    """How far the ball is from a place in the end."""
+    """Return the distance of the ball from a place at the end, as the largest difference of a coordinate."""
     return float(np.max(np.abs(xs[-1, 3:5] - place)))
 
 

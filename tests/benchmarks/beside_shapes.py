@@ -1,11 +1,11 @@
-"""Arms beside tables and boxes: how often a plan said to hold goes through a shape, and a clear way is refused.
+"""Arms near tables and boxes: how often a successful plan penetrates a shape, and how often a clear path is refused.
 
     python tests/benchmarks/beside_shapes.py [--count 200] [--first 0] [--seed 0]
 
 Each case is an SDF of an arm of two or three links (capsules, boxes and cylinders of random sizes, about random axes)
-with one to three boxes that are fixed to the world, and a plan of least effort between two postures that are clear,
-with `SelfCollision()` and `contact=False`. The referee loads the file by Drake alone and asks its penetration query at
-1 kHz. A straight way that is clear by twice the margin is to be planned.
+with one to three boxes that are fixed to the world. It plans the least effort between two collision-free postures, with
+`SelfCollision()` and `contact=False`. The referee loads the file with Drake alone and evaluates Drake's penetration
+query at 1 kHz. If the straight path is clear by twice the margin, the solve must succeed.
 """
 
 import argparse
@@ -23,9 +23,9 @@ from trust import Figure
 import drake_diff as dd
 from drake_diff.exceptions import DrakeDiffError
 
-MARGIN = 0.01  # [m] what a plan keeps
-CLEAR = 2 * MARGIN  # [m] of a way that is to be planned
-DEPTH = 1e-6  # [m] from which a query's answer is a penetration
+MARGIN = 0.01  # [m] smallest distance allowed in a plan
+CLEAR = 2 * MARGIN  # [m] smallest distance of a straight path that must be planned
+DEPTH = 1e-6  # [m] smallest depth that counts as a penetration
 
 
 def row(numbers):
@@ -33,7 +33,7 @@ def row(numbers):
 
 
 def shape(random, length):
-    """The geometry of a link along its z axis."""
+    """Return the geometry of a link along its z axis."""
     width = random.uniform(0.02, 0.05)
     return (
         f"<capsule><radius>{width}</radius><length>{length}</length></capsule>",
@@ -43,7 +43,7 @@ def shape(random, length):
 
 
 def arm_with_boxes(random):
-    """The text of one file, and the number of its joints."""
+    """Return the text of an SDF file and the number of its joints."""
     count, z, links = int(random.integers(2, 4)), 0.0, ""
     for i in range(count):
         length = random.uniform(0.25, 0.45)
@@ -72,7 +72,7 @@ def arm_with_boxes(random):
 
 
 class Referee:
-    """Drake's own reading of the file."""
+    """The file as Drake's own parser reads it."""
 
     def __init__(self, path):
         builder = DiagramBuilder()
@@ -88,17 +88,17 @@ class Referee:
         return self.scene_graph.get_query_output_port().Eval(self.scene_graph.GetMyContextFromRoot(self.root))
 
     def penetration(self, qs):
-        """[m] the deepest of any pair."""
+        """Return the largest penetration depth [m] of any pair."""
         return max((p.depth for q in qs for p in self._query(q).ComputePointPairPenetration()), default=0.0)
 
     def distance(self, qs):
-        """[m] the least of any pair."""
+        """Return the smallest distance [m] of any pair."""
         pairs = (p.distance for q in qs for p in self._query(q).ComputeSignedDistancePairwiseClosestPoints())
         return min(pairs, default=np.inf)
 
 
 def case(seed, i, folder):
-    """What became of one: whether a plan holds, whether it penetrates, and whether the straight way is clear."""
+    """Solve one case; return (outcome, penetration depth [m] of the plan, whether the straight path is clear)."""
     random, path = np.random.default_rng([seed, i]), Path(folder) / f"arm{i}.sdf"
     while True:
         text, count = arm_with_boxes(random)

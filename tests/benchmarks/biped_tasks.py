@@ -1,7 +1,7 @@
 """Tasks of a humanoid on two flat feet: it shifts its weight and takes a step with each foot, or stands up.
 
-Talos, its torso and arms held. The starts are drawn and the ends measured as in
-`legged_tasks.py`; a foot that is to be in the air is measured at each corner of its sole, and where it lands.
+The robot is Talos with fixed torso and arms. The starts are drawn and the ends are measured as in `legged_tasks.py`.
+The height of a swinging foot is measured at each corner of its sole, and its landing position is measured too.
 """
 
 from functools import cache, partial
@@ -13,7 +13,7 @@ from legged_tasks import IN_AIR, OPTIONS, TIME_STEP, build, scheduled_problem
 
 ROBOT, LEFT, RIGHT, BOTH = "talos", 0, 1, (0, 1)
 STRIDE, SWING = 0.1, 0.05  # [m]
-LANDED, STANDS = 0.03, 0.005  # [m] a foot from where it is to be at last; of one that carries, over the ground
+LANDED, STANDS = 0.03, 0.005  # [m] distance of a foot from its final position; height of a standing foot
 
 
 def step(random, h=TIME_STEP):
@@ -62,12 +62,12 @@ def _task(random, h, kind, first, phases, text, *, way=0.0):
 
 @cache
 def _posture(h):
-    """(nq,) as the robot stands."""
+    """Return the posture (nq,) of the standing robot."""
     model = legged_model(ROBOT, h)
     return tuple(rest(ROBOT, model, np.array(LEGGED[ROBOT].high))[: model.nq])
 
 
-# What a referee measures, by Drake alone.
+# The measurements of the referee, with Drake alone.
 
 
 @cache
@@ -77,7 +77,7 @@ def _kinematics():
 
 
 def _soles(q):
-    """(feet, corners, 3) [m] the lowest points of the spheres under each foot in posture q (nq,)."""
+    """Return the lowest points (feet, corners, 3) [m] of the spheres under each foot in posture q (nq,)."""
     plant, context = _kinematics()
     facts = LEGGED[ROBOT]
     plant.SetPositions(context, q)
@@ -95,7 +95,7 @@ def _low(i, knot, xs, us):
 
 
 def _over(i, knot, xs, us):
-    """How high over the ground the middle of a sole is."""
+    """Return the height of the middle of a sole above the ground."""
     return float(max(np.mean(_soles(_q(xs[knot]))[i, :, 2]), 0.0))
 
 

@@ -1,7 +1,7 @@
-"""The benchmark's models, each with a state, an input and a constant motion of inputs.
+"""The benchmark's models, each with a state and an input that is constant over the horizon.
 
-Contact cases rest on the ground, where contact acts; the others move freely, free bodies high up and joints near the
-middle of their limits, so that every peer takes the same smooth step.
+Contact cases rest on the ground, where contact acts. The other models move freely, with free bodies high above the
+ground and joints near the middle of their limits, so that every peer computes the same smooth step.
 """
 
 import tempfile
@@ -42,14 +42,14 @@ class Case:
     u: np.ndarray  # (nu,)
 
     def inputs(self, horizon: int) -> np.ndarray:
-        """(horizon, nu) the input held."""
+        """Return the constant input for each step (horizon, nu)."""
         return np.tile(self.u, (horizon, 1))
 
     @property
     def ends(self) -> np.ndarray:
-        """(nx,) the gradient by x_N of the loss: the sum of the joints' last velocities, of the body's if it has none.
+        """The gradient (nx,) with respect to x_N of the loss, the sum of the last velocities of joints, or of a body.
 
-        Joints' velocities are the same numbers in every engine, free bodies' are not.
+        Joint velocities have the same values in every engine, while velocities of free bodies differ.
         """
         free = 6 if 6 < self.model.nv < self.model.nq else 0
         by = np.zeros(self.model.nx)
@@ -62,7 +62,7 @@ class Case:
 
 
 def chain_urdf(joints: int) -> str:
-    """Hinges 0.1 m apart, in turn about x and y."""
+    """Return the URDF of a chain of hinges 0.1 m apart, alternately about y and x."""
     links = "".join(
         LINK.format(
             i=i,
@@ -76,7 +76,7 @@ def chain_urdf(joints: int) -> str:
 
 
 def box_sdf() -> str:
-    """A cube of 1 kg that touches a half space with spheres in its corners."""
+    """Return the SDF of a 1 kg cube that touches a half space with spheres in its corners."""
     at = [BOX_SIDE / 2 * s for s in (-1, 1)]
     corners = "".join(
         f'<collision name="c{i}"><pose>{x} {y} {z} 0 0 0</pose><geometry><sphere><radius>{CORNER}</radius></sphere>'
@@ -95,16 +95,16 @@ def _moving(name: str, path: Path, time_step: float, weld_base: str | None = Non
     model = dd.load_model(path, time_step=time_step, weld_base=weld_base)
     x, u = state(model, np.random.default_rng(0))
     if model.nq > model.nv:
-        x[6] = 5.0  # m high
+        x[6] = 5.0  # [m] height
     return Case(name, model, x, u)
 
 
 def _resting(name: str, path: Path, height: float) -> Case:
-    """On the ground at 0.2 m/s: where it slides."""
+    """Return the case of a body that slides on the ground, with a velocity of 0.2 m/s at first."""
     model = dd.load_model(path, time_step=0.005)
     x = model.default_state
     x[6], x[10] = height, 0.2
-    for _ in range(20):  # 0.1 s: what the fall on the contact's springs leaves has died out
+    for _ in range(20):  # 0.1 s, in which the oscillation after the fall onto the ground dies out
         x = dd.step(model, x)
     return Case(name, model, x, np.zeros(0))
 
@@ -129,7 +129,7 @@ CASES: dict[str, Callable[[Path], Case]] = {
 
 
 def case(name: str) -> Case:
-    """The model of a name in CASES, in its state."""
+    """Return the case with this name in CASES."""
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-        warnings.simplefilter("ignore", ModelWarning)  # visuals' meshes are left out
+        warnings.simplefilter("ignore", ModelWarning)  # about visual meshes that are left out
         return CASES[name](Path(folder))

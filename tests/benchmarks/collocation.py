@@ -1,9 +1,9 @@
-"""Kelly's cart-pole, and how the suite solves it: ours, Drake's DirectCollocation, CasADi by hand.
+"""Kelly's cart-pole, solved by drake_diff, by Drake's DirectCollocation and by hand-written CasADi code.
 
-All start from a straight line at zero input, with the same limits and tolerance. "verified" is `dd.solve`: what the
-others do, certificates of the gradients at ten knots, and the motion measured and replayed on Drake's plant. Drake's
-scheme is another one (midpoint input the mean, cost by the trapezoid rule), so that its optimum differs a little.
-"limit" is 60 s on the wall or 3000 iterations.
+All solves start from a straight line at zero input, with the same limits and tolerance. "verified" is `dd.solve`, which
+also certifies the gradients at ten knots, and measures the motion and replays it on Drake's plant. Drake's scheme is
+different (its midpoint input is the mean, and its cost uses the trapezoid rule), so its optimum differs a little.
+"limit" is 60 s of wall time or 3000 iterations.
 """
 
 import time
@@ -24,14 +24,14 @@ Row = tuple[float, str, float, int]  # seconds, outcome, cost, iterations
 
 
 def kelly() -> dd.Problem:
-    """The swing-up of Kelly's cart-pole on 50 intervals of 0.04 s."""
+    """Return the swing-up problem of Kelly's cart-pole on 50 intervals of 0.04 s."""
     model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.04)
     cost = dd.QuadraticCost(R=np.eye(model.nu))
     return dd.Problem(model, x0=np.zeros(4), x_goal=[1, np.pi, 0, 0], running_cost=cost, num_steps=50)
 
 
 def ours(problem: dd.Problem, scheme: str) -> Row:
-    """The search alone, without certificates and measures."""
+    """Run the optimization alone, without certificates and measurements."""
     guess = (
         np.linspace(problem.x0, problem.x_goal, problem.num_steps + 1),
         np.zeros((problem.num_steps + 1, problem.nu)),
@@ -62,7 +62,7 @@ def drakes(problem: dd.Problem) -> Row:
 
 
 def kelly_by_hand(count: int = 50) -> Row:
-    """Hermite-Simpson in one SX expression, from the formulas of Kelly's paper."""
+    """Solve the Hermite-Simpson problem as one SX expression, with the formulas of Kelly's paper."""
     start, h = time.process_time(), 2.0 / count
 
     def rates(z: Any) -> Any:

@@ -1,7 +1,7 @@
-"""Two saved runs: by which factor each ratio changed, and which changes are beyond the spread.
+"""A comparison of two saved runs: the factor by which each ratio changed, and the changes that exceed the spread.
 
-Ratios to a base that ran in the same rounds, so that two machines, or one at two loads, can be compared. A row changed
-where the quartiles of one run lie wholly outside the other's and the medians are more than LEAST apart.
+The ratios are relative to a base that ran in the same rounds, so that two machines, or one machine at two loads, can be
+compared. A row has changed if the interquartile ranges are disjoint and the medians differ by more than a factor LEAST.
 """
 
 import json
@@ -15,7 +15,7 @@ from timing import Spread
 
 from drake_diff.exceptions import InputError
 
-LEAST = 1.1  # less than quartiles of few rounds can be apart by chance
+LEAST = 1.1  # quartiles of a few rounds can differ by smaller factors by chance
 KEY = ("model", "quantity", "horizon", "peer", "base")
 
 
@@ -29,7 +29,7 @@ class Change:
 
 
 def read(path: Path) -> dict:
-    """A saved run; InputError where the file is none of this format."""
+    """Read a saved run. Raises InputError if the file does not have this format."""
     try:
         found = json.loads(path.read_text())
     except (OSError, ValueError) as error:
@@ -40,7 +40,7 @@ def read(path: Path) -> dict:
 
 
 def changes(old: dict, new: dict) -> tuple[list[Change], list[tuple]]:
-    """Of the rows in both, bases left out, and the keys of the rows in one alone."""
+    """Return the changes of the rows in both runs, without bases, and the keys of rows in only one run."""
     before, after = ({tuple(row[k] for k in KEY): row for row in run["rows"]} for run in (old, new))
     both = [key for key in before if key in after and key[-1] != key[-2]]
     return [_change(key, before[key], after[key]) for key in both], sorted(before.keys() ^ after.keys(), key=str)
@@ -54,7 +54,7 @@ def _change(key: tuple, old: dict, new: dict) -> Change:
 
 
 def show(found: list[Change], alone: list[tuple]) -> None:
-    """Changes first, the largest first of all."""
+    """Print a table of the ratios. Changed ratios are first, and larger factors precede smaller ones."""
     console = Console(width=None if Console().is_terminal else 150)
     table = Table(title=f"{sum(c.changed for c in found)} of {len(found)} ratios changed", title_justify="left")
     for name in ("", "model", "quantity", "peer", "old", "new", "new / old"):

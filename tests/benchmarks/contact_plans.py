@@ -1,11 +1,11 @@
-"""Plans with contact: each task from starts drawn by a seed, solved, verified, and looked at by a referee of its own.
+"""Plans with contact: each task is solved from starts drawn by a seed, verified, and checked by an independent referee.
 
     python tests/benchmarks/contact_plans.py --seed 0 --starts 5 --jobs 2
     python tests/benchmarks/contact_plans.py --tasks go2_stand,go2_trot --time-step 0.05 --starts 2
 
-The referee is Drake alone: it builds the plant, sends it the plan's inputs, and measures what the task asks. Where a
-robot falls by rounding alone unless it is balanced, each step of the plan is compared with Drake's own instead. A plan
-that solve calls verified and the referee does not find is false.
+The referee uses Drake alone. It builds the plant, applies the plan's inputs, and measures the task's requirements. If a
+robot without feedback falls because of rounding alone, each step of the plan is compared with Drake's step instead.
+A plan that solve calls verified and that the referee rejects is false.
 Times are processor seconds of one thread: of the whole solve with its verification, of an iteration of its search, and
 of Drake's own simulation of the motion.
 """
@@ -34,8 +34,8 @@ from pydrake.systems.analysis import Simulator  # noqa: E402
 from solving import solve_with  # noqa: E402
 
 MODULES = ("legged_tasks", "biped_tasks", "manipulation_tasks", "arm_tasks")
-REPEATS = 3  # of a simulation, the quickest of which counts
-AGAIN = 1e-6  # what the referee's own motion may be off the plan's in a step: another order of sums
+REPEATS = 3  # runs of a simulation, of which the fastest counts
+AGAIN = 1e-6  # allowed difference of the referee's step from the plan's, because sums have another order
 
 
 def every_task():
@@ -47,7 +47,7 @@ def every_task():
 
 
 def simulated(plant, diagram, x0, us, h):
-    """(states (N+1, nx), seconds) of Drake's own simulation, each input held for a step."""
+    """Return (states (N+1, nx), seconds) of Drake's own simulation with inputs that are constant over each step."""
     best, xs = np.inf, None
     for _ in range(REPEATS):
         simulator = Simulator(diagram)
@@ -67,13 +67,13 @@ def simulated(plant, diagram, x0, us, h):
 
 
 def off_by_step(plant, diagram, xs, us, h):
-    """How far, of 1 or of its own size, a state of the plan is from where Drake's step from the one before it leads."""
+    """Return the largest difference of the plan's states from Drake's steps, relative to the larger of |x| and 1."""
     ends = [simulated(plant, diagram, x, u[None], h)[0][1] for x, u in zip(xs[:-1], us, strict=True)]
     return float(np.max(np.abs(np.array(ends) - xs[1:]) / np.maximum(np.abs(xs[1:]), 1.0)))
 
 
 def referee(task, solution):
-    """(what is not as asked, seconds of Drake's simulation) of a plan, by Drake alone."""
+    """Return (violated requirements, seconds of Drake's simulation) of a plan, with Drake alone."""
     model = task.problem.model
     if task.build is not None:
         plant, diagram = task.build(model.time_step)
@@ -101,12 +101,12 @@ def referee(task, solution):
 
 
 def takes_step(make):
-    """Whether a task is told of any time step; the others have that of their models."""
+    """Return whether a task accepts a time step. The other tasks use their models' time steps."""
     return "h" in inspect.signature(make).parameters
 
 
 def one(name, seed, start, time_step):
-    """A row of the table: one task from one start, in steps of the task's own where `time_step` is 0."""
+    """Return the row for one task from one start, with the task's own time step if `time_step` is 0."""
     warnings.simplefilter("ignore")
     logging.getLogger("drake").setLevel(logging.ERROR)
     import drake_diff as dd
@@ -119,7 +119,7 @@ def one(name, seed, start, time_step):
     except dd.exceptions.DrakeDiffError as error:
         return row | {"message": f"no guess: {error}", "guess_s": time.process_time() - begun}
     row["guess_s"] = time.process_time() - begun
-    # What a process does once (it compiles, it certifies a source) is not a task's: a solve of one iteration does it.
+    # A first solve of one iteration does the work that a process does once: compilation and certification of a source.
     with contextlib.suppress(dd.exceptions.DrakeDiffError):
         solve_with(task.problem, **{**task.options, "max_iterations": 1})
     ticks, begun = [], time.process_time()
@@ -133,7 +133,7 @@ def one(name, seed, start, time_step):
     if np.all(np.isfinite(solution.us)):
         try:
             wrong, row["simulation_s"] = referee(task, solution)
-        except RuntimeError as error:  # Drake cannot take a step
+        except RuntimeError as error:  # Drake's step failed
             wrong = [str(error)[:100]]
     row["wrong"] = wrong
     row["solved"] = not wrong
@@ -144,7 +144,7 @@ def one(name, seed, start, time_step):
 
 
 def told_of(rows):
-    """A line of the table for a task."""
+    """Return the line of the table for a task."""
 
     def middle(key):
         values = [row[key] for row in rows if np.isfinite(row.get(key, np.nan))]

@@ -1,7 +1,7 @@
-"""One task with contact, as `contact_plans.py` runs it; its MODULES, such as `legged_tasks.py`, build them.
+"""A task with contact, as `contact_plans.py` runs it. Its MODULES, such as `legged_tasks.py`, make such tasks.
 
-Each of these modules has `TASKS`, a name -> a function of a random generator that gives a Task: the start is drawn,
-and the guess is none or a naive one.
+Each module has `TASKS`, which maps names to functions that take a random generator and return a Task. The start is
+random, and the initial guess is None or a naive guess.
 """
 
 from collections.abc import Callable
@@ -12,16 +12,16 @@ import numpy as np
 
 import drake_diff as dd
 
-Ask = tuple[str, Callable[[np.ndarray, np.ndarray], float], float]  # name, (xs, us) -> miss, allowed
+Ask = tuple[str, Callable[[np.ndarray, np.ndarray], float], float]  # name, (xs, us) -> miss, allowed miss
 
 
 @dataclass(frozen=True)
 class Task:
-    """`options` are keywords of `dd.solve`; `asks` are all that a referee measures, the goal too, besides input limits.
+    """A problem with `options`, the keywords of `dd.solve`, and `asks`, the requirements beyond the input limits.
 
-    `schedule` is what Crocoddyl needs to be told, None where it cannot express the task; `build` gives Drake's
-    (plant, diagram) at a time step, 0 for continuous, None where the model's own file gives it. What `falls` goes
-    another way from a change of 1e-12, as a biped does on one foot: its plan is measured step by step.
+    `schedule` is the input for Crocoddyl, or None if Crocoddyl cannot express the task. `build` returns Drake's
+    (plant, diagram) for a time step, 0 for continuous time, or is None if the model's own plant is used. If `falls`, a
+    change of 1e-12 leads to another motion, as for a biped on one foot. Such a plan is measured step by step.
     """
 
     name: str

@@ -1,14 +1,14 @@
-"""A cube's contact identified from motion-captured tosses, and judged on tosses that were not used.
+"""Identify a cube's contact from motion-captured tosses, and test the result on held-out tosses.
 
     python tests/benchmarks/cube_tosses.py TOSSES.npz [--fit 20] [--held-out 30] [--steps 2] [--seed 0]
 
 TOSSES.npz has `length` and `state` of real tosses at 148 Hz (ContactNets, BSD-3): quaternion, position, angular
-velocity in the body's frame and velocity. Each toss that was held out is simulated from its first state; its error is
-the mean distance of the centre over time, in % of the cube's width. First states are those measured, or those whose
-motion goes through the positions before the first contact. Lengths are put right by gravity: in the air these cubes
-fall by less than 9.81 m/s^2. The centre of mass is off the middle, and the recorded axes of the cube are turned from
-one set of throws to the next: cube_tosses_axes.py puts that right, by the motion before the first contact. Drake fits
-eight corner spheres, and pads on the faces with a friction of their own.
+velocity in the body's frame and velocity. Each held-out toss is simulated from its first state. Its error is the mean
+distance of the centre over time, in % of the cube's width. First states are the measured ones, or those whose motion
+fits the positions before the first contact. Lengths are corrected by gravity, because in the air these cubes accelerate
+by less than 9.81 m/s^2. The centre of mass is not in the middle, and the recorded axes of the cube are rotated between
+sets of throws. cube_tosses_axes.py corrects the axes, based on the motion before the first contact. The Drake model has
+eight corner spheres, and pads on the faces with their own friction.
 """
 
 import argparse
@@ -28,19 +28,19 @@ from drake_diff.identification import Identification, first_state, identify_cont
 from drake_diff.identification.impacts import flights_of
 
 RATE, WIDTH, MASS, INERTIA = 148.0, 0.1048, 0.37, 0.00081  # [Hz, m, kg, kg m^2] as published with the tosses
-INSET = 0.0024  # [m] by hand, radius of a corner sphere: its centre is so far inside of three faces
+INSET = 0.0024  # [m] radius of a corner sphere, chosen by hand; its centre is this far inside three faces
 GYRATION = (INERTIA / MASS) ** 0.5  # [m]
 LENGTHS = {"half_width": WIDTH / 2, "corner": INSET, "gyration": GYRATION}
 BY_HAND = {"friction": 0.15, "stiffness": 2e4, "relaxation_time": 0.005}  # [1, N/m, s]
 NAMES = ("cube.friction", "pads.friction", "cube.stiffness", "cube.relaxation_time")
-PAD, APART, RECESS = 0.005, 0.03, 1e-4  # [m] radius of a pad, how far from the middle of its face, and corners below it
+PAD, APART, RECESS = 0.005, 0.03, 1e-4  # [m] radius of a pad, its offset from the face's centre, depth of the corners
 
 
 def sdf(half_width: float, corner: float, gyration: float, center: Array) -> str:
-    """The cube above z = 0, as by hand; the board is much stiffer, with the same friction.
+    """Return the SDF of the cube above z = 0, with values by hand, and of a much stiffer board with equal friction.
 
-    Eight spheres are its corners, and four on each face, which lie a little further out, carry it where it lies flat.
-    The board is a thick box, since Drake's query for overlaps ended the process with pads above a plane.
+    Eight spheres are the corners of the cube. Four pads on each face lie a little further out and carry a flat cube.
+    The board is a thick box, because Drake's query for overlaps crashed the process with pads above a plane.
     """
     at, inertia = half_width - corner - RECESS, MASS * gyration**2
 
@@ -80,7 +80,7 @@ def sdf(half_width: float, corner: float, gyration: float, center: Array) -> str
 
 
 def read_tosses(path: Path) -> list[Array]:
-    """Each (n, 13) in Drake's state: the angular velocity in the world's frame."""
+    """Read the tosses, each (n, 13), as Drake's states, with the angular velocity in the world frame."""
     data = np.load(path)
     tosses = np.split(data["state"].astype(float), np.cumsum(data["length"])[:-1])
     for x in tosses:
@@ -100,7 +100,7 @@ def model_of(
     corner: float = INSET,
     gyration: float = GYRATION,
 ) -> dd.Model:
-    """With its centre of mass there [m], by so many steps between two samples."""
+    """Load the cube with its centre of mass at `center` [m] and `steps` time steps between two samples."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cube.sdf"
         path.write_text(sdf(half_width, corner, gyration, center))
@@ -108,7 +108,7 @@ def model_of(
 
 
 def flights(tosses: list[Array], model: dd.Model) -> dict[int, Array]:
-    """What each toss (n, 13) is before the first contact, where that is 6 samples or more."""
+    """Return the part of each toss (n, 13) before the first contact, if it has at least 6 samples."""
     found = {}
     for i, xs in enumerate(tosses):
         spans = flights_of(model, xs)
@@ -118,10 +118,10 @@ def flights(tosses: list[Array], model: dd.Model) -> dict[int, Array]:
 
 
 def in_the_air(flown: list[Array]) -> tuple[Array, Array]:
-    """Gravity [m/s^2] and centre of mass [m] (6,) before the first contact, and their standard errors.
+    """Estimate gravity [m/s^2] and centre of mass [m] (6,) before the first contact, and their standard errors.
 
-    Each toss has p = p0 + v0 t + g t^2 / 2 - R c: least squares, with p0 and v0 taken out of each. Errors are by the
-    scatter between tosses.
+    The model p = p0 + v0 t + g t^2 / 2 - R c is fitted by least squares, with p0 and v0 of each toss eliminated. The
+    errors are estimated from the scatter between tosses.
     """
     each = []
     for xs in flown:
@@ -138,14 +138,14 @@ def in_the_air(flown: list[Array]) -> tuple[Array, Array]:
 
 
 def scaled(tosses: list[Array], by: float) -> list[Array]:
-    """All lengths times `by`."""
+    """Return the tosses with all lengths multiplied by `by`."""
     columns = np.ones(13)
     columns[[4, 5, 6, 10, 11, 12]] = by
     return [xs * columns for xs in tosses]
 
 
 def errors_of(model: dd.Model, tosses: list[Array], starts: list[Array], values: dict[str, object]) -> Array:
-    """[% of the width] of each toss, from its start."""
+    """Return the error [% of the width] of each toss, simulated from its start."""
     found, each = [], round(1 / RATE / model.time_step)
     for xs, x0 in zip(tosses, starts, strict=True):
         motion = dd.rollout(model, x0, np.zeros(((len(xs) - 1) * each, 0)), parameters=values).xs[::each, 4:7]

@@ -1,10 +1,10 @@
-"""How a recorded cube's axes lie in it: turned by quarter turns about x, from one set of throws to the next.
+"""The orientation of a recorded cube's axes, which is rotated by quarter turns about x between sets of throws.
 
-The centre of mass of the cube of cube_tosses.py is 6 mm off the middle, and where it lies among the recorded axes
-differs: along -z, y, z or -y. Throws of one set follow each other and go the same way, and have the same axes. The
-motion before the first contact says which: what is left of the centre's path beside a parabola. All throws of a set
-vote. Their paths also bend sideways a little, each set's alike, as no gravity does that slides feel too; so that is
-fitted beside, along and across the way they go.
+The centre of mass of the cube in cube_tosses.py is 6 mm off the middle. In the recorded axes its direction differs: -z,
+y, z or -y. The throws of one set are consecutive and have the same direction and the same axes. The axes are estimated
+from the motion before the first contact, as the deviation of the centre's path from a parabola. All throws of a set
+vote. The paths of a set also bend sideways a little, all alike. Gravity is not the reason, as slides would show it too.
+The bend along and across the direction of the throws is therefore fitted as well.
 """
 
 from dataclasses import dataclass
@@ -15,26 +15,26 @@ from numpy.polynomial import legendre
 from drake_diff._base.arrays import Array
 
 QUARTERS = np.array([[[1, 0, 0], [0, c, -s], [0, s, c]] for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))], dtype=float)
-LEAST = 6  # samples in the air
-APART = np.radians(15)  # throws whose ways differ by more are of different sets
-ORDERS = 3  # polynomials beside a straight line whose part in a path is looked at
+LEAST = 6  # minimum number of samples in the air
+APART = np.radians(15)  # throws whose directions differ by more belong to different sets
+ORDERS = 3  # number of polynomials, besides a straight line, onto which a path is projected
 ROUNDS = 20
-TAILS = 3.0  # degrees of freedom: the scatter has outliers
+TAILS = 3.0  # degrees of freedom of a t-distribution, because the scatter has outliers
 
 
 @dataclass(frozen=True, eq=False)
 class Axes:
-    """What the motions in the air say."""
+    """The axes that are estimated from the motions in the air."""
 
-    quarter: Array  # (n,) int, turns about x from the recorded axes to those with the centre along -z
+    quarter: Array  # (n,) int, quarter turns about x from the recorded axes to axes with the centre of mass along -z
     sure: Array  # (n,) the probability of that turn
     sets: int
-    center: Array  # (3,) [m] of mass, by those axes
-    errors: Array  # (3,) standard errors of it
+    center: Array  # (3,) [m] centre of mass in these axes
+    errors: Array  # (3,) standard errors of the centre of mass
 
 
 def rotations(quaternions: Array) -> Array:
-    """(n, 3, 3) of (n, 4) w, x, y, z."""
+    """Return the rotation matrices (n, 3, 3) of quaternions (n, 4) w, x, y, z."""
     w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1)[:, None]).T
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -45,7 +45,7 @@ def rotations(quaternions: Array) -> Array:
 
 
 def turned(xs: Array, quarter: int) -> Array:
-    """The same motion (n, 13) by axes of the body that are turned so often about x."""
+    """Return the same motion (n, 13) with body axes that are rotated by `quarter` quarter turns about x."""
     c, s = np.cos(quarter * np.pi / 4), np.sin(quarter * np.pi / 4)
     w, x, y, z = xs[:, :4].T
     return np.concatenate(
@@ -54,10 +54,10 @@ def turned(xs: Array, quarter: int) -> Array:
 
 
 def axes_of(flights: dict[int, Array], count: int, rate: float, fitted: set[int]) -> Axes:
-    """Of `count` tosses in the order in which they were thrown; `flights` has their motions (n, 13) in the air.
+    """Estimate the axes of `count` tosses in the order of the throws; `flights` has their motions (n, 13) in the air.
 
-    The centre of mass, how paths bend and how they scatter are found from those of `fitted`; each of a set votes for
-    its turn. A toss without a flight has none.
+    The centre of mass, the bend of the paths and their scatter are estimated from the tosses in `fitted`. Each toss of
+    a set votes for the turn of the set. A toss without a flight has no vote.
     """
     sets = _sets({i: xs for i, xs in sorted(flights.items()) if len(xs) >= LEAST})
     parts = {i: _parts(flights[i], along, rate) for members, along in sets for i in members}
@@ -81,19 +81,19 @@ Part = tuple[Array, Array, Array]
 
 @dataclass(frozen=True, eq=False)
 class _Law:
-    """How paths in the air differ from straight lines."""
+    """The deviation of paths in the air from straight lines."""
 
-    bend: Array  # (3,) [m/s^2] along the way of a set, to its left and up
-    center: Array  # (3,) [m] of mass, by axes that are turned
-    variance: Array  # (ORDERS, 3) of the scatter beside it
-    errors: Array  # (3,) standard errors of the centre
+    bend: Array  # (3,) [m/s^2] along the direction of a set, to its left and up
+    center: Array  # (3,) [m] centre of mass in the rotated axes
+    variance: Array  # (ORDERS, 3) of the remaining scatter
+    errors: Array  # (3,) standard errors of the centre of mass
 
     def left(self, part: Part, k: int) -> Array:
         y, t, R = part
         return np.asarray(y - np.outer(t, self.bend) + R @ QUARTERS[k] @ self.center)
 
     def chances(self, sets: list[list[int]], parts: dict[int, Part]) -> dict[int, Array]:
-        """(4,) of each toss: the probabilities of its turns, which are those of its set."""
+        """Return the probabilities (4,) of the turns of each toss, which are those of its set."""
         found: dict[int, Array] = {}
         for members in sets:
             logs = np.zeros(4)
@@ -106,7 +106,7 @@ class _Law:
         return found
 
     def fitted(self, tosses: dict[int, tuple[Array, Part]]) -> "_Law":
-        """The law by weighted least squares over all turns, each as likely as it was."""
+        """Fit the law by weighted least squares over all turns, weighted with their previous probabilities."""
         H, v, squares = np.zeros((6, 6)), np.zeros(6), np.zeros((ORDERS, 3))
         for chance, part in tosses.values():
             y, t, R = part
@@ -122,7 +122,7 @@ class _Law:
 
 
 def _sets(flights: dict[int, Array]) -> list[tuple[list[int], Array]]:
-    """The tosses of each set of throws, and the axes along which it goes (3, 3)."""
+    """Return the tosses of each set of throws, and axes (3, 3) whose first is the direction of the set."""
     way = {i: xs[-1, 4:6] - xs[0, 4:6] for i, xs in flights.items()}
     angle = {i: float(np.arctan2(y, x)) for i, (x, y) in way.items()}
     sets: list[list[int]] = []
@@ -139,7 +139,7 @@ def _sets(flights: dict[int, Array]) -> list[tuple[list[int], Array]]:
 
 
 def _parts(xs: Array, along: Array, rate: float) -> Part:
-    """Of the path (ORDERS, 3), of t^2 / 2 (ORDERS,) and of rotations (ORDERS, 3, 3), the parts of each polynomial."""
+    """Project the path (ORDERS, 3), t^2 / 2 (ORDERS,) and the rotations (ORDERS, 3, 3) onto the polynomials."""
     n, t = len(xs), np.arange(len(xs)) / rate
     Q = np.linalg.qr(legendre.legvander(np.linspace(-1, 1, n), ORDERS + 1))[0][:, 2:]
     return Q.T @ xs[:, 4:7] @ along.T, Q.T @ (t**2 / 2), np.einsum("td,tij->dij", Q, along @ rotations(xs[:, :4]))

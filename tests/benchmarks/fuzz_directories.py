@@ -1,16 +1,16 @@
-"""Strangers' directories by the thousand: none may crash, hang, or lead the reader out of it; each refusal has a name.
+"""Open thousands of untrusted directories: none may crash, hang or cause reads outside; each refusal is a named error.
 
     python tests/benchmarks/fuzz_directories.py [--seed 0] [--count 1000] [--log FILE]
 
-A small run is changed by chance: values of its record, the bytes of its files, its model, its files themselves. Most
-are sealed again with all hashes right, as a stranger can. Then each is opened as users do: `verify`, `list`,
-`compare-runs`, `read_mcap`, and what `view` and `robustness` read. Counted are
+A small run is changed at random: values of its record, the bytes of its files, its model, or the files themselves. Most
+are sealed again with correct hashes, as an attacker can do. Then each is opened as users do: by `verify`, `list`,
+`compare-runs`, `read_mcap`, and the functions with which `view` and `robustness` read. The script counts
 
-- crashes: this process ends (the case is the last in the log), or a command says that it is a bug (exit status 4);
+- crashes: this process ends (the last case in the log is the cause), or a command reports a bug (exit status 4);
 - hangs: a case takes longer than HANG seconds;
-- reads outside: the names in the cases lead to canaries, which inotify watches, whichever process opens one, and to
-  files of the system, which this process does not open, by an audit hook;
-- errors without a name: what is raised is no DrakeDiffError.
+- reads outside: the names in the cases refer to canary files, which inotify watches for all processes, and to system
+  files, which an audit hook watches for this process;
+- errors without a name: the exception is not a DrakeDiffError.
 """
 
 import argparse
@@ -49,8 +49,8 @@ from drake_diff.logs import read_mcap
 from drake_diff.runs.verify import recalled
 from drake_diff.runs.view import scene_of_run
 
-HANG = 90.0  # [s] the limit of the process apart is 60, and this machine may be busy
-OPENED, ACCESSED = 0x20, 0x1  # of inotify
+HANG = 90.0  # [s]; the limit of the child process is 60 s, and this machine may be busy
+OPENED, ACCESSED = 0x20, 0x1  # inotify events
 FORBIDDEN = ("/etc/passwd", "/etc/shadow", "/root/.ssh", "/dev/zero", "/dev/random")
 INERTIA = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
 LINK = f'<link name="pole">{INERTIA}<visual><geometry>{{}}</geometry></visual></link>'
@@ -62,7 +62,7 @@ URDF = (
 
 
 def values(canaries):
-    """What is put into a field of a record."""
+    """Return the values that can be written into a field of a record."""
     out = str(canaries / "secret.urdf")
     return (
         None, True, 0, -1, 2**63, 10**300, 1e308, -1e-308, 0.5, -(2**70), "", "nan", "inf", "9" * 400, "x" * 100_000,
@@ -73,7 +73,7 @@ def values(canaries):
 
 
 def models(canaries):
-    """Robot files that end a parser, never end, or lead elsewhere, by their names."""
+    """Return (name, text) of robot files that crash a parser, never end, or refer to files outside."""
     out, kind = canaries / "secret", "transmission_interface/SimpleTransmission"
     mesh = '<mesh filename="{}"/>'
     deep = "<a>" * 20_000 + "</a>" * 20_000
@@ -109,7 +109,7 @@ def models(canaries):
 
 
 class Canaries:
-    """A folder whose files nobody may open; `opened` are those that were, by whichever process."""
+    """A folder whose files no process may open. `opened` counts the accesses by any process since its last call."""
 
     def __init__(self, folder):
         self.folder = folder
@@ -135,7 +135,7 @@ class Canaries:
 
 
 def bytes_changed(data, rng):
-    """A file's bytes: flipped, cut, grown, filled with what numbers mean most by."""
+    """Return bytes with random changes: flipped bits, a cut end, inserted bytes, extreme numbers, or a copied start."""
     data = bytearray(data)
     for _ in range(int(rng.integers(1, 5))):
         at, way = int(rng.integers(len(data) or 1)), rng.integers(6)
@@ -178,7 +178,7 @@ def record_changed(folder, rng, canaries):
 
 
 def _sealed(folder, fields):
-    """With all hashes right, where what is left is a record at all."""
+    """Write the record, with correct hashes if the fields are still a record."""
     try:
         seal(folder, fields)
     except (AttributeError, KeyError, TypeError, ValueError):
@@ -234,7 +234,7 @@ def messages_changed(folder, rng, _):
 
 
 def model_changed(folder, rng, canaries):
-    """Another robot file, as the record and the trace have it."""
+    """Replace the robot file, consistently in the record and the trace."""
     fields = json.loads((folder / "record.json").read_text())
     if rng.random() < 0.5:
         pool = models(canaries.folder)
@@ -245,7 +245,7 @@ def model_changed(folder, rng, canaries):
         ((how, data),) = broken(ending, int(rng.integers(2**31)), 1)
         name = f"robot.{ending}"
     _with_model(folder, fields, name, data)
-    if rng.random() < 0.3:  # one that is to be read where it stood
+    if rng.random() < 0.3:  # a model that must be read from its original path
         fields["provenance"]["model_file"] = str(
             rng.choice([str(canaries.folder / f"secret.{e}") for e in ("urdf", "xml")])
         )
@@ -255,7 +255,7 @@ def model_changed(folder, rng, canaries):
 
 
 def replace_model(folder, name, data):
-    """Another robot file, all hashes right."""
+    """Replace the robot file, with correct hashes."""
     fields = json.loads((folder / "record.json").read_text())
     _with_model(folder, fields, name, data)
     seal(folder, fields)
@@ -268,7 +268,7 @@ def _with_model(folder, fields, name, data):
 
 
 def with_attachment(path, old, new, data):
-    """The trace with another file in the place of the model's."""
+    """Rewrite the trace with another file in place of the model's file."""
     real = Writer.add_attachment
 
     def add(self, create_time, log_time, name, media_type, content):
@@ -322,7 +322,7 @@ WAYS = {
 
 
 def command(*words):
-    """How a command ends in this process: its exit status, and what it wrote."""
+    """Run a command in this process and return its exit status and its output."""
     out, argv = io.StringIO(), sys.argv
     sys.argv = ["drake-diff", *map(str, words)]
     try:
@@ -336,7 +336,7 @@ def command(*words):
 
 
 def opened_as_users_do(folder, base, wanted):
-    """(what, how it ended) of each way to open a directory; all of them, or those `wanted`."""
+    """Open a directory in each way in `wanted`, and yield (way, outcome)."""
     commands = {
         "verify": ("verify", folder),
         "list": ("list", folder.parent),
@@ -365,9 +365,9 @@ def opened_as_users_do(folder, base, wanted):
 
 
 def fuzz(count, seed, *, log=None, every_model=False):
-    """Counts of what went wrong, and how the ways to open a directory ended.
+    """Return the failures, the number of each outcome of opening a directory, and the longest time [s] of a case.
 
-    With `every_model`, at most `count` files of `models` are tried, once each; a run that holds with one is wrong too.
+    With `every_model`, at most `count` files of `models` are tried, once each. Accepting one is a failure.
     """
     rng, ended, wrong, slowest = np.random.default_rng(seed), Counter(), [], 0.0
     read = []

@@ -1,15 +1,15 @@
-"""Strangers' recordings and robot files by the thousand: each refusal has a name, within 60 s and 1 GiB.
+"""Read thousands of untrusted recordings and robot files: each refusal is a named error, within 60 s and 1 GiB.
 
     python tests/benchmarks/fuzz_files.py recordings|models [--seed 0] [--count 1000]
 
-Recordings are CSV files, MCAP files and ROS 2 bags; models are URDF, SDF, MJCF and .dmd.yaml files, and meshes as
-OBJ, STL, VTK and glTF. A good file is changed by chance, or is one of a list. Each is read in a process forked from
-this one that may have 1 GiB more and 60 s, as users do: `read_recording`, `read_mcap` and what `identify` checks first;
-of models as commands do (`crash_of`), then `load_model`, a step and `audit`, and each 25th with isolated=True. Counted:
+Recordings are CSV files, MCAP files and ROS 2 bags. Models are URDF, SDF, MJCF and .dmd.yaml files, with OBJ, STL, VTK
+and glTF meshes. A valid file is changed at random, or drawn from a list. A forked process (60 s, 1 GiB more memory)
+runs `read_recording`, `read_mcap` and the first checks of `identify` on a recording, and `load_model`, a step and
+`audit` on a model, which `crash_of` loads first. Every 25th model is also loaded with isolated=True. The script counts
 
 - crashes, and runs that reach a limit;
-- errors without a name: what is raised is no DrakeDiffError;
-- code execution: a process, a connection or a class of a pickle, by an audit hook, or the file that all payloads make.
+- errors without a name: the exception is not a DrakeDiffError;
+- code execution: an audit hook reports a process, a connection or an unpickled class, or the payloads' file exists.
 """
 
 import argparse
@@ -53,7 +53,7 @@ from drake_diff.logs.channels import input_channel, state_channel
 from drake_diff.logs.mcap_file import write_mcap
 
 SECONDS, MEMORY = 60, 2**30
-OF_CACHES = ("numba", "copyreg", "builtins", "llvmlite")  # packages of which Numba's own files have classes
+OF_CACHES = ("numba", "copyreg", "builtins", "llvmlite")  # packages with classes in Numba's own cache files
 STARTED = ("os.system", "os.exec", "os.posix_spawn", "subprocess.Popen", "socket.connect", "pickle.find_class")
 JOINTS = "sensor_msgs/msg/JointState"
 ROWS = 40
@@ -85,7 +85,7 @@ def motion():
 
 
 def put_recordings(folder, model):
-    """A good recording of each kind, by its name in the folder."""
+    """Write a valid recording of each kind into the folder."""
     times, xs, us = motion()
     header = ",".join(["time", *model.state_names, *model.input_names])
     rows = [",".join(map(repr, [t, *x, 0.0])) for t, x in zip(times.tolist(), xs.tolist(), strict=True)]
@@ -112,7 +112,7 @@ def put_recordings(folder, model):
 
 
 def csv_changed(text, rng, canary):
-    """What is wrong, and the bytes."""
+    """Return (name of the change, bytes) of a changed CSV file."""
     lines = text.splitlines()
     way, at = int(rng.integers(12)), int(rng.integers(1, len(lines)))
     cells = lines[at].split(",")
@@ -141,7 +141,7 @@ def csv_changed(text, rng, canary):
 
 
 def mcap_changed(data, rng):
-    """The bytes of an MCAP file: changed as such, or in a chunk whose checksum is right again, or a bomb."""
+    """Return (name, bytes): an MCAP file with changed bytes, or with a changed or huge chunk and its checksum."""
     if rng.random() < 0.6:
         return "bytes", bytes_changed(data, rng)
     place = data.find(b"\x06", 8)
@@ -162,7 +162,7 @@ def mcap_changed(data, rng):
 
 
 def recording_changed(folder, rng, canary):
-    """What is wrong, and the path."""
+    """Change a recording and return (name of the change, path)."""
     name = str(rng.choice(["run.csv", "run.mcap", "ros.mcap", "bag", "old"], p=[0.4, 0.2, 0.15, 0.125, 0.125]))
     path = folder / name
     if name == "run.csv":
@@ -260,7 +260,7 @@ def chain(count):
 
 
 def model_changed(folder, rng, canaries):
-    """What is wrong, the path, and options to load it with."""
+    """Write a changed model and return (name of the change, path, options to load it)."""
     put(folder)
     options = {
         "time_step": 0.01,
@@ -310,11 +310,11 @@ def load_as_users_do(path, options):
     dd.audit(model)
 
 
-# ---- both ----------------------------------------------------------------------------------------------------------
+# ---- recordings and models -----------------------------------------------------------------------------------------
 
 
 def outcome_of(action, log):
-    """How a forked process with limits ends that calls `action`: "read", the name of an error, or what is wrong."""
+    """Call `action` in a forked process with limits; return "read", the name of an error, or "WRONG" with a reason."""
     log.write_text("")
 
     def act():
@@ -396,7 +396,7 @@ def fuzz(kind, count, seed):
 
 
 def isolated(path, options, crash):
-    """ "" where an isolated load ends by a named error, or loads what did not crash."""
+    """Return "" if an isolated load raises a named error or loads a file that did not crash, or else the failure."""
     try:
         dd.load_model(path, isolated=True, **options)
     except DrakeDiffError:

@@ -1,13 +1,13 @@
-"""Altered pages, scenes and sentences, all hashes and content policies being right: none may hold.
+"""Alter pages, scenes and sentences, with correct hashes and content policies: `verify` must accept none of them.
 
     python tests/benchmarks/fuzz_pages.py [--seed 0] [--count 300]
 
-Directories of eight kinds are saved, two of each that shows a motion. Then a page of one is changed by chance: its
-scene is that of another run, or has another number, or a command in it is cut; a script, a picture, words or a number
-of a plot are put into it; it is another run's; or a sentence is another, in the record, the trace and all pages.
-Counted by kind and by alteration is what `verify` says. What is not made again (scenes and plots of comparisons and
-trials) may be "intact", which says that contents are not checked; what holds is missed. Unaltered directories that are
-refused are false alarms.
+Directories of eight kinds are saved, two of each kind that shows a motion. Then one page is altered at random. Its
+scene is replaced by that of another run, or gets another number or a truncated command. A script, a picture or words
+are inserted, a number of a plot is changed, or the page is replaced by another run's. Some alterations change the
+sentence in the record, the trace and all pages. The verdicts of `verify` are counted by kind and by alteration. What is
+not reproduced (scenes and plots of comparisons and trials) may be "intact", which states that contents are not checked.
+An alteration that "holds" is missed. Unaltered directories that are refused are false alarms.
 """
 
 import argparse
@@ -70,7 +70,7 @@ def save_kinds(folder):
 
 
 def number_in_scene(page, _, rng):
-    """One number of a command larger or smaller by a thousandth of the largest there, to all of it."""
+    """Change one number of a command by 0.001 to 1 times the largest number in the command."""
     wanted = int(rng.integers(len(COMMAND.findall(unescape(page)))))
 
     def change(i, data):
@@ -86,7 +86,7 @@ def number_in_scene(page, _, rng):
 
 
 def bytes_of_scene(page, _, rng):
-    """A command that is cut, or without anything in it."""
+    """Truncate a command, possibly to nothing."""
     wanted = int(rng.integers(len(COMMAND.findall(unescape(page)))))
     return with_commands(page, lambda i, data: data[: int(rng.integers(len(data)))] if i == wanted else data)
 
@@ -106,7 +106,7 @@ def picture(page, _, rng):
 
 
 def plot(page, _, rng):
-    """A digit of what a page plots, of a number that is no millionth."""
+    """Change the digit before the decimal point of a number that a page plots."""
     start = page.find('id="data">')
     digits = [m.start() for m in re.finditer(r"(?<=[\[,])\d(?=\.\d+[,\]])", page)] if start > 0 else []
     digits = [at for at in digits if start < at < page.index("</script>", start)]
@@ -123,7 +123,7 @@ PAGES |= {"page of another run": lambda page, other, _: other}
 
 
 def sentence_changed(folder, rng):
-    """Another sentence in the record and in all that shows it."""
+    """Change the sentence in the record and in all files that show it."""
     fields = json.loads((folder / "record.json").read_text())
     old = fields["sentence"]
     fields["sentence"] = f"{old} It was checked on the robot."
@@ -136,7 +136,7 @@ def sentence_changed(folder, rng):
 
 
 def altered(folder, other, rng):
-    """What was changed in `folder`, or None; `other` is a run of the same kind, if there is one."""
+    """Alter `folder` and return the name of the change, or None; `other` is a run of the same kind, if it exists."""
     if rng.random() < 0.1:
         sentence_changed(folder, rng)
         return "sentence"
@@ -158,7 +158,7 @@ def altered(folder, other, rng):
 
 
 def fuzz(count, seed):
-    """Counts of verdicts by kind and alteration, what was missed, and the false alarms among so many directories."""
+    """Return verdict counts by kind and alteration, missed alterations, false alarms and the number of directories."""
     rng, verdicts, missed = np.random.default_rng(seed), Counter(), []
     with tempfile.TemporaryDirectory() as name, warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -193,7 +193,7 @@ def main():
     asked = parser.parse_args()
     start = time.monotonic()
     verdicts, missed, alarms, saved = fuzz(asked.count, asked.seed)
-    for column in (0, 1, 2):  # by kind, by alteration, and of all
+    for column in (0, 1, 2):  # by kind, by alteration, and in total
         counts = Counter()
         for key, number in verdicts.items():
             counts[key[column], key[2]] += number

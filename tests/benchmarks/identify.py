@@ -1,20 +1,20 @@
-"""Whether `dd.explain` names what was changed: 20 robots, recorded by MuJoCo in steps of 0.25 ms.
+"""Test whether `dd.explain` names a planted change: 20 robots, simulated by MuJoCo in steps of 0.25 ms.
 
     pip install -e '.[test]'
     python tests/benchmarks/identify.py [--seed 0] [--count 600] [--changes 0 1 2] [--soft] [--out FILE.json]
     python tests/benchmarks/identify.py --chance 100000 [--seed 0] [--count 20]
 
-Each case is a robot of example-robot-data or of models/, on its base for 2 s at 100 Hz. A controller leads it along
-sums of sines within its joints' ranges, by torques that are held for 10 ms and recorded. Positions have the noise of an
-encoder, 0.2 mrad; velocities are not recorded. In turn nothing is changed, and anything that is named is a false alarm;
-one thing is; or two are: a mass with its inertia, a centre of mass, a damping, the dry friction of a joint, the
-strength of an input, a delay of all inputs, the bias of an encoder, or gravity. Dry friction stops a joint within two
-of MuJoCo's steps; with --soft it is MuJoCo's by default, which slows a joint down over 10 ms and lets it creep. A
-change that moves no joint by more than five times the noise, in MuJoCo and under the same torques, is drawn anew. So
-is a bias with which the robot could be where its encoder says that it is.
+Each case is a robot of example-robot-data or of models/, on a fixed base for 2 s at 100 Hz. A controller moves it along
+sums of sines within its joint ranges. Its torques are constant for 10 ms and are recorded. Positions have encoder noise
+of 0.2 mrad; velocities are not recorded. In turn, zero, one or two parameters are changed. With zero, any named change
+is a false alarm. The candidates are a mass with its inertia, a centre of mass, a damping, a joint's Coulomb friction,
+the strength of an input, a delay of all inputs, the bias of an encoder, and gravity. Coulomb friction stops a joint
+within two of MuJoCo's steps. With --soft it is MuJoCo's default, which slows a joint down over 10 ms and lets it creep.
+A change that moves no joint by more than five times the noise, in MuJoCo under the same torques, is drawn again. So is
+a bias that has the same effect as another initial position.
 
-With --chance, nothing is changed, and noise is drawn so often for each robot: in which share of the draws some change
-passes the limit, and in which it passes the penalty of BIC alone.
+With --chance, nothing is changed, and noise is drawn that many times for each robot. The output is the share of draws
+in which a change exceeds the limit, and the share in which a change exceeds the penalty of BIC alone.
 """
 
 import argparse
@@ -56,13 +56,13 @@ ROBOTS = (
     "double_pendulum_simple",
     "hextilt_flying_arm_5",
     "a1",
-)  # of which MuJoCo takes the inertias; fmt: skip
+)  # robots whose inertias MuJoCo accepts; fmt: skip
 KINDS = ("mass", "damping", "center_of_mass", "coulomb_friction", "strength", "input_delay", "bias", "gravity")
-FINER = 4  # parts of a sample, of which delays are whole numbers
-SEEN = 5  # times the noise that a change moves some joint by
-DRAWS = 100  # after so many changes of a kind that show nothing another kind is drawn
-STIFF, DAMPED = 8.0, 0.7  # [rad/s] of the controller
-BEGUN = 0.4  # [s] after which the sines are whole
+FINER = 4  # parts of a sample; a delay is a whole number of them
+SEEN = 5  # least motion of some joint due to a change, relative to the noise
+DRAWS = 100  # number of changes without a visible effect after which another kind is drawn
+STIFF, DAMPED = 8.0, 0.7  # [rad/s] natural frequency of the controller, and its damping ratio
+BEGUN = 0.4  # [s] after which the sines have their full amplitude
 
 
 def loaded(root, robot):
@@ -74,18 +74,18 @@ def loaded(root, robot):
 
 
 class NoMotionError(Exception):
-    """The controller does not hold the robot as it was changed."""
+    """The controller does not stabilize the changed robot."""
 
 
 class UnseenError(Exception):
-    """This robot shows nothing of such a change, as of a bias where all axes are vertical."""
+    """The changes have no visible effect on this robot, such as a bias if all axes are vertical."""
 
 
 class Truth:
-    """The robot that is recorded, and the names of what is not the file's."""
+    """The recorded robot, and the parameters whose values differ from the file."""
 
     def __init__(self, root, joints, nu, soft=False):
-        self.soft = soft  # whether dry friction is MuJoCo's by default
+        self.soft = soft  # whether Coulomb friction is MuJoCo's default
         self.root, self.joints, self.changes = copy.deepcopy(root), joints, {}
         self.friction, self.strength = np.zeros(len(joints)), np.ones(nu)
         self.late, self.bias, self.gravity = 0, np.zeros(len(joints)), np.array([0, 0, -9.81])
@@ -132,7 +132,7 @@ class Truth:
             self.changes["model.gravity"] = list(self.gravity)
 
     def run(self, model, q0, command):
-        """(positions (N + 1, n) as encoders without noise say them, inputs (N, nu)); command(k, q, v) is an input."""
+        """Return (encoder positions (N + 1, n) without noise, inputs (N, nu)); command(k, q, v) returns an input."""
         root = copy.deepcopy(self.root)
         if all(link.get("name") != "world" for link in root.iter("link")):
             root.insert(0, ET.Element("link", name="world"))
@@ -142,7 +142,7 @@ class Truth:
         ids = [mujoco.mj_name2id(engine, mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in self.joints]
         q, v = engine.jnt_qposadr[ids], engine.jnt_dofadr[ids]
         engine.dof_frictionloss[v], engine.opt.gravity[:] = self.friction, self.gravity
-        if not self.soft:  # friction that stops a joint within two steps, and holds it where it can
+        if not self.soft:  # friction that stops a joint within two steps and keeps it at rest if it can
             engine.dof_solimp[v, :2], engine.dof_solref[v] = 0.9999, (2 * base.STEP, 1)
         data = mujoco.MjData(engine)
         data.qpos[q] = q0
@@ -161,7 +161,7 @@ class Truth:
 
 
 def led(model, random):
-    """(first positions, command(k, q, v)): a controller along sines within the joints' ranges."""
+    """Return (first positions, command(k, q, v), size of the torques) of a controller along sines in the ranges."""
     lower, upper = (np.clip(limit, -2, 2) for limit in model.position_limits)
     lower, upper = np.where(upper - lower > 1e-3, lower, -2.0), np.where(upper - lower > 1e-3, upper, 2.0)
     q0 = lower + random.uniform(0.35, 0.65, model.nq) * (upper - lower)
@@ -185,7 +185,7 @@ def led(model, random):
         model.plant.SetPositionsAndVelocities(context, np.concatenate([q, v]))
         inertia = model.plant.CalcMassMatrix(
             context
-        )  # by its diagonal a Panda whose joints 1 and 3 are in line chatters
+        )  # with its diagonal alone, a Panda whose joints 1 and 3 are in line chatters
         pull = inertia @ (STIFF**2 * (path[k] - q) + 2 * DAMPED * STIFF * (speed[k] - v))
         return np.clip(back @ (ahead[k] + pull), -limits, limits)
 
@@ -194,7 +194,7 @@ def led(model, random):
 
 
 def recorded(robot, kinds, seed, soft=False):
-    """(model, recording, truth)."""
+    """Draw a case and return (model, recording, truth)."""
     random = np.random.default_rng(seed)
     root = base.bare(OURS / f"{Path(robot).name}.urdf" if robot.startswith("models/") else robot_file(f"{robot}.urdf"))
     model = loaded(root, robot)
@@ -220,7 +220,7 @@ def recorded(robot, kinds, seed, soft=False):
 
 
 def seen_without(truth, kind, root, model, q0, qs, us):
-    """Whether the same torques move the robot otherwise where this change is not made."""
+    """Return whether the same torques move the robot differently without this change."""
     other = copy.deepcopy(truth)
     if kind == "coulomb_friction":
         other.friction[:] = 0
@@ -228,7 +228,7 @@ def seen_without(truth, kind, root, model, q0, qs, us):
         other.strength[:] = 1
     elif kind == "input_delay":
         other.late = 0
-    elif kind == "bias":  # what is measured could be where the robot is: of an upright first joint that changes nothing
+    elif kind == "bias":  # start at the measured position; a bias of a vertical first joint has no effect
         q0, other.bias = q0 + truth.bias, np.zeros_like(truth.bias)
     elif kind == "gravity":
         other.gravity = np.array([0, 0, -9.81])
@@ -285,7 +285,7 @@ def measure(robot, kinds, seed, soft=False):
 
 
 def kinds_of(seed, i, count):
-    """So many kinds, of which no two are alike; every kind is met by every robot as cases go on."""
+    """Return `count` different kinds of changes. With enough cases, every robot gets every kind."""
     random = np.random.default_rng([seed, i])
     return tuple(str(kind) for kind in random.choice(KINDS, count, replace=False))
 
@@ -308,7 +308,7 @@ def rates(cases):
 
 
 def drawn(robot, count, seed, i, soft):
-    """Of kinds of changes of which the robot shows something."""
+    """Measure a case with kinds of changes that have a visible effect on the robot."""
     for other in range(DRAWS):
         try:
             return measure(robot, kinds_of(seed, i + 1000 * other, count), 10000 * seed + i, soft)

@@ -1,11 +1,11 @@
-"""Whether `dd.explain` names columns of a recording that are exchanged, have the other sign, or are in degrees.
+"""Test whether `dd.explain` names columns of a recording that are exchanged, have the wrong sign, or are in degrees.
 
     pip install -e '.[test]'
     python tests/benchmarks/identify_columns.py [--seed 0] [--count 40]
 
-The recordings are those of `identify.py` in which nothing is changed: robots that MuJoCo moved for 2 s, with the
-noise of an encoder and no velocities. In each, in turn, nothing is mistaken, and anything that is named is a false
-alarm; or two positions or two inputs are exchanged, a position or an input has the other sign, or angles are degrees.
+The recordings are those of `identify.py` without a change: robots simulated by MuJoCo for 2 s, with encoder noise and
+without velocities. In turn, a recording has no mistake (any named column is a false alarm), two positions or two inputs
+are exchanged, a position or an input has the wrong sign, or angles are in degrees.
 """
 
 import argparse
@@ -23,7 +23,7 @@ KINDS = ("nothing", "positions exchanged", "inputs exchanged", "position mirrore
 
 
 def mistaken(model, log, kind, random):
-    """(the recording with the mistake, the names of its columns)."""
+    """Return (the recording with the mistake, the names of the mistaken columns)."""
     xs, us = log.xs.copy(), log.us.copy()
     values, names = (us, model.input_names) if kind.startswith("input") else (xs[:, : model.nq], model.position_names)
     some = [int(i) for i in sorted(random.choice(values.shape[1], 2, replace=False))]
@@ -58,7 +58,7 @@ def verdict(model, log, kind, columns):
 
 
 def measure(seed, i):
-    """(robot, kind, processor seconds, verdict, columns, sentence) of the i-th case."""
+    """Return (robot, kind, processor seconds, verdict, columns, sentence) of the i-th case."""
     robot, kind = ROBOTS[i // len(KINDS) % len(ROBOTS)], KINDS[i % len(KINDS)]
     random = np.random.default_rng([seed, i])
     model, log, _ = causes.recorded(robot, (), 10000 * seed + i)

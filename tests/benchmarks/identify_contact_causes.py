@@ -1,18 +1,18 @@
-"""Whether `dd.explain` names what was changed in a model whose bodies touch: a sphere, a block, a box, a hopper, dogs.
+"""Test whether `dd.explain` names a change in a model with contact: sphere, block, box, hopper or quadruped.
 
     pip install -e '.[test]'
     python tests/benchmarks/identify_contact_causes.py [--seed 0] [--count 24] [--robots anymal go2] [--by finer]
 
-Each case is a motion of 0.6 s, sampled every 10 ms, by Drake's steps of 5 or 2.5 ms, which are the model's too.
+Each case is a motion of 0.6 s, sampled every 10 ms. Drake simulates it with the model's own steps of 5 or 2.5 ms.
 Positions have a noise of 0.1 mm and 0.5 mrad, velocities of 5 mm/s and 25 mrad/s. A sphere and a block are thrown onto
-the ground, a pusher moves a box, and a controller lets a hopper land and hop by recorded torques. In every third case
-nothing is changed, and anything that is named is a false alarm. Else one thing is, by 15 to 50 %: a friction,
-stiffness, dissipation, radius (by 3 to 10 %), a mass, a damping, gravity along the vertical (by 5 to 20 %), or the
-height of the ground (by 3 to 10 mm). A change that moves nothing by more than five times its noise is drawn anew.
+the ground, a pusher moves a box, and a controller makes a hopper land and hop with recorded torques. In every third
+case nothing is changed, and any named change is a false alarm. In the others, one parameter changes by 15 to 50 %: a
+friction, stiffness, dissipation, radius (by 3 to 10 %), mass or damping, vertical gravity (by 5 to 20 %), or the height
+of the ground (by 3 to 10 mm). A change that moves nothing by more than five times its noise is drawn again.
 
 anymal, go2 and solo12 of example-robot-data, named by --robots, drop onto their feet and squat under a PD controller.
-With --by finer Drake records in steps of a fifth of the model's, with --by mujoco MuJoCo does, which changes nothing:
-there the model's parameters are right and its law of contact is not, so "not explained" is as good as "right".
+With --by finer, Drake uses a fifth of the model's step. With --by mujoco, MuJoCo simulates and nothing is changed: the
+model's parameters are right and its contact law is not, so "not explained" is as good as "right".
 """
 
 import argparse
@@ -20,7 +20,7 @@ import sys
 import time
 from pathlib import Path
 
-sys.path.append(str(Path(__file__).parents[1]))  # the robots that the tests have
+sys.path.append(str(Path(__file__).parents[1]))  # tests/helpers
 
 import numpy as np
 from helpers.contact_recordings import DOGS, recorded

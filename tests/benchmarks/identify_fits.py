@@ -1,13 +1,13 @@
-"""Whether `dd.identify` finds what was changed: robots of example-robot-data, recorded by MuJoCo in steps of 0.25 ms.
+"""Test whether `dd.identify` finds changed values: robots of example-robot-data in MuJoCo with steps of 0.25 ms.
 
     pip install -e '.[test]'
     python tests/benchmarks/identify_fits.py [--seed 0] [--count 40] [--out FILE.json]
 
-Each case is a robot on its base for 2 s at 100 Hz, with torques that weigh it and shake it, and the noise of an
-encoder, 0.2 mrad, on its positions; velocities are not recorded, and joints have no limits. One body's mass (with its
-inertia) and one joint's damping are not the file's. Both are estimated, and the damping of a third joint, which is
-right. In every fourth case nothing is changed, and in every fourth other one the joints have dry friction, which the
-model has not.
+Each case is a robot on a fixed base for 2 s at 100 Hz, with torques that compensate its weight and shake it. Positions
+have encoder noise of 0.2 mrad, velocities are not recorded, and joints have no limits. One body's mass (with its
+inertia) and one joint's damping differ from the file. Both are estimated, together with the damping of another joint,
+which is right. In one of four cases nothing is changed. In another one of four, the joints have Coulomb friction, which
+the model lacks.
 """
 
 import argparse
@@ -35,12 +35,12 @@ import drake_diff as dd
 
 ROBOTS = ("ur5_robot.urdf", "z1.urdf", "so100.urdf")
 PERIOD, SAMPLES, STEP, NOISE = 0.01, 200, 2.5e-4, 2e-4  # [s], and [rad]
-DAMPING = 0.05  # [N m s/rad] of joints whose file gives none
-FRICTION = 0.05  # of the largest torque that holds the robot up
+DAMPING = 0.05  # [N m s/rad] of joints without damping in their file
+FRICTION = 0.05  # relative to the largest torque that holds the robot against gravity
 
 
 def bare(path):
-    """The file without shapes, motors, followers and dry friction, and with damping in every joint."""
+    """Return the file without shapes, motors, mimic elements and Coulomb friction, with damping in every joint."""
     root = ET.parse(path).getroot()
     for element in list(root.iter()):
         for child in list(element):
@@ -60,7 +60,7 @@ def moving(root):
 
 
 def scale(root, name, factor):
-    """Change `link.mass`, and the inertia with it, or `joint.damping`."""
+    """Scale `link.mass` together with the inertia, or scale `joint.damping`."""
     label, quantity = name.rsplit(".", 1)
     if quantity == "damping":
         element = next(joint for joint in moving(root) if joint.get("name") == label).find("dynamics")
@@ -74,7 +74,7 @@ def scale(root, name, factor):
 
 
 def inverse_dynamics(plant, context, q, v, rate):
-    """(nv,) the forces of the joints that give the accelerations `rate`, by pydrake: gravity and damping included."""
+    """Return pydrake's joint forces (nv,) for the accelerations `rate`, including gravity and damping."""
     plant.SetPositionsAndVelocities(context, np.concatenate([q, v]))
     forces = MultibodyForces(plant)
     plant.CalcForceElementsContribution(context, forces)
@@ -82,7 +82,7 @@ def inverse_dynamics(plant, context, q, v, rate):
 
 
 def by_mujoco(root, joints, q0, torques, friction, period=PERIOD, gravity=(0, 0, -9.81)):
-    """(N + 1, 2 n) positions and velocities of `joints`, from rest, under N torques that act for a period each."""
+    """Return positions and velocities (N + 1, 2 n) of `joints` from rest, under N torques of one period each."""
     root = copy.deepcopy(root)
     if all(link.get("name") != "world" for link in root.iter("link")):
         root.insert(0, ET.Element("link", name="world"))
@@ -112,8 +112,8 @@ class Case:
     reason: str = ""
     covered: list = field(default_factory=list)
     misses: list = field(default_factory=list)
-    alarms: list = field(default_factory=list)  # parameters that are said to differ, and do not
-    widths: list = field(default_factory=list)  # half an interval, in parts of the value
+    alarms: list = field(default_factory=list)  # unchanged parameters that are reported as different
+    widths: list = field(default_factory=list)  # half widths of the intervals, relative to the values
     seconds: float = 0.0
 
 

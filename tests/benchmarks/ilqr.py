@@ -1,4 +1,4 @@
-"""A Panda reaches by iLQR, at rest without effort, to where a full step promises less than its `stop` of cost."""
+"""A Panda's reach by iLQR, from rest with zero inputs, until a full step predicts a cost decrease below `stop`."""
 
 import math
 import re
@@ -15,7 +15,7 @@ from drake_diff.optimize.program import Limits
 
 
 def panda_reach(folder: Path) -> dict:
-    """State cost q, v, u rates and final weights. `cost` scales our tolerance."""
+    """Return the task, with running and final weights of q, v and u. `cost` scales the tolerance of `ours`."""
     goal = [0.0, -0.78, 0.0, -2.36, 0.0, 1.57, 0.78, *[0.0] * 7]
     start = [1.0, 0.2, -0.5, -1.2, 0.4, 2.2, -0.3, *[0.0] * 7]
     task = {"urdf": str(_undamped(panda_arm(folder), folder)), "time_step": 0.01, "count": 100}
@@ -24,9 +24,9 @@ def panda_reach(folder: Path) -> dict:
 
 
 def _undamped(urdf: Path, folder: Path) -> Path:
-    """Without joint damping, stops at limits and shapes: nothing touches."""
+    """Write the URDF without joint damping, joint limits and shapes, so that there is no contact."""
     text = re.sub(r"<dynamics[^>]*/>", "", urdf.read_text())
-    text = re.sub(r"<(visual|collision)>.*?</\1>", "", text, flags=re.DOTALL)  # nothing is to touch
+    text = re.sub(r"<(visual|collision)>.*?</\1>", "", text, flags=re.DOTALL)
     text = re.sub(r'(lower|upper)="[^"]*"', lambda m: f'{m[1]}="{-100 if m[1] == "lower" else 100}"', text)
     path = folder / f"undamped_{urdf.name}"
     path.write_text(text)
@@ -34,7 +34,7 @@ def _undamped(urdf: Path, folder: Path) -> Path:
 
 
 def ours(task: dict) -> dict:
-    """One solve, the model's loading included."""
+    """Load the model and solve the task once."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
         model = dd.load_model(task["urdf"], time_step=task["time_step"], weld_base=task.get("base"))

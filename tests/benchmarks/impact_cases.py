@@ -1,9 +1,9 @@
-"""Random motions through impact, by seed: each as a discrete model, and as the same plant in continuous time.
+"""Seeded random motions through impact, each as a discrete model and as the same plant in continuous time.
 
-`case(seed, number)` is number `number` of a seed: a bounce, a toss, a slide that sticks, a roll, a rod or a pendulum
-that strikes the ground, two bodies that hit each other, a ball thrown at a box, capsule, cylinder or sphere. What a
-case is follows from its formulas and the seed alone. `Case.diagram(time_step, changes)` builds its plant with Drake;
-the package is not needed for that, only `Case.model()` loads it.
+`case(seed, number)` returns one case of a seed: a bounce, a toss, a slide that sticks, a roll, a rod or a pendulum
+that strikes the ground, two bodies that hit each other, or a ball thrown at a box, capsule, cylinder or sphere. A case
+depends only on its formulas and the seed. `Case.diagram(time_step)` builds the plant with Drake and does not use the
+package. Only `Case.model()` imports it.
 """
 
 from collections.abc import Callable, Mapping
@@ -28,14 +28,14 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 
 FAMILIES = ("bounce", "toss", "slide", "roll", "rod", "two", "wall", "pendulum")
 STIFFNESS = "stiffness"
-INTERVAL = 0.01  # [s] of the model's steps
+INTERVAL = 0.01  # [s] the model's step
 STICTION = 1e-3  # [m/s]
 AXES = {"x": [1.0, 0, 0], "y": [0, 1.0, 0], "z": [0, 0, 1.0]}
 
 
 @dataclass(frozen=True)
 class Material:
-    """One side of a contact, as Drake takes it."""
+    """The material of one body in contact, with Drake's parameters."""
 
     friction: float
     stiffness: float  # [N/m]
@@ -52,7 +52,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Mover:
-    """A body with spheres of one `radius`. Without `axes` it is free, "xz" slides, "hinge" turns about y at `pivot`."""
+    """A body with spheres of one `radius`: free without `axes`, "xz" on slides, "hinge" rotates about y at `pivot`."""
 
     name: str
     mass: float
@@ -61,10 +61,10 @@ class Mover:
     centers: tuple[tuple[float, float, float], ...]
     material: Material
     axes: str = ""
-    pivot: float = 0.0  # [m] its height
-    arm: float = 0.0  # [m] how far below it the ball is
-    spring: float = 0.0  # [N/m] on the first slide, at rest at 0
-    effort: float = 0.0  # [N m] of a motor in the hinge, if any
+    pivot: float = 0.0  # [m] height of the hinge
+    arm: float = 0.0  # [m] distance of the ball below the hinge
+    spring: float = 0.0  # [N/m] on the first slide, relaxed at 0
+    effort: float = 0.0  # [N m] limit of a motor in the hinge
 
     def inertia(self) -> SpatialInertia:
         if len(self.sizes) == 1:
@@ -75,7 +75,7 @@ class Mover:
 
 @dataclass(frozen=True)
 class Obstacle:
-    """What is fixed in the world: "ground", "box", "capsule", "cylinder" or "sphere"."""
+    """A shape that is fixed in the world: "ground", "box", "capsule", "cylinder" or "sphere"."""
 
     kind: str
     sizes: tuple[float, ...]
@@ -93,11 +93,11 @@ class Obstacle:
 
 @dataclass(frozen=True)
 class Case:
-    """One motion, its loss at the end, and the columns of its gradient that are judged.
+    """One motion, its loss at the end, and the columns of its gradient that are tested.
 
-    A column is a number of the state, a contact parameter "body.quantity", the "stiffness" of all that touches, or the
-    "input", which is held throughout. The stiffness is that of both sides, since Drake's discrete plants let a contact
-    act nearer to the stiffer side, its continuous ones in the middle.
+    A column is an index of the state, a contact parameter "body.quantity", the common "stiffness" of all shapes, or the
+    constant "input". The stiffness is that of both sides, because in Drake's discrete plants a contact force acts
+    nearer to the stiffer side, and in its continuous plants it acts in the middle.
     """
 
     seed: int
@@ -109,9 +109,9 @@ class Case:
     gravity: tuple[float, float, float]
     x0: tuple[float, ...]
     num_steps: int
-    weights: tuple[float, ...]  # of the final state; loss = weights x, or half the square of what is left to `target`
+    weights: tuple[float, ...]  # of the final state; loss = weights x, or (weights x - target)^2 / 2
     target: float | None
-    columns: tuple[int | str, ...]  # the first is the one that others are compared in
+    columns: tuple[int | str, ...]  # the first is the one used in comparisons with others
     input: float = 0.0
 
     @property
@@ -127,7 +127,7 @@ class Case:
         return along if self.target is None else 0.5 * (along - self.target) ** 2
 
     def value(self, column: int | str) -> float:
-        """What a column's number is."""
+        """Return the value of a column's variable."""
         if isinstance(column, int):
             return self.x0[column]
         if column == "input":
@@ -137,11 +137,11 @@ class Case:
         return float(getattr(self.movers[0].material, column.split(".")[1]))
 
     def unit(self, column: int | str) -> float:
-        """By what a column is changed at a width of 1: the state's unit, or a parameter's own value."""
+        """Return the change of a column for a width of 1: the state's unit, or the parameter's own value."""
         return 1.0 if isinstance(column, int) or column == "input" else self.value(column)
 
     def changed(self, column: int | str, by: float) -> "Case":
-        """With a column's number changed."""
+        """Return the case with a column's variable increased by `by`."""
         if isinstance(column, int):
             x0 = list(self.x0)
             x0[column] += by
@@ -155,20 +155,20 @@ class Case:
         return replace(self, movers=movers, obstacles=fixed)
 
     def parameters(self, column: int | str) -> tuple[str, ...]:
-        """The package's names of what a column changes; its derivative is the sum of theirs."""
+        """Return the package's names of a column's parameters. Their derivatives add up to the column's derivative."""
         if isinstance(column, int) or column == "input":
             return ()
         bodies = [mover.name for mover in self.movers] + ["world"] * bool(self.obstacles)
         return tuple(f"{body}.stiffness" for body in bodies) if column == STIFFNESS else (column,)
 
     def diagram(self, time_step: float, *, contact: bool = True) -> tuple[MultibodyPlant, Diagram]:
-        """Its plant, and the diagram that it is in."""
+        """Build the plant, and return it with its diagram."""
         builder = DiagramBuilder()
         plant = self.add(builder, time_step, contact=contact)
         return plant, builder.Build()
 
     def add(self, builder: DiagramBuilder, time_step: float, *, contact: bool) -> MultibodyPlant:
-        """Its plant in a diagram under construction; without `contact` it has no shapes."""
+        """Add the plant to a diagram under construction. Without `contact` the plant has no shapes."""
         config = MultibodyPlantConfig(
             time_step=time_step,
             contact_model="point",
@@ -191,14 +191,14 @@ class Case:
         return plant
 
     def model(self) -> Any:
-        """Of the package, in steps of `INTERVAL`."""
+        """Return the package's model with steps of `INTERVAL`."""
         import drake_diff as dd
 
         return dd.model_from_diagram(self.diagram(INTERVAL)[1])
 
 
 def _join(plant: MultibodyPlant, mover: Mover, body: Any) -> None:
-    """The mover's joints."""
+    """Add the mover's joints."""
     parent = plant.world_frame()
     if mover.axes == "hinge":
         pivot = FixedOffsetFrame("pivot", parent, RigidTransform([0, 0, mover.pivot]))
@@ -215,7 +215,7 @@ def _join(plant: MultibodyPlant, mover: Mover, body: Any) -> None:
 
 
 def case(seed: int, number: int, family: str | None = None) -> Case:
-    """Case `number` of a seed; the families take turns where none is given."""
+    """Return case `number` of a seed. Without a `family`, the families alternate."""
     random = np.random.default_rng([seed, number])
     family = family or FAMILIES[number % len(FAMILIES)]
     made = MAKERS[family](random)
@@ -224,7 +224,7 @@ def case(seed: int, number: int, family: str | None = None) -> Case:
 
 @dataclass
 class _Draw:
-    """What the makers draw from: a generator, and what a case has so far."""
+    """The random draws of the makers, from a generator."""
 
     random: Any
 
@@ -232,7 +232,7 @@ class _Draw:
         return float(self.random.uniform(low, high))
 
     def scale(self, low: float, high: float) -> float:
-        """As likely in each decade."""
+        """Draw a log-uniform number."""
         return float(10 ** self.random.uniform(np.log10(low), np.log10(high)))
 
     def chance(self, share: float) -> bool:
@@ -242,9 +242,9 @@ class _Draw:
         return options[int(self.random.integers(len(options)))]
 
     def material(self, mass: float, depth: float, load: float) -> Material:
-        """Of a side, twice as stiff as the pair, whose stiffness is from 1e2 to 1e6 N/m.
+        """Draw the material of one side, twice as stiff as the pair, whose stiffness is from 1e2 to 1e6 N/m.
 
-        A `load` [N] at rest sinks in by half a `depth` [m] at most, and the ball's period is 1 ms at least.
+        A `load` [N] at rest penetrates by at most half of `depth` [m], and the ball's period is at least 1 ms.
         """
         softest = max(1e2, 2 * load / depth)
         stiffness = min(self.scale(softest, max(1e6, 2 * softest)), max(softest, mass * (2 * pi / 1e-3) ** 2))
@@ -276,7 +276,7 @@ def _case(
     obstacles: tuple[Obstacle, ...] | None = None,
     input: float = 0.0,
 ) -> Case:
-    """Its loss is number `of` of the final state, or, of every fourth, half the square of what it is off a target."""
+    """Make a case whose loss is entry `of` of the final state, or for one in four, half its squared target error."""
     weights = tuple(1.0 if i == of else 0.0 for i in range(len(x0)))
     target = draw.between(-1, 1) if draw.chance(0.25) else None
     ground = Obstacle("ground", (), (0, 0, 0), (0, 0, 0), movers[0].material)
@@ -287,7 +287,7 @@ def _case(
 
 
 def _bounce(random: Any) -> Case:
-    """A ball on rails that falls on the ground, once or a dozen times, or at its last moment."""
+    """Draw a ball on rails that falls on the ground, once or up to a dozen times, or only at the end."""
     draw = _Draw(random)
     mass, radius, g = draw.scale(0.05, 5), draw.between(0.03, 0.2), draw.between(1, 15)
     axes = draw.one_of("z", "xz")
@@ -295,7 +295,7 @@ def _bounce(random: Any) -> Case:
     z, vz = radius + draw.between(0.02, 0.6), draw.between(-3, 1)
     fall = (vz + sqrt(vz * vz + 2 * g * (z - radius))) / g
     duration = min(fall * draw.between(1.1, 3) + 0.05, 1.5)
-    if draw.chance(0.2):  # it touches some ms before the end or just does not
+    if draw.chance(0.2):  # it touches a few ms before the end or narrowly misses
         duration = max(round(fall, 2), 0.05)
         touch = duration + draw.between(-4e-3, 4e-3)
         vz = min(vz, 0.0)
@@ -312,7 +312,7 @@ def corners(sides: tuple[float, ...], radius: float) -> tuple[tuple[float, float
 
 
 def _toss(random: Any) -> Case:
-    """A box with a sphere in each corner, thrown down with or without spin: from one strike to a long tumble."""
+    """Draw a box with a sphere in each corner, thrown down with or without spin: one impact up to a long tumble."""
     draw = _Draw(random)
     mass, side, g = draw.scale(0.05, 2), draw.between(0.06, 0.2), draw.between(1, 10)
     sides = (side,) * 3 if draw.chance(0.5) else tuple(side * draw.between(0.6, 1.5) for _ in range(3))
@@ -324,13 +324,13 @@ def _toss(random: Any) -> Case:
     x0 = (*draw.quaternion(), 0.0, 0.0, z, *spin, *draw.vector(0.7)[:2], vz)
     fall = (vz + sqrt(vz * vz + 2 * g * (z - reach / 2))) / g
     law = draw.law(0.15)
-    duration = fall + draw.scale(0.03, 0.2 if law == "sap" else 1.5)  # the truth of sap's law is dear
+    duration = fall + draw.scale(0.03, 0.2 if law == "sap" else 1.5)  # the reference of sap's law is expensive
     columns = (12, 7, STIFFNESS)
     return _case(draw, law, (box,), x0, duration, draw.one_of(4, 5, 6, 12), columns, gravity=(0, 0, -g))
 
 
 def _slide(random: Any) -> Case:
-    """A ball that cannot turn, on the level or on an incline, with or without a spring: it slips, sticks, slips."""
+    """Draw a ball that cannot turn, on a level, on an incline or with a spring. It slips and sticks in turn."""
     draw = _Draw(random)
     mass, radius, g = draw.scale(0.1, 5), draw.between(0.03, 0.2), draw.between(3, 12)
     kind = draw.one_of("level", "incline", "spring")
@@ -346,7 +346,7 @@ def _slide(random: Any) -> Case:
 
 
 def _roll(random: Any) -> Case:
-    """A ball that slips until it rolls, from the ground or a little above it."""
+    """Draw a ball that slips until it rolls. It starts on the ground or a little above it."""
     draw = _Draw(random)
     mass, radius, g = draw.scale(0.05, 5), draw.between(0.03, 0.2), draw.between(3, 12)
     material = draw.material(mass, radius / 5, mass * g)
@@ -359,7 +359,7 @@ def _roll(random: Any) -> Case:
 
 
 def _rod(random: Any) -> Case:
-    """A rod with a sphere at either end that falls on the ground."""
+    """Draw a rod with a sphere at each end that falls on the ground."""
     draw = _Draw(random)
     mass, length, g = draw.scale(0.1, 3), draw.between(0.2, 0.8), draw.between(2, 12)
     radius = draw.between(0.01, 0.03)
@@ -386,7 +386,7 @@ def _rod(random: Any) -> Case:
 
 
 def _two(random: Any) -> Case:
-    """Two balls that hit each other: on one rail, in a plane without gravity, or one falling on the other."""
+    """Draw two balls that hit each other: on one rail, in a plane without gravity, or one falling on the other."""
     draw = _Draw(random)
     masses, radii = (draw.scale(0.05, 5), draw.scale(0.05, 5)), (draw.between(0.03, 0.15), draw.between(0.03, 0.15))
     light = min(masses)
@@ -422,7 +422,7 @@ def _two(random: Any) -> Case:
 
 
 def _wall(random: Any) -> Case:
-    """A ball thrown at what is fixed in the world, also so that it barely touches; Hunt and Crossley's law."""
+    """Draw a ball thrown at a fixed shape, which it sometimes barely touches. The law is Hunt and Crossley's."""
     draw = _Draw(random)
     mass, radius, g = draw.scale(0.05, 3), draw.between(0.03, 0.12), draw.between(0, 10)
     kind = draw.one_of("box", "capsule", "cylinder", "sphere")
@@ -438,7 +438,7 @@ def _wall(random: Any) -> Case:
     turn = draw.vector(0.4) if kind != "box" else draw.vector(0.2)
     speed, far = draw.between(1, 4), 2 * thick + radius + draw.between(0.05, 0.3)
     aside = draw.between(-0.08, 0.08)
-    if kind == "sphere" and draw.chance(0.5):  # it barely touches or just does not
+    if kind == "sphere" and draw.chance(0.5):  # it barely touches or narrowly misses
         aside = thick + radius - draw.between(-2e-3, 6e-3)
     place = Obstacle(kind, sizes, (far, 0.0, 0.0), turn, material)
     reach = (far - thick - radius) / speed
@@ -451,13 +451,13 @@ def _wall(random: Any) -> Case:
 
 
 def _pendulum(random: Any) -> Case:
-    """A ball on an arm, with a motor in its hinge, that strikes the ground."""
+    """Draw a ball on an arm, with a motor in its hinge, that strikes the ground."""
     draw = _Draw(random)
     mass, radius, g = draw.scale(0.1, 3), draw.between(0.03, 0.1), draw.between(2, 12)
     arm = draw.between(0.3, 0.8)
-    low = draw.between(0.3, 0.9) * arm  # how far below the pivot the ball is when it touches
+    low = draw.between(0.3, 0.9) * arm  # distance of the ball below the pivot when it touches
     material = draw.material(mass, radius / 2, 2 * mass * g)
-    material = replace(material, friction=draw.between(0.05, 0.3))  # more would jam the arm
+    material = replace(material, friction=draw.between(0.05, 0.3))  # more friction would jam the arm
     ball = Mover(
         "ball", mass, (radius,), radius, ((0, 0, -arm),), material, "hinge", pivot=low + radius, arm=arm, effort=100.0
     )

@@ -1,8 +1,8 @@
-"""The truth of an impact's value and slopes, by Drake alone: error-controlled Runge-Kutta 3 and central differences.
+"""The reference loss and slopes of an impact, by Drake alone: error-controlled Runge-Kutta 3 and central differences.
 
-The plant is the case's own with time_step = 0, in double. Its contact is Drake's (Hunt and Crossley); for the law of
-`sap`, k (x + tau x')+, which Drake has in no continuous plant, the plant has no shapes and a system of this file pushes
-its bodies. A slope exists where those of three widths agree to 0.1 %. Nothing of the package is read here.
+The plant is the case's own with time_step = 0, in double precision. Its contact is Drake's (Hunt and Crossley). Drake's
+continuous plants lack the law of `sap`, k (x + tau x')+. For this law the plant has no shapes, and a system of this
+file applies the forces. A slope exists if the slopes of three widths agree to 0.1 %. The package is not used.
 """
 
 import contextlib
@@ -20,15 +20,15 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorC
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 ACCURACY, FINER = 1e-8, 1e-10
-LONGEST = 0.01  # [s] a step
-WIDTHS = (1e-2, 1e-3, 1e-4)  # of a state's unit, and of a parameter's own value
-AGREE = 1e-3  # part of the slope
-NEARLY = 0.1  # part of the slope
-NOISE = 1e-5  # [of the loss by unit of the column] a tenth of what the accuracy is over the least width
+LONGEST = 0.01  # [s] maximum step
+WIDTHS = (1e-2, 1e-3, 1e-4)  # relative to a state's unit or a parameter's own value
+AGREE = 1e-3  # relative to the slope
+NEARLY = 0.1  # relative to the slope
+NOISE = 1e-5  # [loss / unit of the column] a tenth of the accuracy divided by the smallest width
 
 
 class Contact(LeafSystem):
-    """The forces of sap's law, k (x + tau x')+, with Drake's friction of continuous time, on a case's bodies."""
+    """The forces on a case's bodies by sap's law, k (x + tau x')+, with the friction of Drake's continuous plants."""
 
     def __init__(self, case: Case, plant: Any):
         super().__init__()
@@ -94,14 +94,14 @@ class Contact(LeafSystem):
 
 
 def combined(one: Any, two: Any) -> tuple[float, float, float, float]:
-    """mu, k, tau, and how far into `one` the point is that force acts in, as a part of the depth."""
+    """Return mu, k, tau, and the depth inside `one` of the point where the force acts, relative to the total depth."""
     mu = 2 * one.friction * two.friction / (one.friction + two.friction)
     k = one.stiffness * two.stiffness / (one.stiffness + two.stiffness)
     return mu, k, one.relaxation_time + two.relaxation_time, k / one.stiffness
 
 
 def push(mu: float, k: float, tau: float, depth: float, normal: Any, velocity: Any) -> Any:
-    """(3,) the force on what moves at `velocity` against the other, along `normal` away from it."""
+    """Return the force (3,) on a body with `velocity` relative to another body, from which `normal` points away."""
     rate = -float(normal @ velocity)
     f = max(0.0, k * (depth + tau * rate))
     slip = velocity + rate * normal
@@ -112,7 +112,7 @@ def push(mu: float, k: float, tau: float, depth: float, normal: Any, velocity: A
 
 
 class Motion:
-    """A case in continuous time: its loss at the end, from any first state."""
+    """A case in continuous time. It computes the final state from any first state."""
 
     def __init__(self, case: Case, accuracy: float = ACCURACY):
         self.case, self.accuracy, builder = case, accuracy, DiagramBuilder()
@@ -132,7 +132,7 @@ class Motion:
         self.context = self.plant.GetMyMutableContextFromRoot(self.root)
 
     def end(self, x0: Sequence[float] | None = None) -> Any:
-        """(nx,) the state at the end."""
+        """Return the state (nx,) at the end."""
         if self.plant.num_actuators():
             self.plant.get_actuation_input_port().FixValue(self.context, [self.case.input])
         self.root.SetTime(0.0)
@@ -148,16 +148,16 @@ class Motion:
 
 @dataclass(frozen=True)
 class Slopes:
-    """Those of one column over the `WIDTHS`, by `unit` of it; `other` is the middle one at another accuracy.
+    """The slopes of one column for the `WIDTHS`, times its `unit`; `other` is the middle slope at another accuracy.
 
-    `kind` is "exists" where all agree, "narrow" where the last two do and the first does not, so that the loss is a
-    curve at its width, else "none".
+    `kind` is "exists" if all agree. It is "narrow" if the last two agree and the first does not, because the loss is
+    curved over the first width. Otherwise it is "none".
     """
 
     column: int | str
     unit: float
     slopes: tuple[float, ...]
-    other: float | None = None  # not asked for
+    other: float | None = None  # None if not computed
 
     @property
     def kind(self) -> str:
@@ -167,42 +167,42 @@ class Slopes:
 
     @property
     def best(self) -> float:
-        """The middle width's: its own curvature is a hundredth of the widest's, its noise a tenth of the least's."""
+        """The slope of the middle width. Its curvature is 1/100 of the widest's, its noise 1/10 of the smallest's."""
         return self.slopes[1]
 
     @property
     def doubt(self) -> float:
-        """By how much other widths, or another accuracy, change it."""
+        """The change of `best` due to another width or another accuracy."""
         others = [self.slopes[2]] if self.other is None else [self.slopes[2], self.other]
-        least = 0.0 if agree(self.slopes[1:], 0.0) else NOISE  # one so small that it is known by its size alone
+        least = 0.0 if agree(self.slopes[1:], 0.0) else NOISE  # a slope so small that only its size is known
         return max(least, *(abs(other - self.best) for other in others))
 
 
 def agree(slopes: Sequence[float], noise: float = NOISE) -> bool:
-    """Whether they differ by 0.1 % of the largest at most, or by no more than differences can tell from 0."""
+    """Return whether the slopes differ by at most 0.1 % of the largest, or by at most the noise of differences."""
     return float(np.ptp(slopes)) <= max(AGREE * float(np.max(np.abs(slopes))), noise)
 
 
 def truth(case: Case, columns: Sequence[int | str] | None = None) -> tuple[float, list[Slopes]]:
-    """The loss, and the slopes of the case's columns, or of those given.
+    """Return the loss and the slopes of `columns`, by default the case's columns.
 
-    The first one's is taken again at accuracy `FINER` where it has one, and all of any whose two least widths nearly
-    agree and do not: `other` says by how much that changes the middle one.
+    If the first column has a slope, `other` is its middle slope at accuracy `FINER`. If the slopes of a column's two
+    smallest widths agree nearly but not fully, all are computed again, and `other` is the middle slope from before.
     """
     motion, exact = Motion(case), Motion(case, FINER)
     value, found = float(case.loss(motion.end())), list[Slopes]()
     for column in case.columns if columns is None else columns:
         one = Slopes(column, case.unit(column), tuple(slope(case, motion, column, width) for width in WIDTHS))
-        with contextlib.suppress(RuntimeError):  # Drake's integration does not end at that accuracy everywhere
+        with contextlib.suppress(RuntimeError):  # Drake's integration fails at this accuracy for some cases
             one = taken_again(case, exact, one, first=not found)
         found.append(one)
     return value, found
 
 
 def taken_again(case: Case, exact: Motion, one: Slopes, *, first: bool) -> Slopes:
-    """The slopes of a column with what is known of them at accuracy `FINER`, where that is asked."""
+    """Return the slopes of a column, computed again at accuracy `FINER` if `truth` requires it."""
     if one.kind == "none" and abs(one.slopes[2] - one.slopes[1]) < NEARLY * abs(one.slopes[1]):
-        # that may be the integration's own error over so small a width
+        # the difference may be the integration error over such a small width
         return Slopes(one.column, one.unit, tuple(slope(case, exact, one.column, w) for w in WIDTHS), one.slopes[1])
     if first and one.kind != "none":
         return Slopes(one.column, one.unit, one.slopes, slope(case, exact, one.column, WIDTHS[1]))
@@ -210,7 +210,7 @@ def taken_again(case: Case, exact: Motion, one: Slopes, *, first: bool) -> Slope
 
 
 def slope(case: Case, motion: Motion, column: int | str, width: float) -> float:
-    """Of the loss by a column, times its unit."""
+    """Return the slope of the loss with respect to a column, times the column's unit."""
     ends = []
     for sign in (1, -1):
         changed = case.changed(column, sign * width * case.unit(column))

@@ -1,12 +1,12 @@
-"""The gradient through random impacts beside the truth.
+"""Compare gradients through random impacts with reference gradients.
 
     pip install -e '.[test]'
     python tests/benchmarks/impacts.py [--seed 0] [--count 100] [--only toss,rod] [--out FILE.json]
 
-Of each case (impact_cases.py) some columns of the gradient are judged: by the first state, contact's parameters, an
-input. The truth is Drake's own continuous plant by error-controlled Runge-Kutta 3 and central differences of three
-widths (impact_truth.py); where those agree to 0.1 % ours is to be within 1 %, elsewhere it is to be `undefined`. What
-it costs is processor time beside that of the rollout alone, medians of three in turns.
+For each case (impact_cases.py), some columns of the gradient are tested: with respect to the first state, contact
+parameters and an input. The reference is Drake's own continuous plant with error-controlled Runge-Kutta 3 and central
+differences of three widths (impact_truth.py). If these agree to 0.1 %, our value must be within 1 %, and otherwise it
+must be `undefined`. The cost is processor time relative to the rollout alone, as medians of three alternating runs.
 """
 
 import argparse
@@ -32,13 +32,13 @@ from drake_diff.model.parameters import select
 from drake_diff.motion.flow import FlowSteps
 
 HERE = Path(__file__).parent
-RIGHT = 0.01  # part of the truth
-DEARER = 10.0  # times the rollout
+RIGHT = 0.01  # relative to the reference
+DEARER = 10.0  # relative to the rollout
 TIMES = 3
 
 
 def known_truth(one: Case, file: Path | None) -> tuple[float, list[Slopes]]:
-    """The truth of a case, read from a file where it was found before, by the same case and the same referee."""
+    """Return the reference of a case, read from `file` if it was computed before for the same case and referee."""
     if file is None:
         return truth(one)
     referee, cases = ((HERE / f"impact_{name}.py").read_text() for name in ("truth", "cases"))
@@ -54,10 +54,10 @@ def known_truth(one: Case, file: Path | None) -> tuple[float, list[Slopes]]:
 
 
 def ours(one: Case, model, us):
-    """(loss, {column: derivative by its unit}, columns told to be undefined)."""
+    """Return (loss, {column: derivative times its unit}, columns reported as undefined)."""
     names = tuple(name for column in one.columns for name in one.parameters(column))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", GradientWarning)  # `undefined` has what it says
+        warnings.simplefilter("ignore", GradientWarning)  # `undefined` has the same content
         found = differentiate_rollout(model, one.x0, us, one.loss, method="continuous", parameters=names)
     by = {column: float(found.by_x0[column]) for column in one.columns if isinstance(column, int)}
     columns = dict(zip(names, found.by_parameters, strict=True))
@@ -73,7 +73,7 @@ def ours(one: Case, model, us):
 
 
 def cost(one: Case, model, us) -> float:
-    """Processor time of value, gradient and verdict over that of the motion alone; all is compiled before."""
+    """Return the processor time of value, gradient and verdict relative to the rollout alone, without compilation."""
     steps = FlowSteps(model, select(model, ()))
 
     def roll():
@@ -93,7 +93,7 @@ def cost(one: Case, model, us) -> float:
 
 
 def judge(one: Case, truths: Path | None, *, costs: bool = True) -> dict:
-    """One case: each column's kind of truth, our number, its error and whether it was told to be undefined."""
+    """Return, for one case, each column's kind of slope, our value, its error and whether it is called undefined."""
     value, slopes = known_truth(one, truths)
     found = {"name": one.name, "family": one.family, "law": one.law, "value": value, "columns": []}
     try:
@@ -122,7 +122,7 @@ def judge(one: Case, truths: Path | None, *, costs: bool = True) -> dict:
 
 
 def figures(cases: list[dict]) -> list[tuple[str, int, int]]:
-    """(what, how many, of how many)."""
+    """Return (name, number of cases, total) of each figure."""
     columns = [column for one in cases for column in one["columns"]]
     exist, narrow, none = ([c for c in columns if c["kind"] == kind] for kind in ("exists", "narrow", "none"))
     costs = [one["cost"] for one in cases if one.get("cost") is not None]
@@ -150,7 +150,7 @@ def told(name: str, found: int, of: int) -> str:
 
 
 def line(one: dict) -> str:
-    """A case as it comes."""
+    """Return the line that is printed for a case."""
     if "failed" in one:
         return f"{one['name']} ({one['law']}): {one['failed']}"
     columns = [
@@ -172,7 +172,7 @@ def main() -> int:
     parser.add_argument("--truths", type=Path, help="where truths are kept for another run")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    logging.getLogger("drake").setLevel(logging.ERROR)  # what it tells of every half space
+    logging.getLogger("drake").setLevel(logging.ERROR)  # no message about each half space
     only, cases = options.only.split(","), []
     for family in only:
         if family not in FAMILIES:

@@ -1,7 +1,7 @@
-"""Tasks of robots on legs: stand up, lower, lift a foot, jump in place and forward, trot, recover from a push.
+"""Tasks of legged robots: stand up, lower, lift a foot, jump in place and forward, trot, recover from a push.
 
-Each start is drawn: where the feet are about a posture, the base's place and turn, and of a push its velocity. A PD
-controller holds it until it rests. The user says which foot stands when, and where the robot is to end.
+Each start is random: the feet near those of a posture, the position and rotation of the base, and the velocity of a
+push. A PD controller brings the robot to rest. A task gives the standing feet of each phase and the final pose.
 """
 
 from collections.abc import Sequence
@@ -19,15 +19,15 @@ from pydrake.systems.framework import DiagramBuilder
 
 import drake_diff as dd
 
-TIME_STEP, OF_JUMPS = 0.02, 0.01  # [s]; where a robot flies at 1 m/s a foot moves by a third of its size in 10 ms
-PUSH, SPIN = 0.35, 0.5  # [m/s], [rad/s] the largest velocity of a push of Solo12; of others by their height
-HEIGHTS = {"solo12": 0.23, "go2": 0.31, "anymal": 0.45, "cheetah": 0.27}  # [m] of the base, standing
+TIME_STEP, OF_JUMPS = 0.02, 0.01  # [s]; in a jump at 1 m/s a foot moves by a third of its size in 10 ms
+PUSH, SPIN = 0.35, 0.5  # [m/s], [rad/s] largest push of Solo12; PUSH scales with the root of a robot's height
+HEIGHTS = {"solo12": 0.23, "go2": 0.31, "anymal": 0.45, "cheetah": 0.27}  # [m] of the standing robot's base
 AT_PLACE, AT_REST, LEVEL, SPINS = 0.05, 0.3, 0.1, 1.0  # [m], [m/s], [rad], [rad/s] of the base at the end
-SWING = 0.15  # of that height, how high a foot is lifted
-IN_AIR = 0.01  # [m] every foot that is to be in the air, in the middle of its way
+SWING = 0.15  # height of a lifted foot, relative to the base's height
+IN_AIR = 0.01  # [m] minimum height of each swinging foot in the middle of its swing
 OPTIONS = {"method": "ilqr", "tolerance": 1e-4, "max_iterations": 100}
 
-Phases = Sequence[tuple[float, Sequence[str]]]  # [s], and the feet that stand
+Phases = Sequence[tuple[float, Sequence[str]]]  # [s], and the standing feet
 
 
 def stand_up(robot, random, h=TIME_STEP):
@@ -107,7 +107,7 @@ def _task(robot, random, h, kind, first, last, phases, text, *, way=0.0, pushed=
 
 
 def scheduled_problem(model, facts, x0, end, steps, swing):
-    """(problem, schedule, guess, what a referee measures of the base) of a robot that comes to rest at `end`."""
+    """Return (problem, schedule, guess, the referee's measures of the base) of a robot that comes to rest at `end`."""
     schedule = dd.optimize.ContactSchedule(steps, feet=facts.feet)
     guess = schedule.guess(model, x0, end, swing=swing)
     goals = [
@@ -127,13 +127,13 @@ def scheduled_problem(model, facts, x0, end, steps, swing):
 
 @cache
 def _posture(robot, h, joints):
-    """(nq,) as the robot rests with joints at about these."""
+    """Return the posture (nq,) of the robot at rest with its joints near `joints`."""
     model = legged_model(robot, h)
     return tuple(rest(robot, model, np.array(joints))[: model.nq])
 
 
 def _pushed(robot, model, x0, random):
-    """(nv,) the base moves as pushed, and the joints so that the feet stay where they are."""
+    """Return the velocities (nv,) of a pushed base, and of joints that keep the feet at rest."""
     plant, facts = model.plant, LEGGED[robot]
     part = np.sqrt(HEIGHTS[robot] / HEIGHTS["solo12"])
     v = np.zeros(model.nv)
@@ -151,11 +151,11 @@ def _pushed(robot, model, x0, random):
     return v
 
 
-# What a referee measures, by Drake alone.
+# The measurements of the referee, with Drake alone.
 
 
 def build(robot, h, time_step):
-    """(plant, diagram) of the robot on the feet of a task in steps of h, by Drake's own parser; 0 is continuous."""
+    """Return Drake's (plant, diagram) of the robot with feet for steps of h. A `time_step` of 0 is continuous time."""
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(
         time_step=time_step,
@@ -180,7 +180,7 @@ def build(robot, h, time_step):
 
 @cache
 def _kinematics(robot):
-    """A plant and its context in which only places are asked for."""
+    """Return a plant and a context that are only used for kinematics."""
     plant, _ = build(robot, TIME_STEP, TIME_STEP)
     return plant, plant.CreateDefaultContext()
 

@@ -1,10 +1,10 @@
-"""Tasks of `contact_plans.py` in which something is pushed, grasped or tipped, and a hop: from a random start.
+"""Tasks of `contact_plans.py` with random starts: an object is pushed, grasped or tipped, or a hopper hops.
 
-A goal is a place with a tolerance: 5 mm for a ball and a box, 0.05 rad for a spinner. Speed at the end costs and is not
-asked. Contact is softer than the models' own: of that, the force of a step that begins to touch jumps so far that it
-stops what it hits at once, and the least cost lies at the jump. The guess is a line to the goal, and the spinner's a
-finger that goes to the end of the spinner and along with it; two fingers go to a box's sides and up with it. These are
-geared, and their effort is told from that of a grip: a finger that comes slowly and presses on has few jumps ahead.
+A goal is a position with a tolerance: 5 mm for a ball and a box, 0.05 rad for a spinner. The final speed has a cost but
+no goal. Contact is softer than in the models. Otherwise the force of the first step in contact jumps so far that it
+stops the object at once, and the least cost is at the jump. The guess is a line to the goal. For the spinner, a finger
+moves to its end and along with it. Two fingers move to a box's sides and up with it. They are geared, and the cost of
+their effort is relative to a grip, because a finger that approaches slowly and keeps pressing meets few jumps.
 """
 
 import re
@@ -20,24 +20,24 @@ import drake_diff as dd
 MODELS = Path(dd.__file__).parent / "models"
 OPTIONS = {"method": "ilqr", "continuation": "relaxed", "max_iterations": 150}
 AT_PLACE, AT_ANGLE = 0.005, 0.05  # [m], [rad]
-AT_HEIGHT, HELD = 0.01, 0.2  # [m], for so long at the end [s]
-AT_GOAL = 1e-3  # of a hop's goal, in the units of states
-ROUGHLY = 1e-2  # of a solve: where a push begins or lets go the cost has a corner, and the last 0.01 % take long
-MORE_ROUGHLY = 3e-2  # of a grasp: the last 0.1 %
-TIPPED_ROUGHLY = 0.1  # of a box that tips and lands: the last 1 %
+AT_HEIGHT, HELD = 0.01, 0.2  # [m] tolerance, and its duration at the end [s]
+AT_GOAL = 1e-3  # tolerance of a hop's goal, in the units of the state
+ROUGHLY = 1e-2  # tolerance of a solve: the cost has a kink where a push begins or ends; the last 0.01 % take long
+MORE_ROUGHLY = 3e-2  # tolerance of a grasp, in which the last 0.1 % take long
+TIPPED_ROUGHLY = 0.1  # tolerance of a box that tips and lands, in which the last 1 % takes long
 DISSIPATION = 5  # [s/m]
-WEIGHT, CARRIED, GRIP = 9.81 * 0.203, 9.81 * 0.101, 2.5  # [N] of a box, of a finger and its slide; of a finger on a box
-CUBE, HIGH, PUSH, PRESS = 0.05, 0.03, 1.0, 0.5  # [m] half of the low box, where it is pushed, above its middle; [N]
+WEIGHT, CARRIED, GRIP = 9.81 * 0.203, 9.81 * 0.101, 2.5  # [N] weight of a box, of a finger and its slide; grip force
+CUBE, HIGH, PUSH, PRESS = 0.05, 0.03, 1.0, 0.5  # [m] half of the low box, height of the push above its centre; [N]
 BOX, TIP, GIVES = (
     (0.05, 0.1),
     0.02,
     2000,
-)  # [m] half of the tall box, of a fingertip; [N/m] of two corners on the ground
-LINK, PIVOT, BESIDE, OUT = 0.15, (0.25, 0.2), 0.04, 0.07  # [m] of the finger and the spinner, between axes; from pivot
+)  # [m] half of the tall box, radius of a fingertip; [N/m] stiffness of two corners on the ground
+LINK, PIVOT, BESIDE, OUT = 0.15, (0.25, 0.2), 0.04, 0.07  # [m] link; pivot; tip to the spinner's axis and to the pivot
 
 
 def softer(path: Path, time_step: float, stiffness: float, relaxation: float, **others: str) -> dd.Model:
-    """The model of that file with contact of a stiffness [N/m] that relaxes in so many steps, and other elements."""
+    """Load the model with a contact stiffness [N/m], a relaxation time in steps, and other values of elements."""
     text = path.read_text()
     elements = {
         "drake:point_contact_stiffness": f"{stiffness:g}",
@@ -54,12 +54,12 @@ def softer(path: Path, time_step: float, stiffness: float, relaxation: float, **
 
 
 def off(wanted: dict[int, float], xs: np.ndarray, us: np.ndarray, knot: int = -1) -> float:
-    """How far the worst of some entries of a state is from what is wanted."""
+    """Return the largest difference between entries of a state and their wanted values."""
     return max(abs(float(xs[knot][i]) - value) for i, value in wanted.items())
 
 
 def spinner(random: np.random.Generator, time_step: float = 0.02) -> Task:
-    """A finger turns a spinner to an angle in a second, to the side to which its tip can reach the spinner's end."""
+    """Return the task of turning a spinner to an angle in 1 s with a finger, in a direction that its tip can reach."""
     model = softer(Path(__file__).parent / "finger_spinner.sdf", time_step, 1000, 0.5)
     x0 = np.array([random.uniform(-0.3, 0.1), random.uniform(0.2, 0.6), random.uniform(-0.1, 0.1), 0, 0, 0])
     angle, count = x0[2] - random.uniform(0.6, 1.2), round(1 / time_step)
@@ -78,7 +78,7 @@ def spinner(random: np.random.Generator, time_step: float = 0.02) -> Task:
 
 
 def beside(x0: np.ndarray, angle: float, count: int, time_step: float) -> np.ndarray:
-    """(N+1, 6) the finger goes to the spinner in 40 % of the time, then along with it as far as it reaches."""
+    """Return states (N+1, 6): the finger moves to the spinner in 40 % of the time, then with it within its reach."""
     part = np.linspace(0, 1, count + 1)
     spin = np.interp(part, [0, 0.4, 1], [x0[2], x0[2], angle])
     tip = np.array(PIVOT)[:, None] - OUT * np.array([np.cos(spin), np.sin(spin)])
@@ -91,7 +91,7 @@ def beside(x0: np.ndarray, angle: float, count: int, time_step: float) -> np.nda
 
 
 def ball(random: np.random.Generator, time_step: float = 0.02) -> Task:
-    """A pusher that starts apart from a ball, which rolls on with resistance, brings it to a place."""
+    """Return the task of moving a ball with rolling resistance to a goal with a pusher that starts apart from it."""
     model = softer(MODELS / "two_spheres.sdf", time_step, 1000, 2.5, damping="5")
     gap, way = random.uniform(0.1, 0.4), random.uniform(0.3, 0.6)
     place = 0.2 + gap + way
@@ -108,7 +108,7 @@ def ball(random: np.random.Generator, time_step: float = 0.02) -> Task:
 
 
 def box(random: np.random.Generator, time_step: float = 0.02) -> Task:
-    """A finger that starts apart from a box, and not behind its middle, brings it to a place in the plane."""
+    """Return the task of pushing a box to a goal in the plane with a finger that starts apart, off its centre."""
     model = softer(MODELS / "box_push.sdf", time_step, 500, 0.25)
     x0 = np.zeros(10)
     x0[3:5] = -random.uniform(0.25, 0.45), random.uniform(-0.08, 0.08)
@@ -127,7 +127,7 @@ def box(random: np.random.Generator, time_step: float = 0.02) -> Task:
 
 
 def monoped(random: np.random.Generator, time_step: float = 0.01) -> Task:
-    """A hopper that stands hops on, a foot's clearance on the way, and stands again."""
+    """Return the task of hopping forward from standing to standing, with a clearance of the foot on the way."""
     model = dd.load_model(MODELS / "hopper.sdf", time_step=time_step)
     height, way = random.uniform(0.45, 0.55), random.uniform(0.3, 0.6)
     leg = height - 0.05 + 12 / 2e4
@@ -145,7 +145,7 @@ def monoped(random: np.random.Generator, time_step: float = 0.01) -> Task:
 
 
 def grasp(random: np.random.Generator, time_step: float = 0.02) -> Task:
-    """Two fingers that start apart from a box grip it by its sides and hold it up, which friction alone does."""
+    """Return the task of lifting a box by friction alone, with two fingers that start apart and grip its sides."""
     model = dd.load_model(MODELS / "two_fingers.sdf", time_step=time_step)
     count, (half, tall) = round(2 / time_step), BOX
     x0 = np.zeros(14)
@@ -176,7 +176,7 @@ def grasp(random: np.random.Generator, time_step: float = 0.02) -> Task:
 
 
 def beyond_faces(xs: np.ndarray, us: np.ndarray) -> float:
-    """[m] how far a fingertip ever is from the middle of a box's side along it, once the box is up."""
+    """Return the largest distance [m] of a fingertip from the middle of the box's side, along it, in the air."""
     up = xs[xs[:, 1] > BOX[1] + AT_HEIGHT]
     c, s = np.cos(up[:, 2]), np.sin(up[:, 2])
     along = [(up[:, i] - up[:, 0]) * s + (up[:, i + 1] - up[:, 1]) * c for i in (3, 5)]
@@ -184,7 +184,7 @@ def beyond_faces(xs: np.ndarray, us: np.ndarray) -> float:
 
 
 def gripped(x0: np.ndarray, height: float, count: int, time_step: float) -> tuple[np.ndarray, np.ndarray]:
-    """(N+1, 14), (N, 4) the fingers go to the sides of the box in 40 % of the time, then up with it, and stay."""
+    """Return (xs (N+1, 14), us (N, 4)): the fingers reach the box in 40 % of the time, then lift it and stay."""
     part = np.linspace(0, 1, count + 1)
     z = np.interp(part, [0, 0.4, 0.9, 1], [x0[1], x0[1], height, height])
     way, columns = np.minimum(part / 0.4, 1), [np.full(count + 1, x0[0]), z, np.zeros(count + 1)]
@@ -195,7 +195,7 @@ def gripped(x0: np.ndarray, height: float, count: int, time_step: float) -> tupl
 
 
 def flip(random: np.random.Generator, time_step: float = 0.02) -> Task:
-    """A finger that starts apart from a box tips it over its far edge, by a quarter of a turn, and it lies still."""
+    """Return the task of tipping a box by 90 degrees over its far edge, to rest, with a finger that starts apart."""
     model = dd.load_model(MODELS / "finger_box.sdf", time_step=time_step)
     count = round(2 / time_step)
     x0 = np.zeros(10)
@@ -221,7 +221,7 @@ def flip(random: np.random.Generator, time_step: float = 0.02) -> Task:
 
 
 def tipped(x0: np.ndarray, count: int, time_step: float) -> np.ndarray:
-    """(N+1, 10) the finger goes to the box's side in 40 % of the time, and the box turns with it about its edge."""
+    """Return states (N+1, 10): the finger reaches the box in 40 % of the time, and turns it about its edge."""
     part = np.linspace(0, 1, count + 1)
     turn = np.interp(part, [0, 0.4, 0.8, 1], [0, 0, np.pi / 2, np.pi / 2])
     c, s = np.cos(turn), np.sin(turn)
@@ -236,7 +236,7 @@ def tipped(x0: np.ndarray, count: int, time_step: float) -> np.ndarray:
 
 
 def with_speeds(q: np.ndarray, time_step: float) -> np.ndarray:
-    """(N+1, nx) of a motion that begins at rest."""
+    """Return the states (N+1, nx) of a motion that begins at rest."""
     return np.hstack([q, np.vstack([np.zeros(q.shape[1]), np.diff(q, axis=0) / time_step])])
 
 

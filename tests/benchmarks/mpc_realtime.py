@@ -1,14 +1,14 @@
-"""MPC in real time, under pushes: a crane, a Panda past a ball and a quadrotor through gates, limits kept.
+"""Real-time MPC under pushes and within limits: a crane, a Panda past a ball and a quadrotor through gates.
 
     pip install -e '.[test]'
     python tests/benchmarks/mpc_realtime.py [--only crane,panda,quadrotor] [--count 20] [--seed 0] [--markdown FILE]
 
-Each run is a problem drawn by seed, planned by `dd.solve`, and driven by `dd.loop.MPC` with default options at its
-control period, while three blows by seed hit a body. The plant is pydrake's alone, in steps of 1 ms, and goes on under
-the old input for as long as the controller's thread computes (`--clock wall` takes the time of the wall instead). An
-answer later than the period counts as missed. What is judged, by the referee's own formulas at every step of 1 ms, is
-what the task asks for: the problem plans with a part of it, so that there is room for a blow. Where the blow itself
-goes beyond a limit, as a jump of a speed may, it counts too.
+Each run is a seeded random problem, planned by `dd.solve` and controlled by `dd.loop.MPC` with default options at its
+control period, while three seeded random pushes hit a body. The plant is pydrake's alone, in steps of 1 ms. It keeps
+the old input during the processor time of the controller's thread (with `--clock wall`, during its wall time). An
+answer that takes longer than the period counts as missed. At every step of 1 ms, the referee checks the limits of the
+task with its own formulas. The problem uses only a part of these limits, so that there is room for a push. A violation
+by the push itself, such as a jump of a speed, counts too.
 """
 
 import argparse
@@ -37,14 +37,14 @@ from drake_diff.model import BodyForce
 
 FINE = 1e-3  # [s] the referee's step
 PUSHES = 3
-DRAWS = 5  # runs with the same problem and other pushes
+DRAWS = 5  # runs with the same problem and different pushes
 FREE = np.inf
 HOME = np.array([0, -0.785, 0, -2.356, 0, 1.571, 0.785])
 
 
 @dataclass(frozen=True)
 class Ask:
-    """What must hold all along: `excess` of states (S, nx), 0 where it is kept; `unit` and what is `allowed`."""
+    """A requirement: the `excess` of states (S, nx) over a limit, its `unit`, and the largest `allowed` excess."""
 
     name: str
     excess: Callable[[np.ndarray], np.ndarray]
@@ -54,22 +54,22 @@ class Ask:
 
 @dataclass(frozen=True)
 class Task:
-    """A problem, its horizon [steps], how long it is driven [s], and how a referee sees it; `bare` lacks its limits."""
+    """A problem, its horizon [steps] and duration [s], and the referee's requirements; `bare` lacks the limits."""
 
     problem: dd.Problem
     bare: dd.Problem
     horizon: int
     duration: float
-    plant: Callable[[float], Any]  # a system, with an input port and the state as an output port
+    plant: Callable[[float], Any]  # returns a system with an input port and the state as an output port
     body: str
-    push: tuple[np.ndarray, np.ndarray]  # [N s] the largest impulse, and its least part
+    push: tuple[np.ndarray, np.ndarray]  # [N s] the largest impulse, and the smallest part of it
     asks: tuple[Ask, ...]
     passes: tuple[tuple[float, Ask], ...]  # at times [s]
     ends: Ask
 
 
 def crane(random):
-    """A cart on rails carries a load on a rod of 0.5 m, from rest to rest, at 50 Hz; it may sway a little."""
+    """Return the task of a cart on rails: carry a load on a 0.5 m rod from rest to rest, at 50 Hz, with little sway."""
     path, way, sway, rail = MODELS / "cart_pole.urdf", random.uniform(0.7, 1.2), random.uniform(0.18, 0.25), 0.25
     model = dd.load_model(path, time_step=0.02)
 
@@ -94,7 +94,7 @@ def crane(random):
 
 
 def panda(random):
-    """The arm of seven joints takes its hand across its front to a place, past a ball, at 50 Hz."""
+    """Return the task of an arm of seven joints: move the hand across its front to a goal, past a ball, at 50 Hz."""
     model = dd.example_model("panda", time_step=0.02)
     start, goal = HOME + random.uniform(-0.1, 0.1, 7), HOME + random.uniform(-0.1, 0.1, 7)
     start[0], goal[0] = -random.uniform(0.65, 0.85), random.uniform(0.65, 0.85)
@@ -125,7 +125,7 @@ def panda(random):
 
 
 def quadrotor(random):
-    """Four rotors of 5 N carry a body through two gates to a place, at 50 Hz; it may tilt a little."""
+    """Return the task of four rotors of 5 N: carry a body through two gates to a goal, at 50 Hz, with little tilt."""
     points = [(ARM * x, ARM * y, 0.0) for x, y in [(1, 0), (0, 1), (-1, 0), (0, -1)]]
     forces = [
         BodyForce(f"rotor_{i + 1}", "body", point, moment_ratio=MOMENT_RATIO * (-1) ** i, upper=MOST)
@@ -191,7 +191,7 @@ def hand_at(path, frame):
 
 
 class Plant:
-    """The referee's: pydrake's Simulator in steps of FINE, and blows M dv = J' p."""
+    """The referee's plant: pydrake's Simulator in steps of FINE, with pushes M dv = J' p."""
 
     def __init__(self, task):
         self.system = task.plant(FINE)
@@ -216,10 +216,10 @@ class Plant:
         self.xs = [self.x]
 
     def go_on(self, u, to):
-        """Until the step `to` under u."""
+        """Simulate with input u until the step `to`."""
         self.input.GetMutableData().set_value(u)
         for k in range(len(self.xs), to + 1):
-            self.simulator.AdvanceTo(k * FINE - FINE / 2)  # the step that begins before
+            self.simulator.AdvanceTo(k * FINE - FINE / 2)  # takes the step that begins before
             self.xs.append(self.x)
 
     def push(self, impulse):
@@ -228,7 +228,7 @@ class Plant:
 
 @dataclass(frozen=True)
 class Run:
-    """What one run came to. Latencies [s] by the thread's clock and the wall's; `taken` are those that counted."""
+    """The result of one run, with latencies [s] by the thread's clock and the wall clock; `taken` are those judged."""
 
     seed: int
     excess: dict[str, float]
@@ -279,7 +279,7 @@ def drive(task, problem, plan, seed, clock):
             if taken <= h:
                 u = new
             plant.go_on(u, now + per_tick)
-        except RuntimeError:  # Drake takes no step more: it is out of control
+        except RuntimeError:  # Drake's step fails because the plant is out of control
             lost = True
             break
     xs = np.array(plant.xs)
@@ -304,7 +304,7 @@ def drive(task, problem, plan, seed, clock):
 
 
 def _judged(task, xs):
-    """(excess over each limit, distance from each gate, distance from the goal)"""
+    """Return (excess over each limit, distance from each gate, distance from the goal)."""
     excess = {ask.name: float(max(0.0, np.max(ask.excess(xs)))) for ask in task.asks}
     missed = {ask.name: float(ask.excess(xs[[round(at / FINE)]])[0]) for at, ask in task.passes}
     return excess, missed, float(task.ends.excess(xs[-1:])[0])
@@ -312,7 +312,7 @@ def _judged(task, xs):
 
 @cache
 def planned(name, draw, bare):
-    """(task, problem, plan) of the `draw`-th problem."""
+    """Return (task, problem, plan) of the `draw`-th problem. The plan is None if the solve failed."""
     task = TASKS[name](np.random.default_rng([draw, 0]))
     problem = task.bare if bare else task.problem
     solution = dd.solve(problem)
@@ -322,7 +322,7 @@ def planned(name, draw, bare):
 
 
 def measure(name, seed, count, clock, *, bare=False):
-    """(runs, problems that were not solved)"""
+    """Return (runs, number of runs whose problem was not solved)."""
     found, unsolved = [], 0
     for i in range(count):
         draw = seed * 1000 + i // DRAWS
@@ -346,7 +346,7 @@ beside the ball). Latencies are {clock}, on a machine with other work.
 
 
 def row(name, runs, unsolved):
-    """The task's row of the page."""
+    """Return the task's row of the page."""
     period, taken = runs[0].period, np.concatenate([r.taken for r in runs])
     ok, count = sum(s == "ok" for r in runs for s in r.statuses), len(runs)
     told = ", ".join(f"{v:.1f}" for v in 1e3 * np.percentile(taken, [50, 99, 100]))
@@ -367,7 +367,7 @@ Without limits in the problem |
 
 
 def details(name, runs, bare):
-    """The task's row of the second table."""
+    """Return the task's row of the second table."""
     followed = sum("followed further" in s for r in runs for s in r.statuses)
     gives = sum("gives way" in s for r in runs for s in r.statuses)
     wall = np.concatenate([r.wall for r in runs])

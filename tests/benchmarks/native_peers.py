@@ -1,4 +1,4 @@
-"""Peers that are called in their own coordinates: MuJoCo and MJX."""
+"""Peers with native coordinates: MuJoCo and MJX."""
 
 from typing import Any, ClassVar
 
@@ -18,12 +18,12 @@ from peers import (
 
 from drake_diff.exceptions import GradientError, MissingDependencyError, ModelError, SimulationError
 
-LARGEST_MJX = 7  # velocities; what has more compiles for minutes
-SMALL = 1e-6  # of mjd_transitionFD, as in its own documentation
+LARGEST_MJX = 7  # velocities; larger models compile for minutes
+SMALL = 1e-6  # eps of mjd_transitionFD, as in MuJoCo's documentation
 
 
 class Native(Engine):
-    """x is (qpos, qvel), the Jacobian that of MuJoCo's tangent coordinates."""
+    """A peer whose x is (qpos, qvel) and whose Jacobian is in MuJoCo's tangent coordinates."""
 
     contact: ClassVar = True
     step_jacobian = Peer.step_jacobian
@@ -76,9 +76,9 @@ class Mujoco(Native):
 
 
 class Mjx(Native):
-    """Once it has compiled, its 15 threads are in the process, and Drake's contact step takes 1.6 to 3 times as long.
+    """MJX. After compilation, the process has 15 threads of MJX, and Drake's contact step takes 1.6 to 3 times as long.
 
-    Ratios to a base beside it are comparable among each other, and not with those of a run without it.
+    Ratios of a run with MJX can be compared with each other, but not with the ratios of a run without MJX.
     """
 
     name, engine = "MJX", "mjx"
@@ -131,7 +131,7 @@ PEERS: tuple[type[Peer], ...] = (
 
 
 def peers_of(case: Case, left_out: set[str]) -> tuple[list[Peer], dict[str, str]]:
-    """Those that can have the model, and why the others cannot; `left_out` are names that --quick leaves out."""
+    """Return the peers that support the model, and why the others do not. --quick excludes the names in `left_out`."""
     found, missing = [], {}
     for kind in PEERS:
         if kind.name in left_out:

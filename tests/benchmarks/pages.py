@@ -1,18 +1,18 @@
-"""The page of figures of the documentation, whose sections benchmarks write."""
+"""Write the results of benchmarks into sections of a documentation page."""
 
 import csv
 import subprocess
 import time
 from pathlib import Path
 
-LONGEST_TABLE = 12  # rows that a page shows
+LONGEST_TABLE = 12  # largest number of rows in a page
 
 
 def write_section(page: Path, name: str, text: str) -> None:
     """Replace the section between `<!-- name -->` and `<!-- end of name -->` of a page.
 
-    A table of more than `LONGEST_TABLE` rows becomes the file `measured/<name>_<number>.csv` beside the page, to which
-    the section links.
+    A table of more than `LONGEST_TABLE` rows is written to `measured/<name>_<number>.csv` in the page's folder, and the
+    section links to this file.
     """
     begin, end = f"<!-- {name} -->\n", f"\n<!-- end of {name} -->"
     before, has_begin, rest = page.read_text().partition(begin)
@@ -23,7 +23,7 @@ def write_section(page: Path, name: str, text: str) -> None:
 
 
 def with_files(folder: Path, name: str, text: str) -> str:
-    """The text with its long tables as files in the folder."""
+    """Write the long tables of a text to files in the folder, and return the text with links to them."""
     blocks, number = text.strip("\n").split("\n\n"), 0
     for index, block in enumerate(blocks):
         rows = [[cell.strip() for cell in line.strip().strip("|").split(" | ")] for line in block.strip().splitlines()]
@@ -38,7 +38,7 @@ def with_files(folder: Path, name: str, text: str) -> str:
 
 
 def marked() -> dict[str, str]:
-    """The commit and the day of a measurement."""
+    """Return the current commit and date, to record them with a measurement."""
     command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
     commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
     return {"commit": commit or "not known", "date": time.strftime("%Y-%m-%d", time.gmtime())}

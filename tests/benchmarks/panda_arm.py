@@ -1,4 +1,4 @@
-"""The Panda's seven joints, and a state in the middle of a model's limits, as several benchmarks use them."""
+"""A Panda with seven joints, and random states near the middle of the joint limits, for several benchmarks."""
 
 import re
 from importlib.metadata import files
@@ -16,7 +16,7 @@ def robot(name: str) -> Path:
 
 
 def panda_arm(folder: Path) -> Path:
-    """The Panda's seven joints with actuators, its fingers fixed, without meshes."""
+    """Write a Panda with seven actuated joints, fixed fingers and no meshes, and return the path."""
     text = re.sub(r"<mimic[^>]*/>|<(visual|collision)>.*?</\1>", "", robot("panda.urdf").read_text(), flags=re.S)
     text = re.sub(r'(<joint name="panda_finger_joint\d" type=")prismatic', r"\1fixed", text)
     motors = "".join(
@@ -31,7 +31,7 @@ def panda_arm(folder: Path) -> Path:
 
 
 def state(model: dd.Model, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Near the middle of the joints' limits, moving."""
+    """Return a random moving state near the middle of the joint limits, and random inputs."""
     lower, upper = model.plant.GetPositionLowerLimits(), model.plant.GetPositionUpperLimits()
     limited = np.isfinite(lower) & np.isfinite(upper)
     x = model.default_state

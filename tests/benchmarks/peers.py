@@ -1,7 +1,7 @@
-"""What is timed: one class a peer, with the same four calls, and the reasons why a peer has no such call.
+"""The timed peers: each is a class with the same four calls, and with the reasons for missing calls.
 
-Each linearization and gradient starts from x0 and the inputs and makes its own rollout. Peers of native coordinates
-stay in them; `in_drake` maps an answer back to be compared before anything is timed.
+Each linearization and gradient starts from x0 and the inputs and computes its own rollout. Peers with native
+coordinates use them in all calls. `in_drake` maps a result to Drake's coordinates to compare it before the timing.
 """
 
 from collections.abc import Callable
@@ -18,12 +18,12 @@ from drake_diff.model.tangent import tangent_space
 
 QUANTITIES = ("step", "step_jacobian", "linearization", "rollout_gradient")
 BASE = "Drake AutoDiffXd"
-SMALL = 1e-5  # of Drake's central differences
+SMALL = 1e-5  # displacement of Drake's central differences
 Linear = tuple[np.ndarray, np.ndarray, np.ndarray]  # x_next, A, B
 
 
 def adjoint(steps: list[Linear], end: np.ndarray) -> np.ndarray:
-    """(N, nu) the gradient by the inputs of a loss whose gradient by x_N is `end`."""
+    """Return the gradient (N, nu) of a loss with respect to the inputs; `end` is its gradient with respect to x_N."""
     found = []
     for _, A, B in reversed(steps):
         found.append(B.T @ end)
@@ -32,10 +32,10 @@ def adjoint(steps: list[Linear], end: np.ndarray) -> np.ndarray:
 
 
 class Peer:
-    """`advance` is a step with its Jacobian, from which the other calls are made where a peer has none of its own."""
+    """A peer to time. `advance` is a step with its Jacobian, which the calls that a peer does not override use."""
 
     name: ClassVar[str]
-    how: ClassVar[dict[str, str]] = {}  # by quantity, "" for all of them
+    how: ClassVar[dict[str, str]] = {}  # by quantity; "" is the default
     missing: ClassVar[dict[str, str]] = {}
 
     def __init__(self, case: Case):
@@ -62,7 +62,7 @@ class Peer:
         return adjoint(self.linearization(horizon), self.ends)
 
     def in_drake(self, quantity: str, answer: Any) -> np.ndarray | None:
-        """A step, a step's Jacobian on the tangent space, or a gradient, in Drake's coordinates; None for the rest."""
+        """Return a step, its Jacobian on the tangent space, or a gradient in Drake's coordinates; None otherwise."""
         if quantity == "step":
             return np.asarray(answer)
         if quantity == "step_jacobian":
@@ -75,7 +75,7 @@ class Peer:
         return np.hstack([minus @ A @ space.derivative_of_plus(self.case.x), minus @ B])
 
     def call(self, quantity: str, horizon: int) -> Callable[[], Any]:
-        """What is timed."""
+        """Return the function to time."""
         method = getattr(self, quantity)
         return method if quantity in QUANTITIES[:2] else lambda: method(horizon)
 
@@ -90,7 +90,7 @@ class Peer:
 
 
 class DrakeAutodiff(Peer):
-    """Plain pydrake: one kept context of the converted plant, the double plant's for the step."""
+    """Plain pydrake, with one reused context of the AutoDiffXd plant, and of the double plant for the step."""
 
     name = BASE
     how: ClassVar = {"step": "the double step, pydrake called directly", "": "whole step, pydrake called directly"}
@@ -170,7 +170,7 @@ class DrakeDiff(Peer):
 
 
 class Engine(Peer):
-    """drake_diff's engine of a peer: Drake's coordinates and step, the peer's terms."""
+    """A peer as an engine of drake_diff: Drake's coordinates and step, with the peer's dynamics terms."""
 
     engine: ClassVar[str]
     contact: ClassVar = False
@@ -217,7 +217,7 @@ class PinocchioAlone(Engine):
         import pinocchio
 
         self.pin, nq = pinocchio, case.model.nq
-        # Its time does not depend on where a free body is, whose coordinates are others there.
+        # Pinocchio's coordinates of a free body differ from Drake's. The time does not depend on the pose of the body.
         self.q = pinocchio.neutral(self.peer.pin) if case.floats else self.x[:nq]
         self.v = self.x[nq:]
         self.effort = self.peer.actuation @ self.u

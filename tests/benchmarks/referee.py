@@ -1,8 +1,8 @@
-"""What a plan really does, by pydrake alone: its own Simulator, error-controlled or in finer steps, and its own TVLQR.
+"""Judge a plan with pydrake alone: a Simulator with error control or finer steps, and a separate TVLQR.
 
-A plan is true if the plant, under its inputs or with feedback about them, cut off at their limits, ends at the goal
-and stays within the bounds, to `tolerance` of each state's range (at least a fifth of the largest of its kind). What
-else is asked of it are its `asks`: (name, function of the times and states, most allowed), and its inputs' `rate`.
+A plan is accepted if the plant, under its inputs or with feedback about them, clipped at their limits, ends at the goal
+and stays within the bounds. The tolerance is a part of a state's range (at least a fifth of the largest of its kind).
+Further requirements are `asks`, (name, function of times and states, largest allowed value), and the inputs' `rate`.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from pydrake.systems.primitives import FirstOrderTaylorApproximation
 
 
 class Control(LeafSystem):
-    def __init__(self, plan, times, gains):  # u(t) + K(t) (x(t) - x) - l(t), cut off at the limits
+    def __init__(self, plan, times, gains):  # u(t) + K(t) (x(t) - x) - l(t), clipped at the limits
         LeafSystem.__init__(self)
         self.plan, self.times, self.gains = plan, times, gains
         self.DeclareVectorInputPort("x", BasicVector(len(plan["goal"])))
@@ -32,9 +32,7 @@ def state_of(context):
     return getattr(context, names[context.has_only_continuous_state()])()
 
 
-def simulate(
-    plan, step, times, gains, start=None
-):  # (S,) [s], (S, nx): what the plant with `step` [s] (0: continuous) goes through
+def simulate(plan, step, times, gains, start=None):  # times (S,) [s] and states (S, nx), continuous if `step` is 0
     builder, seen, (system, port_in, port_out) = DiagramBuilder(), [], plan["build"](step)
     system, control = builder.AddSystem(system), builder.AddSystem(Control(plan, times, gains))
     builder.Connect(control.get_output_port(), system.get_input_port(port_in))
@@ -44,13 +42,11 @@ def simulate(
     state_of(own).SetFromVector(plan["x"](0.0) if start is None else start)
     ResetIntegratorFromFlags(simulator, "runge_kutta3", times[1]).set_target_accuracy(1e-7)
     simulator.set_monitor(lambda root: seen.append([root.get_time(), *state_of(own).CopyToVector()]) and None)
-    simulator.AdvanceTo(times[-1] - step / 2)  # a step begins at each multiple of it
+    simulator.AdvanceTo(times[-1] - step / 2)  # a step begins at each multiple of `step`
     return np.array(seen)[:, 0], np.array(seen)[:, 1:]
 
 
-def slopes(
-    system, context, port_in
-):  # A, B and the constant term where the context is; by differences of what Drake cannot linearize
+def slopes(system, context, port_in):  # A, B, constant term at the context; by differences without AutoDiffXd
     if system.ToAutoDiffXdMaybe() is not None:
         found = FirstOrderTaylorApproximation(system, context, port_in, OutputPortSelection.kNoOutput)
         return found.A(), found.B(), found.f0()
@@ -63,10 +59,10 @@ def slopes(
 
     at = np.concatenate([x, u])
     found = np.array([(rates(at + h * e) - rates(at - h * e)) / (2 * h) for e in np.eye(len(at))]).T
-    return found[:, : len(x)], found[:, len(x) :], None  # in continuous time, where it is not asked for
+    return found[:, : len(x)], found[:, len(x) :], None  # in continuous time, which does not use the constant
 
 
-def regulator(plan, step, times, scale):  # gains and offsets at `times` by Riccati's recursion
+def regulator(plan, step, times, scale):  # gains and offsets at `times` by a Riccati recursion
     system, port_in, _ = plan["build"](step)
     context, h, Q, gains = system.CreateDefaultContext(), times[1], np.diag(1 / scale**2), []
     R, P = 0.1 * np.diag(1 / np.maximum(np.ptp([plan["u"](t) for t in times], axis=0), 1e-3) ** 2), 100 * Q
@@ -84,19 +80,19 @@ def regulator(plan, step, times, scale):  # gains and offsets at `times` by Ricc
     return gains[::-1]
 
 
-def scale_of(plan, times):  # (nx,) what a miss of each state is a part of, and (nu,) the inputs' ranges
+def scale_of(plan, times):  # (nx,) scales of the errors of states, and (nu,) ranges of the inputs
     nq = plan["nq"]
     ranges, us = (np.ptp([plan[name](t) for t in times], axis=0) for name in ("x", "u"))
     least = np.repeat([ranges[:nq].max(initial=0), ranges[nq:].max(initial=0)], [nq, len(ranges) - nq]) / 5
     return np.maximum(np.maximum(ranges, least), 1e-3), us
 
 
-def input_excess(plan, us):  # by how much of its range an input is beyond its bound
+def input_excess(plan, us):  # largest excess of an input beyond its bound, relative to its range
     applied = [plan["u"](t) for t in np.linspace(0, plan["T"], 999)]
     return np.max(np.maximum(plan["u_lower"] - applied, applied - plan["u_upper"]) / np.maximum(us, 1e-2))
 
 
-def misses(plan, at, xs, scale, tolerance):  # (the worst miss, what is told of it, "" where nothing is missed)
+def misses(plan, at, xs, scale, tolerance):  # (the largest relative error, a message or "" if all are allowed)
     excess = np.maximum(plan["x_lower"] - xs, xs - plan["x_upper"])[1:].max(axis=0)
     missed = np.where(np.isnan(plan["goal"]), 0, np.abs(xs[-1] - plan["goal"]))
     worst = float(np.nan_to_num(np.maximum(missed, excess) / scale, nan=np.inf).max())
@@ -107,12 +103,12 @@ def misses(plan, at, xs, scale, tolerance):  # (the worst miss, what is told of 
 
 
 def judge(plan, step, tolerance):
-    """(why the plan is false, "" if it is true; the worst miss as a part of the range) in the plant with `step` [s]."""
+    """Return why the plan is wrong in the plant with `step` [s], "" if it is right, and the largest relative error."""
     times = np.linspace(0, plan["T"], round(plan["T"] / step) + 1 if step else 201)
     scale, us = scale_of(plan, times)
     if (beyond := input_excess(plan, us)) > 1e-3:
         return f"input beyond its bound by {beyond:.2g} of its range", np.inf
-    if "rate" in plan:  # of inputs, per s, over a while that a held one takes to change
+    if "rate" in plan:  # [per s], and the interval in which a piecewise constant input changes
         most, while_ = plan["rate"]
         starts = np.linspace(0, plan["T"] - while_, 999)
         changes = [np.abs(plan["u"](t + while_) - plan["u"](t)).max() / while_ for t in starts + 1e-9]
@@ -129,9 +125,9 @@ def judge(plan, step, tolerance):
 
 
 def judge_phases(plans, resets, closes, tolerance):
-    """The same of phases one after the other, each from where the one before leads, through `resets` of its own.
+    """Judge successive phases. Each starts from the last state of the previous phase, mapped by its reset.
 
-    Where it `closes`, the last reset leads back to the first state.
+    If `closes` is true, the last reset must lead back to the first state.
     """
     parts = []
     for plan in plans:

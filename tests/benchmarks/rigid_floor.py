@@ -1,6 +1,6 @@
-"""Rigid impacts of a point of a robot with a floor, from Drake's mass matrix and Jacobian alone: a referee.
+"""Reference for rigid impacts of a robot's point with a floor, from Drake's mass matrix and Jacobian alone.
 
-Impulses of one contact by the angle along which it slides: nothing of the toolkit is in it.
+The impulse of a sliding contact is found by a search for the sliding angle. No code of the toolkit is used.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ FLOOR = np.array([0.0, 0.0, 1.0])
 
 
 class Floor:
-    """The lowest point of a ball of that radius [m] at a point of a body, against the plane z = 0."""
+    """The plane z = 0 and the lowest point of a ball with this radius [m], centered at a point of a body."""
 
     def __init__(self, plant, body, radius=0.0, at=(0.0, 0.0, 0.0)):
         self.plant, self.context = plant, plant.CreateDefaultContext()
@@ -20,7 +20,7 @@ class Floor:
         self.nq = plant.num_positions()
 
     def terms(self, x):
-        """M (nv, nv), J (3, nv) and the gap [m]."""
+        """Return M (nv, nv), J (3, nv) and the gap [m]."""
         plant, world = self.plant, self.plant.world_frame()
         plant.SetPositionsAndVelocities(self.context, x)
         pose = plant.EvalBodyPoseInWorld(self.context, self.body)
@@ -31,7 +31,7 @@ class Floor:
         return plant.CalcMassMatrix(self.context), J, (pose @ self.at)[2] - self.radius
 
     def after(self, x, restitution, friction, *, poisson=False):
-        """(nx,) the state after an impact."""
+        """Return the state (nx,) after an impact."""
         M, J, _ = self.terms(x)
         v, pushed = x[self.nq :], np.linalg.solve(M, J.T)
         W, w = J @ pushed, J @ v
@@ -43,7 +43,7 @@ class Floor:
         return np.concatenate([x[: self.nq], v + pushed @ P])
 
     def slopes(self, x, restitution, friction, *, poisson=False, width=1e-6):
-        """(nx, nx) central differences of `after`."""
+        """Return central differences (nx, nx) of `after` with respect to the state."""
         ends = [
             [self.after(x + s * width * e, restitution, friction, poisson=poisson) for e in np.eye(len(x))]
             for s in (1, -1)
@@ -52,11 +52,11 @@ class Floor:
 
 
 def impulse(W, w, speed, least, friction):
-    """(3,) of the cone |P_t| <= friction P_n that makes the normal velocity `speed`, or is `least` if it parts them.
+    """Return P (3,) with |P_t| <= friction P_n for a normal velocity `speed`, or a larger one if P_n = `least`.
 
-    It sticks where the cone has what that needs. Else it slides along an angle at which the slip has no part across.
+    The contact sticks if the cone contains this impulse. Otherwise it slides along an angle without transverse slip.
     """
-    for parts in (False, True):  # the contact is left at `speed`, or faster by what it is pushed at least
+    for parts in (False, True):  # separation with `speed`, or faster with the normal impulse `least`
         P = _sticking(W, w, speed, least, parts)
         if np.hypot(*P[:2]) > friction * P[2] + 1e-14 or P[2] < 0:
             P = _sliding(W, w, speed, least, friction, parts)
@@ -69,12 +69,12 @@ def _sticking(W, w, speed, least, parts):
     A, b = W.copy(), np.array([-w[0], -w[1], speed - w[2]])
     if parts:
         A[2], b[2] = [0, 0, 1], least
-    return np.linalg.lstsq(A, b, rcond=1e-12)[0]  # of a planar body nothing moves across its plane
+    return np.linalg.lstsq(A, b, rcond=1e-12)[0]  # W is singular for a planar body, which stays in its plane
 
 
 def _sliding(W, w, speed, least, friction, parts):
     def at(angle):
-        """Across and along the direction the slip, times the size that P is to be divided by; and P times it."""
+        """Return the slip across and along the angle and P, each multiplied by `size`, and `size`."""
         d = np.array([np.cos(angle), np.sin(angle), 0.0])
         way = FLOOR - friction * d
         push, size = (least, 1.0) if parts else (speed - w[2], W[2] @ way)
@@ -88,7 +88,7 @@ def _sliding(W, w, speed, least, friction, parts):
     for low, high, one, other in zip(angles[:-1], angles[1:], across[:-1], across[1:], strict=True):
         if one * other <= 0:
             _, along, P, size = at(brentq(lambda angle: at(angle)[0], low, high, xtol=1e-15))
-            is_known = abs(size) > 1e-9 * (1.0 if parts else np.trace(W))  # else nothing is divided by nothing
+            is_known = abs(size) > 1e-9 * (1.0 if parts else np.trace(W))  # otherwise 0 is divided by 0
             if is_known and along * size > 0 and P[2] * size >= 0:
                 return P / size
     return None

@@ -1,13 +1,13 @@
-"""Files of a grammar of MJCF, stepped in MuJoCo and here: accelerations must agree, or a finding must name why not.
+"""Compare random MJCF files in MuJoCo and drake_diff: accelerations must agree, or a finding must state the reason.
 
     python tests/benchmarks/same_step.py [--count 1000] [--seed 0] [--files robot.xml ...]
 
 Each file is a tree of hinges and slides with random attributes, default classes, compiler options, actuators of every
-kind and couplings. At random states, under random controls within their ranges, MuJoCo's `qacc` without constraints is
-compared with M^-1 (B efforts - rest) of Drake's plant. A difference above 1e-9 of the largest acceleration is reported
-if a note of the model, but for those of BENIGN, or a warning of its audit says what is not as in the file.
-Prints how many files agree (and of these how many have a finding), differ with a finding and differ without one. With
-`--files` it is robots of others instead; a file is named where its joints cannot be matched.
+kind and couplings. At random states and random controls within their ranges, MuJoCo's `qacc` without constraints is
+compared with M^-1 (B efforts - rest) of Drake's plant, to 1e-9 of the largest acceleration. A larger difference has a
+finding if a note of the model, except those of BENIGN, or a warning of its audit states a deviation from the file. The
+script prints how many files agree (and how many of these have a finding), differ with a finding and differ without a
+finding. `--files` compares the given robots instead, and also reports the joints that cannot be matched.
 """
 
 import argparse
@@ -25,9 +25,9 @@ import drake_diff as dd
 from drake_diff.exceptions import ModelError
 from drake_diff.model.plant import actuators, joints
 
-AGREE = 1e-9  # of the largest acceleration: chains of a few bodies in double precision
+AGREE = 1e-9  # relative to the largest acceleration, for chains of a few bodies in double precision
 STATES = 4
-# Notes of what was done so that the plant is as the file says, or of what no acceleration without contact depends on.
+# Notes on exact conversions of the file, or on properties that do not affect accelerations without contact.
 BENIGN = re.compile(
     r"attribute '(timestep|integrator|solver|cone)'|Effort limits at the joint|Gains k|<general> actuators became"
     r"|has no name|Default classes|became forces on bodies|became bodies|tag 'site'|springs? added|Springs"
@@ -114,7 +114,7 @@ def actuator(random, k, target):
 
 
 def text_of(random):
-    """One file of the grammar."""
+    """Return the text of a random MJCF file."""
     degrees = random.random() < 0.5
     depth = int(random.integers(0, 4))
     tree = body(random, 0, degrees, depth, random.random() < 0.1)
@@ -140,7 +140,7 @@ def text_of(random):
 
 
 def matched(model, theirs):
-    """Each joint of ours that moves, where its coordinates begin in MuJoCo's, and where its velocities do."""
+    """Return each joint of the model that moves, with the start of its positions and velocities in MuJoCo."""
     sides = []
     for joint in (j for j in joints(model.plant) if j.num_velocities()):
         free = joint.num_positions() == 7
@@ -157,7 +157,7 @@ def matched(model, theirs):
 
 
 def numbers_of_inputs(model, theirs):
-    """Which of MuJoCo's actuators each input is: that of its name, or of its joint where it has none."""
+    """Return the index of MuJoCo's actuator for each input, found by its name or else by its joint."""
     numbers, motors = [], actuators(model.plant)
     for k, name in enumerate(model.input_names):
         i = mujoco.mj_name2id(theirs, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
@@ -173,11 +173,11 @@ def numbers_of_inputs(model, theirs):
 
 
 class UnmatchedError(Exception):
-    """A joint of one has none in the other that it is."""
+    """A joint or an input of one model has no counterpart in the other."""
 
 
 def put(data, model, sides, x):
-    """The state x (nx,) of ours in MuJoCo's: a free body's place before its turn, its rates of turning in its axes."""
+    """Write x (nx,) to MuJoCo's state: a free body's position before its quaternion, angular velocity in its axes."""
     q, v = x[: model.nq], x[model.nq :]
     for joint, i, k in sides:
         p, w = joint.position_start(), joint.velocity_start()
@@ -190,7 +190,7 @@ def put(data, model, sides, x):
 
 
 def accelerations(data, model, sides):
-    """MuJoCo's (nv,) in our order, those of a free body in the world's axes."""
+    """Return MuJoCo's accelerations (nv,) in the model's order, those of a free body in the world's axes."""
     found = np.zeros(model.nv)
     for joint, i, k in sides:
         w = joint.velocity_start()
@@ -203,7 +203,7 @@ def accelerations(data, model, sides):
 
 
 def gap(path, theirs, random):
-    """The largest difference of accelerations, relative to the largest, and what the model says of the file."""
+    """Return the largest relative difference of accelerations, and the findings of the model about the file."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         model = dd.load_model(path, time_step=0.01, contact=False)
@@ -289,7 +289,7 @@ def main():
         print(f"  {n:5} {words}")
     print(f"{covered} of {counts['agree']} files that agree have a finding: a difference there would be reported")
     print("without a finding:", silent[: asked.show])
-    return 1 if silent or covered > counts["agree"] / 2 else 0  # notes that are no findings would hide differences
+    return 1 if silent or covered > counts["agree"] / 2 else 0  # such findings would excuse any difference
 
 
 if __name__ == "__main__":

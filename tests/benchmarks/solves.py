@@ -1,4 +1,4 @@
-"""Whole solves: the problems of `collocation.py` and `ilqr.py`, as they stand there, in turns."""
+"""Time whole solves of the problems of `collocation.py` and `ilqr.py` in alternation."""
 
 import sys
 import tempfile
@@ -20,7 +20,7 @@ BUDGET, QUICK_BUDGET = 20.0, 5.0  # [s]
 
 
 def solved(names: list[str], quick: bool) -> Iterator[Row | Missing]:
-    """The rows of each whole solve, a key of SOLVES."""
+    """Yield the rows of each whole solve in `names`, which are names of SOLVES."""
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
         for name in names:

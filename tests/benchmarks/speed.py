@@ -1,10 +1,10 @@
-"""What derivatives cost beside Drake's own step of the same motion: the table of docs/measured.md.
+"""Measure the time of derivatives relative to Drake's own step of the same motion, for docs/measured.md.
 
     python tests/benchmarks/speed.py [--quick] [--write docs/measured.md]
 
-A Panda's seven joints that move freely, and a Go2 that stands on its feet at 5, 20 and 50 ms. Processor time of one
-thread; what is compared takes turns, round by round, and a figure is the median of the rounds' ratios. --write puts
-the table into the section `speed` of the page.
+A Panda with seven joints moves freely, and a Go2 stands on its feet with time steps of 5, 20 and 50 ms.
+The processor time of one thread is measured in rounds, in which each function is called in turn. A figure is the median
+of the rounds' ratios. --write writes the table to the section `speed` of the page.
 """
 
 import argparse
@@ -39,9 +39,9 @@ from drake_diff.optimize.ilqr.riccati import LinearQuadratic, solve_riccati
 
 KNOTS, ROUNDS, QUICK_ROUNDS = 50, 15, 5
 LEG = (0.0, 0.8, -1.6)  # [rad] hip, thigh and calf of the standing Go2
-GAINS = {0.005: (40.0, 1.0), 0.02: (40.0, 0.5), 0.05: (20.0, 0.2)}  # that hold it up
+GAINS = {0.005: (40.0, 1.0), 0.02: (40.0, 0.5), 0.05: (20.0, 0.2)}  # (kp, kd) by time step [s] that keep it upright
 Motion = tuple[dd.Model, np.ndarray, np.ndarray]
-Call = tuple[Callable[[], object], int]  # and how many steps it is of
+Call = tuple[Callable[[], object], int]  # function and its number of steps
 
 
 def free_arm() -> Motion:
@@ -54,7 +54,7 @@ def free_arm() -> Motion:
 
 
 def standing_robot(time_step: float) -> Motion:
-    """On four feet, a millimetre in the ground at first, its joints held by the inputs."""
+    """Return a motion of a Go2 on four feet, 1 mm in the ground at the start, under PD control of its joints."""
     model = example_robot("go2.urdf", time_step, feet=True)
     x, nq = model.default_state, model.nq
     x[:7], x[7:nq], x[nq:] = [1, 0, 0, 0, 0, 0, 1], np.tile(LEG, 4), 0.0
@@ -71,7 +71,7 @@ def standing_robot(time_step: float) -> Motion:
 
 
 def calls_of(motion: Motion) -> dict[str, Call]:
-    """What is timed; the first is what the others are beside."""
+    """Return the functions to time. The first is the base of the ratios."""
     model, xs, us = motion
     x, u, ends = xs[KNOTS // 2], us[KNOTS // 2], xs[1:]
 
@@ -118,7 +118,7 @@ def _sweep(motion: Motion) -> Callable[[], object]:
 
 
 def gradients_of(motion: Motion, count: int) -> dict[str, Call]:
-    """A rollout and its gradient, of the last state and of the whole motion."""
+    """Return a rollout, and its gradients for a loss of the last state and for a loss of the whole motion."""
     model, xs, us = motion
     inputs, x0 = np.resize(us, (count, model.nu)), xs[0]
     return {
@@ -132,7 +132,7 @@ def gradients_of(motion: Motion, count: int) -> dict[str, Call]:
 
 
 def measured(calls: dict[str, Call], rounds: int) -> tuple[float, dict[str, float]]:
-    """[us] of the first, the median of the rounds, and the medians of each one's ratio to it."""
+    """Return the median time of the first function [us], and the median ratio of each function to the first."""
     times: dict[str, list[float]] = {name: [] for name in calls}
     repeats = {}
     for name, (call, count) in calls.items():
@@ -153,7 +153,7 @@ def measured(calls: dict[str, Call], rounds: int) -> tuple[float, dict[str, floa
 
 
 def table(quick: bool) -> str:
-    """As Markdown."""
+    """Return the table in Markdown."""
     motions = {"Panda, free": free_arm()} | {f"Go2 stands, {1e3 * h:g} ms": standing_robot(h) for h in GAINS}
     found = {name: measured(calls_of(motion), QUICK_ROUNDS if quick else ROUNDS) for name, motion in motions.items()}
     rows = list(dict.fromkeys(row for _, ratios in found.values() for row in ratios))

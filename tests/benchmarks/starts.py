@@ -1,4 +1,4 @@
-"""Fresh processes in turns: the package's import and the command's help beside the imports of NumPy and of a plant."""
+"""Time the package's import and the command's help in fresh processes, with the imports of NumPy and of a plant."""
 
 import resource
 import subprocess
@@ -20,7 +20,7 @@ BUDGET, QUICK_BUDGET = 15.0, 5.0  # [s]
 
 
 def started(quick: bool) -> Iterator[Row]:
-    """A row each: seconds of a process from its start to its end."""
+    """Yield a row for each kind of process, with the seconds from its start to its end."""
     print("start", file=sys.stderr, flush=True)
     firsts = {name: timed(lambda words=words: _run(words))[1] for name, words in STARTS.items()}
     samples = measure({name: _processes(words) for name, words in STARTS.items()}, QUICK_BUDGET if quick else BUDGET)
@@ -30,7 +30,7 @@ def started(quick: bool) -> Iterator[Row]:
 
 
 def _processes(words: list[str]) -> Block:
-    """One for each call; the processor's clock is theirs, not ours."""
+    """Return a block that starts a process per call and measures the processor time of these processes."""
 
     def run(calls: int) -> tuple[float, float]:
         wall, cpu = time.perf_counter(), _processor()

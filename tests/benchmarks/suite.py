@@ -1,4 +1,4 @@
-"""Models, quantities and peers put together: rows of measurements, and what is missing and why."""
+"""Measure models, quantities and peers, or report the reason why a measurement is missing."""
 
 import sys
 from collections.abc import Iterator
@@ -14,27 +14,27 @@ from drake_diff.exceptions import GradientError, SimulationError
 
 QUICK_MODELS = ("pendulum", "panda", "solo12", "sphere", "chain5")
 BUDGET, QUICK_BUDGET = 3.0, 1.0  # [s] of rounds for one model and quantity
-CHECKED = 10  # steps of a gradient that is compared before it is timed
+CHECKED = 10  # steps of a gradient in the comparison before the timing
 
 
 @dataclass(frozen=True)
 class Row:
-    """One peer's time for one quantity; seconds a call, ratios of processor time to the base's, round by round."""
+    """One peer's time for one quantity: seconds per call, and ratios of processor time to the base's by round."""
 
     model: str
-    joints: int  # nv, 0 where there is no model
+    joints: int  # nv, or 0 without a model
     quantity: str
     horizon: int | None
     peer: str
     how: str
-    first: float  # on the wall, of the first call, of CHECKED steps where it has a horizon
-    calls: int  # in one block
+    first: float  # wall time of the first call, with CHECKED steps if the quantity has a horizon
+    calls: int  # per block
     blocks: int
     wall: Spread
     cpu: Spread
     base: str
     ratio: Spread
-    gap: float | None  # from the base's answer, over its largest entry or 1; None where coordinates differ
+    gap: float | None  # difference from the base's result, over its largest entry or 1; None if coordinates differ
 
     def as_dict(self) -> dict:
         spreads = {name: getattr(self, name)._asdict() for name in ("wall", "cpu", "ratio")}
@@ -44,13 +44,13 @@ class Row:
 @dataclass(frozen=True)
 class Missing:
     model: str
-    quantity: str  # "all" where the peer cannot have the model
+    quantity: str  # "all" if the peer does not support the model
     peer: str
     reason: str
 
 
 def measured(name: str, quantities: list[str], quick: bool) -> Iterator[Row | Missing]:
-    """The rows of one model, of each quantity and horizon."""
+    """Yield the rows of one model for each quantity and horizon."""
     chosen = case(name)
     found, refused = peers_of(chosen, {Mjx.name} if quick else set())
     yield from (Missing(name, "all", peer, reason) for peer, reason in refused.items())
@@ -65,7 +65,7 @@ def measured(name: str, quantities: list[str], quick: bool) -> Iterator[Row | Mi
 
 
 def _horizons(name: str, quantity: str, quick: bool) -> tuple[int, ...]:
-    """0 for what has none."""
+    """Return the horizons of a quantity, or (0,) if it has no horizon."""
     if quantity in QUANTITIES[:2]:
         return (0,)
     if quick:
@@ -98,7 +98,7 @@ def _group(case: Case, quantity: str, horizon: int, peers: list[Peer], budget: f
 def row(
     about: dict, peer: str, how: str, first: float, sample: Sample, base: tuple[str, Sample], gap: float | None
 ) -> Row:
-    """`about` has model, joints, quantity and horizon."""
+    """Return a row. `about` contains model, joints, quantity and horizon."""
     return Row(
         **about,
         peer=peer,

@@ -1,4 +1,4 @@
-"""What was measured as tables, and as JSON with versions, machine and load."""
+"""Show measurements as tables, and save them as JSON with versions, machine and load."""
 
 import json
 import os
@@ -16,13 +16,13 @@ from suite import Missing, Row
 from timing import Spread
 
 FORMAT = 1
-SAME = 1e-6  # differences are up to 1e-8 off, another law of contact 1e-3
+SAME = 1e-6  # finite differences deviate by up to 1e-8, another contact law by 1e-3
 PACKAGES = ["drake-diff", "drake", "numpy", "mujoco", "mujoco-mjx", "jax", "pin", "casadi", "adam-robotics"]
 ROOT = Path(__file__).parents[2]
 
 
 def machine() -> dict:
-    """Processor, cores, system and the load of the last minute."""
+    """Return processor, cores, system and the load of the last minute."""
     lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
     names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
     return {
@@ -35,7 +35,7 @@ def machine() -> dict:
 
 
 def versions() -> dict[str, str | None]:
-    """Of the packages, None where one is not installed, and the commit of this checkout."""
+    """Return the versions of the packages (None if not installed) and the commit of this checkout."""
     found: dict[str, str | None] = {}
     for name in PACKAGES:
         try:
@@ -47,7 +47,7 @@ def versions() -> dict[str, str | None]:
 
 
 def document(rows: list[Row], missing: list[Missing], before: dict, asked: dict) -> dict:
-    """All of a run, as it is saved; `before` is the machine at its start."""
+    """Return a run in the form in which it is saved. `before` is the machine at its start."""
     return {
         "format": FORMAT,
         "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
@@ -64,7 +64,7 @@ def save(path: Path, found: dict) -> None:
 
 
 def show(found: dict) -> None:
-    """A table a quantity and horizon, of ratios to its base; then what is missing."""
+    """Print a table of ratios to the base for each quantity and horizon, and the missing measurements."""
     console = Console(width=None if Console().is_terminal else 190)
     about = found["machine"]
     console.print(
@@ -83,7 +83,7 @@ def show(found: dict) -> None:
 
 
 def _how(rows: list[dict]) -> Iterator[str]:
-    """A line a peer: what was called for which quantities."""
+    """Yield a line for each peer with the functions that were called for each quantity."""
     for peer in dict.fromkeys(row["peer"] for row in rows if row["quantity"] != "solve"):
         own = [row for row in rows if row["peer"] == peer and row["quantity"] != "solve"]
         told = dict.fromkeys((row["how"], row["quantity"]) for row in own)
@@ -93,7 +93,7 @@ def _how(rows: list[dict]) -> Iterator[str]:
 
 
 def _missing(missing: list[dict]) -> Iterator[str]:
-    """A line a reason, with the models it is of."""
+    """Yield a line for each reason, with its models."""
     models: dict[tuple[str, str, str], list[str]] = {}
     for one in missing:
         models.setdefault((one["peer"], one["quantity"], one["reason"]), []).append(one["model"])
@@ -102,13 +102,13 @@ def _missing(missing: list[dict]) -> Iterator[str]:
 
 
 def seconds(value: float) -> str:
-    """With a unit that leaves one to three digits before the point."""
+    """Return a time with a unit that leaves one to three digits before the decimal point."""
     scale, unit = next(((s, u) for s, u in ((1.0, "s"), (1e3, "ms")) if value * s >= 1), (1e6, "us"))
     return f"{value * scale:.3g} {unit}"
 
 
 def ratio(given: dict) -> str:
-    """Its median, and half the distance of the quartiles as a percentage of it."""
+    """Return the median, and half the distance of the quartiles as a percentage of the median."""
     one = Spread(**given)
     return f"{one.median:.2g} ±{50 * (one.q3 - one.q1) / one.median:.0f}%"
 
@@ -128,7 +128,7 @@ def _ratios(title: str, rows: list[dict]) -> Table:
 
 
 def _apart(gap: float | None) -> str:
-    """A mark where the answer is another than the base's."""
+    """Return " *" if the result differs from the base's, else ""."""
     return " *" if gap is not None and gap > SAME else ""
 
 

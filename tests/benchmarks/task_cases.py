@@ -1,7 +1,7 @@
-"""The tasks of `tasks.py`: a name -> what is asked, and how the referee, who shares no code with it, sees it.
+"""The tasks of `tasks.py`: each function returns a problem and an independent model of it for the referee.
 
-Each takes a random generator and gives a `Case`. Constants are drawn such that a motion exists: known limits apart
-(the block's 4 m d / T^2), they leave room.
+Each function takes a random generator and returns a `Case`. Constants are drawn such that a motion exists, with some
+margin except at known limits (the block's 4 m d / T^2).
 """
 
 import dataclasses
@@ -34,26 +34,26 @@ from task_plants import FOLDER, FREE, arm_file, block_file, effort, formula, loa
 import drake_diff as dd
 from drake_diff.model import BodyForce
 
-Ask = tuple[str, Callable[[np.ndarray, np.ndarray], float], float]  # name, (times, xs) -> miss, allowed
+Ask = tuple[str, Callable[[np.ndarray, np.ndarray], float], float]  # name, (times, xs) -> error, largest allowed error
 PANDA = Path(dd.__file__).parent / "model" / "robots" / "panda.urdf"
 QUADROTOR = MODELS / "quadrotor.urdf"
 ARM, MOMENT_RATIO, MOST, HOVER = 0.15, 0.0245, 5.0, 0.775 * 9.81 / 4  # [m], [m], [N], [N]
-TWICE = 2.0  # a hand's tolerance: the referee's plant takes other steps than the plan's
+TWICE = 2.0  # factor of a hand's tolerance, because the referee's plant takes different steps
 
 
 @dataclass(frozen=True)
 class Case:
-    """`asks` are what a referee measures besides the goal and the bounds; `peer` is x' = f(x, u, math), by hand.
+    """A problem with checks for the referee (`asks`), besides the goal and the bounds, and data for peers.
 
-    `file` is the model's, for peers that read it; `disks` are what they are told to keep off. `optimum` is the least
-    cost, in closed form. `rate` [per s] is how fast inputs may change.
+    `peer` is a handwritten function x' = f(x, u, math), `file` the model's file and `disks` the obstacles for peers.
+    `optimum` is the least cost. `rate` [per s] is the largest rate of the inputs.
     """
 
     problem: dd.Problem
     build: Callable[[float], Any]
     asks: tuple[Ask, ...] = ()
     peer: Callable[..., Any] | None = None
-    model_file: Callable[[dd.Solution], Callable[[float], Any]] | None = field(default=None)  # where a plan chooses it
+    model_file: Callable[[dd.Solution], Callable[[float], Any]] | None = field(default=None)  # if the plan optimizes it
     file: Path | None = None
     disks: tuple[tuple[float, float, float], ...] = ()  # x, y, radius
     optimum: float | None = None  # in closed form
@@ -106,7 +106,7 @@ def pendulum_least_effort(random):
 
 
 def pendulum_weak_motor(random):
-    """It swings back and forth: 4.9 Nm would hold it."""
+    """Swing back and forth with less than the 4.9 Nm that hold the pendulum horizontally."""
     return swing(MODELS / "pendulum.urdf", near_rest(random, 1), [np.pi, 0], random.uniform(1.8, 3), 0.05, 80)
 
 
@@ -140,7 +140,7 @@ def acrobot_swing_up(random):
 
 @cache
 def pendubot_file():
-    """The double pendulum without its second motor."""
+    """Write the double pendulum without its second motor, and return the path."""
     path = Path(FOLDER.name) / "pendubot.urdf"
     found = (MODELS / "double_pendulum.urdf").read_text()
     path.write_text(re.sub(r"<transmission>(?:(?!</transmission>).)*elbow.*?</transmission>", "", found, flags=re.S))
@@ -194,7 +194,7 @@ def crane_small_sway(random):
 
 
 def crane_between_walls(random):
-    """The walls are at both ends: nothing may overshoot."""
+    """Move from wall to wall, so that the cart must not overshoot."""
     way = random.uniform(0.4, 1.0)
     wall = way + 0.02
     bounds = dd.Bounds(x_lower=[-wall, FREE, FREE, FREE], x_upper=[wall, FREE, FREE, FREE], u_lower=[-8], u_upper=[8])
@@ -202,7 +202,7 @@ def crane_between_walls(random):
 
 
 def crane_around_a_ball(random):
-    """A ball hangs in the load's way; the pole and the load are drawn at y = -0.08 m."""
+    """Move the load around a ball in its path. The shapes of the pole and the load are at y = -0.08 m."""
     radius = random.uniform(0.08, 0.12)
     center = np.array([random.uniform(-0.2, 0.2), -0.08, -0.55])
     case = crane(random, effort(1), count=60, goals=[dd.SphereObstacle(center, radius)], way=1.2,
@@ -259,7 +259,7 @@ def ball_pushes_a_ball(random):
 
 
 def posture(model, random, share=0.4):
-    """Two postures in the middle of the joints' range."""
+    """Return two random postures near the middle of the joints' range."""
     lower, upper = (
         np.clip(side, -2.5, 2.5)
         for side in (model.plant.GetPositionLowerLimits(), model.plant.GetPositionUpperLimits())
@@ -270,7 +270,7 @@ def posture(model, random, share=0.4):
 
 @cache
 def kinematics(path):
-    """(plant, context) of the referee: no step is taken with it."""
+    """Return the referee's (plant, context) for forward kinematics."""
     plant = MultibodyPlant(0.0)
     Parser(plant).AddModels(str(path))
     plant.Finalize()
@@ -278,7 +278,7 @@ def kinematics(path):
 
 
 def places(path, q, bodies=None):
-    """(B, 3) the origins of the bodies that `bodies` names, of all if None, in the order of the file."""
+    """Return the origins (B, 3) of the bodies named in `bodies`, or of all if None, in the order of the file."""
     plant, context = kinematics(path)
     plant.SetPositions(context, q)
     found = [plant.get_body(i) for i in plant.GetBodyIndices(plant.GetModelInstanceByName(plant_name(plant)))]
@@ -302,7 +302,7 @@ def hand_misses(path, frame, target):
 
 
 def skeleton_enters(path, nq, center, radius):
-    """How deep the lines between the origins of neighbouring links are in a ball."""
+    """Return a function that computes how deep the lines between origins of neighbouring links are in a ball."""
 
     def depth(_, xs):
         s = np.linspace(0, 1, 6)[:, None]
@@ -317,7 +317,7 @@ def skeleton_enters(path, nq, center, radius):
 
 
 def arm(name, random, *, hand=None, ball=False, horizon=None, time=1.5, count=30):
-    """From rest to rest, to a posture or with the hand at a place, past a ball in the middle of the hand's way."""
+    """Move from rest to rest to a posture or a hand position, with `ball` past a ball in the middle of the path."""
     path = arm_file(name)
     model = loaded(path, time / count)
     plant, nq, still = model.plant, model.nq, np.zeros(model.nv)
@@ -380,7 +380,7 @@ HOME = np.array([0, -0.785, 0, -2.356, 0, 1.571, 0.785])
 
 
 def panda(random, **options):
-    """From near its home posture to the hand at a place, with the contact that its file has."""
+    """Return the parts of a task from near the home posture to a hand position, with the contact of the file."""
     model = dd.example_model("panda", time_step=0.03, **options)
     start = HOME + random.uniform(-0.2, 0.2, 7)
     target = places(PANDA, HOME + random.uniform(-0.5, 0.5, 7), ["panda_hand"])[0]
@@ -407,7 +407,7 @@ def panda_joint_goal(random):
 
 
 def ball_distance(radius, center):
-    """How deep a ball is in the Panda's shapes, by Drake's SceneGraph."""
+    """Return a function that computes how deep a ball is in the Panda's shapes with Drake's SceneGraph."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
     Parser(plant).AddModels(str(PANDA))
@@ -428,9 +428,9 @@ def ball_distance(radius, center):
 
 
 def panda_past_a_ball(random):
-    """Across its front, a ball on the way."""
+    """Move the hand across the front of the robot, past a ball in its path."""
     model, problem, _, _ = panda(random)
-    while True:  # until the ball is clear of both ends
+    while True:  # until both ends are clear of the ball
         start, goal = HOME + random.uniform(-0.1, 0.1, 7), HOME + random.uniform(-0.1, 0.1, 7)
         start[0], goal[0] = -random.uniform(0.5, 0.8), random.uniform(0.5, 0.8)
         center = places(PANDA, (start + goal) / 2, ["panda_hand"])[0] + random.uniform(-0.03, 0.03, 3)
@@ -447,7 +447,7 @@ def panda_past_a_ball(random):
 
 
 def heavier_panda(mass):
-    """A file in which the Panda's hand weighs more."""
+    """Write a Panda whose hand has the given mass [kg], and return the path."""
     text = PANDA.read_text().replace(
         '<mass value="0.73"/>\n      <inertia ixx="0.001" iyy="0.0025" izz="0.0017"',
         f'<mass value="{mass!r}"/>\n      <inertia ixx="{0.001 * mass / 0.73!r}" iyy="{0.0025 * mass / 0.73!r}" '
@@ -461,7 +461,7 @@ def heavier_panda(mass):
 
 
 def panda_payload(random):
-    """Its hand carries up to 2 kg, in its file."""
+    """Carry up to 2 kg in the hand, whose mass is changed in the file."""
     path = heavier_panda(0.73 + random.uniform(0.3, 2.0))
     _, problem, target, asks = panda(random)
     model = dd.load_model(path, time_step=0.03)
@@ -470,7 +470,7 @@ def panda_payload(random):
 
 
 def panda_payload_as_a_parameter(random):
-    """The same, where the hand's mass is a parameter of the problem; the referee reads it in a file."""
+    """Carry up to 2 kg, with the hand's mass as a parameter of the problem. The referee reads it from a file."""
     mass = 0.73 + random.uniform(0.3, 2.0)
     model, problem, target, asks = panda(random)
     problem = dd.Problem(
@@ -509,7 +509,7 @@ def two_rods_past_a_ball(random):
 
 
 def plain(f, nx, nu, *, limits, x0, goal, count, horizon, cost, **more):
-    """x' = f(x, u, math) in plain formulas; `limits` are pairs for states and inputs."""
+    """Return a task of x' = f(x, u, math). `limits` are the pairs of bounds of states and inputs."""
     (xl, xu), (ul, uu) = limits
     dynamics = dd.Dynamics(lambda x, u: f(x, u, np), nx, nu, x_lower=xl, x_upper=xu, u_lower=ul, u_upper=uu)
     problem = dd.Problem(dynamics, x0=x0, x_goal=goal, num_steps=count, horizon=horizon, running_cost=cost, **more)
@@ -532,7 +532,7 @@ def car_turns_around(random):
 
 
 def keep_off(disks):
-    """Constraints of the problem, and what the referee asks."""
+    """Return the problem's constraints to avoid the disks, and the referee's check."""
 
     def distance(a, b):
         return lambda x: (x[0] - a) ** 2 + (x[1] - b) ** 2
@@ -566,12 +566,12 @@ def bicycle_around_disks(random):
 
 
 def shortest_dubins(x, y, heading):
-    """[s] the shortest of the six words of Dubins from the origin, with unit speed and radius."""
+    """Return the time [s] of the shortest of the six words of Dubins from the origin, with unit speed and radius."""
 
     def turned(angle):
         return angle % (2 * np.pi)
 
-    def tangents(side, other):  # an arc to a line to an arc; sides are 1 to the left, -1 to the right
+    def tangents(side, other):  # arc, line and arc; sides are 1 for left, -1 for right
         ends = np.array([0, side]), np.array([x - other * np.sin(heading), y + other * np.cos(heading)])
         way = ends[1] - ends[0]
         across, distance = (0.0 if side == other else 2.0), np.hypot(*way)
@@ -589,7 +589,7 @@ def shortest_dubins(x, y, heading):
         between = np.arccos(distance / 4)
         found = []
         for bend in (1, -1):
-            middle = np.arctan2(way[1], way[0]) + bend * between  # from the first centre to the middle one
+            middle = np.arctan2(way[1], way[0]) + bend * between  # from the first centre to the middle centre
             back = np.arctan2(way[1], way[0]) + np.pi - bend * between
             first = turned(side * (middle - np.arctan2(-side, 0)))
             last = turned(side * (heading - side * np.pi / 2 - back))
@@ -601,7 +601,7 @@ def shortest_dubins(x, y, heading):
 
 
 def dubins_least_time(random):
-    """Unit speed, unit radius: the shortest way between two poses."""
+    """Find the shortest path between two poses with unit speed and unit radius."""
     limits = ([-ANY] * 3, [ANY] * 3), ([-1], [1])
     goal = [*random.uniform(-5, 5, 2), random.uniform(-np.pi, np.pi)]
     case = plain(dubins, 3, 1, limits=limits, x0=np.zeros(3), goal=goal, count=40, horizon=(0.3, 25), cost=1.0)
@@ -651,7 +651,7 @@ def rotor_points():
 
 
 def flying(step):
-    """Drake's plant with Drake's Propellers."""
+    """Return Drake's plant with Drake's Propellers, its input port and its output port."""
     builder = DiagramBuilder()
     plant = builder.AddSystem(MultibodyPlant(step))
     plant.SetUseSampledOutputPorts(False)
@@ -721,7 +721,7 @@ def quadrotor_gates(random):
 
 
 def follows(times, wanted, columns, allowed):
-    """The root of the mean square distance from a path."""
+    """Return a check of the root mean square distance from a path."""
 
     def miss(at, xs):
         path = np.array([np.interp(at, times, column) for column in wanted.T]).T
@@ -779,12 +779,12 @@ def ur5_hand_follows_a_circle(random):
 
 
 def repeats(offset=0.0):
-    """How far the last state is from the first, moved on by `offset`."""
+    """Return the name and the function of the distance between the last state and the first state plus `offset`."""
     return "repeats", lambda _, xs: float(np.max(np.abs(xs[-1] - xs[0] - offset)))
 
 
 def periodic_orbit_of_a_driven_pendulum(random):
-    """To and fro between two angles, at another rate than its own: 4.4 rad/s where it swings little."""
+    """Swing between two angles, not at the natural frequency, which is 4.4 rad/s for small angles."""
     size, count = random.uniform(0.3, 1.2), 2 * int(random.integers(12, 30))
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
     problem = dd.Problem(
@@ -804,7 +804,7 @@ def periodic_orbit_of_a_driven_pendulum(random):
 
 
 def pendulum_turns_over_and_over(random):
-    """One turn after the other, each of the same time."""
+    """Turn over again and again, with the same duration of each turn."""
     count = int(random.integers(15, 40))
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
     problem = dd.Problem(
@@ -821,7 +821,7 @@ def pendulum_turns_over_and_over(random):
 
 
 def pendulum_slow_motor(random):
-    """A swing-up in which the torque cannot jump."""
+    """Swing up with a torque that cannot jump."""
     rate = random.uniform(6, 15)
     case = swing(MODELS / "pendulum.urdf", near_rest(random, 1), [np.pi, 0], random.uniform(2.5, 4), 0.05, 80)
     problem = dataclasses.replace(case.problem, couplings=dd.optimize.InputRate(rate))
@@ -837,10 +837,10 @@ def cart_pole_slow_motor(random):
 
 
 def jerks(nq, limit):
-    """The largest change of an acceleration [per s^3], by second differences of speeds, as a part of `limit`."""
+    """Return a check of the largest jerk [per s^3] relative to `limit`, by second differences of velocities."""
 
     def largest(times, xs):
-        w = 6 * times[-1] / 200  # six of the largest steps that the referee takes
+        w = 6 * times[-1] / 200  # six times the referee's largest step
         starts = np.linspace(0, times[-1] - 2 * w, 500)
         v = [np.array([np.interp(starts + i * w, times, column) for column in xs.T[nq:]]) for i in range(3)]
         return float(np.max(np.abs(v[2] - 2 * v[1] + v[0])) / w**2 / limit)
@@ -876,7 +876,7 @@ def ur5_without_jerks(random):
 
 
 def crane_stays(random):
-    """The load hangs still over its place for a while, and not at the end alone."""
+    """Keep the load at rest at its goal for some time, not only at the end."""
     seconds, near = random.uniform(0.4, 1.0), 0.02
     way = random.uniform(0.3, 1.0)
     stay = dd.optimize.Dwell(dd.JointGoal({"slide_x": way, "hinge_q": 0.0}, tolerance=near), seconds)
@@ -897,7 +897,7 @@ def crane_stays(random):
 
 
 def regulated(path, goal, limit, h):
-    """How far from `goal` the plant is after 20 s more under Drake's own regulator, cut off at its limits."""
+    """Return a check of the distance to `goal` after 20 s more under Drake's own regulator, clipped at its limits."""
 
     def left(_, xs):
         system, port, _ = plant_of(path)(h)
@@ -938,7 +938,7 @@ def cart_pole_to_where_it_is_caught(random):
 
 
 def pendulum_and_its_mass(random):
-    """The bob may be lighter: the mass is found with the inputs."""
+    """Optimize the mass of the bob together with the inputs. It may be lighter."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
     problem = dd.Problem(
         model,
@@ -962,7 +962,7 @@ def pendulum_and_its_mass(random):
 
 
 def designed(f, nx, nu, parameters, bounds, *, limits, price=None, **asked):
-    """x' = f(x, u, p, math) in plain formulas, with the parameters p among what is searched for."""
+    """Return a task of x' = f(x, u, p, math), with the parameters p as variables of the problem."""
     (xl, xu), (ul, uu) = limits
     dynamics = dd.Dynamics(
         lambda x, u, p: f(x, u, p, np),
@@ -994,7 +994,7 @@ def designed(f, nx, nu, parameters, bounds, *, limits, price=None, **asked):
 
 
 def gear_ratio_of_a_motor_in_least_time(random):
-    """Of a limited motor that turns a load: the best ratio is the root of the inertias' (the referee does not ask)."""
+    """Turn a load with a limited motor. The best ratio is the root of the ratio of the inertias (not checked)."""
     load, rotor, torque = random.uniform(0.5, 4), 10 ** random.uniform(-3, -1.5), random.uniform(0.2, 1)
     best = np.sqrt(load / rotor)
 
@@ -1010,7 +1010,7 @@ def gear_ratio_of_a_motor_in_least_time(random):
 
 
 def length_of_a_pendulum_in_least_time(random):
-    """A bob on a rod under a weak motor: a short one turns fast, and gravity, which has to be overcome, is less."""
+    """Swing up a bob on a rod with a weak motor. A short rod turns faster, and the torque of gravity is smaller."""
     mass, torque, damping = random.uniform(0.5, 1.5), random.uniform(2, 5), random.uniform(0.0, 0.2)
 
     def rates(x, u, p, math):
@@ -1025,9 +1025,9 @@ def length_of_a_pendulum_in_least_time(random):
 
 
 def tip_spring_of_a_jumping_leg_in_least_time(random):
-    """A rod on a spring, along which a motor drives a mass up and down, until it leaves the ground fast enough.
+    """Drive a mass up and down a rod on a spring, until the rod leaves the ground fast enough.
 
-    x is how far the spring is stretched, which on the ground it never is; a and its rate are the mass on the rod.
+    The states are the spring's extension (at most 0 on the ground) and its rate, and the mass's position and velocity.
     """
     rod, mass, damping = random.uniform(0.1, 0.3), random.uniform(0.8, 1.2), random.uniform(0.2, 1.0)
     height, stroke, start = random.uniform(0.02, 0.06), 0.1, random.uniform(800, 2000)
@@ -1046,7 +1046,7 @@ def tip_spring_of_a_jumping_leg_in_least_time(random):
 
 
 def cart_pole_and_the_length_of_its_pole(random):
-    """Swung up by least effort, where what a pole weighs is for the designer to choose its length by."""
+    """Swing up with least effort and an optimized length of the pole, whose mass depends on its length."""
     cart, density = random.uniform(0.8, 1.5), random.uniform(0.2, 0.5)  # [kg], [kg/m]
 
     def rates(x, u, p, math):
@@ -1070,7 +1070,7 @@ def cart_pole_and_the_length_of_its_pole(random):
 
 
 def masses_of_a_double_pendulum(random):
-    """1.7 kg may be spread otherwise over the two links, at a price of leaving what is."""
+    """Distribute 1.7 kg over the two links, with a cost on deviations of the total mass."""
     path, price = MODELS / "double_pendulum.urdf", random.uniform(20, 60)
     problem = dd.Problem(
         dd.load_model(path, time_step=0.04),
@@ -1133,5 +1133,5 @@ FAMILIES: dict[str, list[Callable[[np.random.Generator], Case]]] = {
     ],
 }  # fmt: skip
 
-# What a practitioner asks and a Problem cannot say. Each counts as a task that is not solved.
+# Tasks of practitioners that a Problem cannot state. Each counts as a task that is not solved.
 NOT_EXPRESSED: dict[str, tuple[str, str]] = {}

@@ -1,4 +1,4 @@
-"""Tasks of the textbooks, rockets and vehicles, those with a closed form among them; see `task_cases.py`."""
+"""Tasks from textbooks, and of rockets and vehicles, some with an optimum in closed form; see `task_cases.py`."""
 
 from functools import cache, partial
 from pathlib import Path
@@ -35,7 +35,7 @@ def with_optimum(case, optimum, asks=()):
 
 
 def bryson_denham(random):
-    """A block below a ceiling l: its effort is 4 + 12 (1 - 4 l)^2 from a sixth to a quarter, 8 / (9 l) below."""
+    """Move a block below a ceiling l. The least effort is 4 + 12 (1 - 4 l)^2 for l in [1/6, 1/4], 8 / (9 l) below."""
     ceiling = random.uniform(0.06, 0.24)
     limits = ([-ANY, -ANY], [ceiling, ANY]), ([-ANY], [ANY])
     least = 8 / (9 * ceiling) if ceiling <= 1 / 6 else 4 + 12 * (1 - 4 * ceiling) ** 2
@@ -45,7 +45,7 @@ def bryson_denham(random):
 
 
 def brachistochrone(random):
-    """The cycloid r (a - sin a), r (1 - cos a) takes a sqrt(r / g)."""
+    """Find the brachistochrone. The cycloid r (a - sin a), r (1 - cos a) takes the time a sqrt(r / g)."""
     wide, deep = random.uniform(0.5, 3), random.uniform(0.5, 3)
     a = brentq(lambda a: wide * (1 - np.cos(a)) - deep * (a - np.sin(a)), 1e-3, 2 * np.pi - 1e-6)
     limits = ([-ANY] * 3, [ANY] * 3), ([0], [np.pi])
@@ -55,7 +55,7 @@ def brachistochrone(random):
 
 
 def hanging_chain(random):
-    """A catenary over a metre, from one height to another: the least moment of a chain of a given length."""
+    """Find the chain of given length with the least moment between two heights 1 m apart, which is a catenary."""
     left, right = random.uniform(1, 3), random.uniform(1, 3)
     length = np.hypot(1, right - left) * random.uniform(1.1, 2.0)
     # y = c cosh((s - b) / c) + d: the length gives c, the difference of heights b
@@ -71,7 +71,7 @@ def hanging_chain(random):
 
 
 def goddard_rocket(random):
-    """As high as the fuel takes it: 1.01283 radii."""
+    """Maximize the height of a rocket with limited fuel. The optimum is 1.01283 radii."""
     start = [1.0, 0.0, 1.0]
     limits = ([1, 0, 0.6], [ANY, ANY, 1]), ([0], [3.5])
     horizon = (0.05, random.uniform(0.3, 1.0))
@@ -81,7 +81,7 @@ def goddard_rocket(random):
 
 
 def orbit_transfer(random):
-    """From a circle of 1 to the widest circle in a given time; in 3.32 it is one of 1.5252."""
+    """Maximize the radius of a circular orbit from radius 1 in a given time. In time 3.32, it is 1.5252."""
     time = random.uniform(2.5, 4.5)
     limits = ([0.5, -ANY, -ANY, 0.1], [5, ANY, ANY, 1]), ([-2 * np.pi], [2 * np.pi])
     circle = dd.Constraint(lambda x: x[2] ** 2 * x[0], lower=1, upper=1, knots=-1, name="a circle")
@@ -102,7 +102,7 @@ def van_der_pol(random):
 
 
 def hang_glider(random):
-    """As far as an updraft takes it; from 1000 to 900 m, in 98.4 s, it is 1248 m."""
+    """Maximize the range with an updraft. From a height of 1000 m to 900 m, it is 1248 m in 98.4 s."""
     start = [0, 1000, 13.227567500, -1.2875005200]
     limits = ([0, 0, 0, -ANY], [ANY, ANY, ANY, ANY]), ([0], [1.4])
     case = plain(by_hand.hang_glider, 4, 1, limits=limits, x0=start, goal=[FREE, 900, *start[2:]], count=100,
@@ -114,7 +114,7 @@ def hang_glider(random):
 
 
 def soft_landing(random):
-    """On the Moon with the least fuel, the engine never off."""
+    """Land on the Moon with the least fuel and an engine that is always on."""
     start = [
         random.uniform(-300, 300),
         random.uniform(600, 1000),
@@ -135,7 +135,7 @@ def ball_and_beam(random):
 
 
 def trailer_backs_up(random):
-    """Into a bay behind it, without folding."""
+    """Back a trailer into a bay without jackknifing."""
     f = partial(by_hand.trailer, length=random.uniform(0.8, 1.2))
     start = [random.uniform(1.5, 3), random.uniform(-0.6, 0.6), *[random.uniform(-0.3, 0.3)] * 2]
     limits = ([-ANY] * 4, [ANY] * 4), ([-1, -1], [1, 1])
@@ -181,7 +181,7 @@ def quadrotor_through_a_slalom(random):
     return Case(case.problem, case.build, asks, case.peer, disks=tuple(disks))
 
 
-# ------------------------------------------------------------------------------ robots from files of their own
+# ------------------------------------------------------------------------------ robots from files
 
 
 LINK = """<link name="{name}"><inertial><origin xyz="0 0 {z}"/><mass value="{mass}"/>
@@ -204,7 +204,7 @@ def written(name, *parts):
 
 
 def cart_with_two_poles(random):
-    """A cart swings a double pendulum up."""
+    """Swing up a double pendulum on a cart."""
     path = written(
         "cart_with_two_poles",
         LINK.format(name="cart", z=0, mass=1, i=1e-4) + rod("first", 0.2, 0.5) + rod("second", 0.2, 0.5),
@@ -228,7 +228,7 @@ def cart_with_two_poles(random):
 
 
 def furuta_pendulum(random):
-    """An arm that turns swings its pole up."""
+    """Swing up a pole on a rotating arm."""
     arm = LINK.format(name="arm", z=0, mass=0.3, i=2e-3).replace('izz="1e-4"', 'izz="2e-3"')
     path = written(
         "furuta",
@@ -270,7 +270,7 @@ def ur5_between_two_balls(random):
 
 
 def ur5_carries_a_tray(random):
-    """Its hand goes elsewhere, an axis of it within 0.1 rad of the vertical."""
+    """Move the hand to a position, with one of its axes within 0.1 rad of the vertical."""
     path, hand, count = arm_file("ur5_robot.urdf"), "wrist_3_link", 40
     model, q = loaded(path, 2.5 / count), np.array([0, -1.2, 1.6, -0.4, 1.57, 0])
     q[:3] += [random.uniform(-0.5, 0.5), *random.uniform(-0.1, 0.1, 2)]

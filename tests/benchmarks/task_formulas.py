@@ -1,13 +1,13 @@
-"""Equations of motion x' = f(x, u, math, **constants) by hand, for peers in environments of their own.
+"""Handwritten equations of motion x' = f(x, u, math, **constants), for peers in separate environments.
 
-`math` has sin, cos and tan of what x and u are. Nothing is imported. Angles of 0 hang down.
+`math` has sin, cos and tan for the types of x and u. Nothing is imported. Links hang down at an angle of 0.
 """
 
 GRAVITY = 9.81
 
 
 def bicycle(x, u, math):
-    """Position, heading, speed; acceleration and steering; 1 m between the axles."""
+    """Return x' of a bicycle, 1 m between its axles. x: position, heading, speed. u: acceleration, steering angle."""
     return [x[3] * math.cos(x[2]), x[3] * math.sin(x[2]), x[3] * math.tan(u[1]), u[0]]
 
 
@@ -16,7 +16,7 @@ def dubins(x, u, math):
 
 
 def planar(x, u, math):
-    """Drake's planar quadrotor."""
+    """Return x' of Drake's planar quadrotor."""
     m, r, inertia = 0.486, 0.25, 0.00383
     push = (u[0] + u[1]) / m
     return [x[3], x[4], x[5], -push * math.sin(x[2]), push * math.cos(x[2]) - 9.81, r * (u[0] - u[1]) / inertia]
@@ -27,12 +27,12 @@ def block(x, u, math, mass, damping):
 
 
 def pendulum(x, u, math):
-    """models/pendulum.urdf: 1 kg, 0.5 m, damping 0.1."""
+    """Return x' of models/pendulum.urdf: 1 kg, 0.5 m, damping 0.1."""
     return [x[1], (u[0] - 0.1 * x[1] - GRAVITY * 0.5 * math.sin(x[0])) / 0.25]
 
 
 def cart_pole(x, u, math):
-    """models/cart_pole.urdf, by the formulas of Kelly's paper."""
+    """Return x' of models/cart_pole.urdf by the formulas of Kelly's paper."""
     l, m1, m2, g = 0.5, 1.0, 0.3, GRAVITY  # noqa: E741
     s, c, rate = math.sin(x[1]), math.cos(x[1]), x[3]
     cart = (l * m2 * s * rate**2 + u[0] + m2 * g * c * s) / (m1 + m2 * s**2)
@@ -41,7 +41,7 @@ def cart_pole(x, u, math):
 
 
 def two_links(x, u, math, first, second, damping, motors):
-    """Each link is (mass, length, distance of its centre, inertia about it); `motors` are the joints that have one."""
+    """Return x' of links (mass, length, distance of the centre, inertia about it); `motors` are driven joints."""
     (m1, l1, c1, i1), (m2, _, c2, i2) = first, second
     q1, q2, v1, v2 = x[0], x[1], x[2], x[3]
     torque = [0.0, 0.0]
@@ -56,29 +56,29 @@ def two_links(x, u, math, first, second, damping, motors):
     return [v1, v2, (c * r1 - b * r2) / determinant, (a * r2 - b * r1) / determinant]
 
 
-# ------------------------------------------------------------------------------ of the textbooks
+# ------------------------------------------------------------------------------ textbooks
 
 
 def sliding_bead(x, u, math):
-    """The brachistochrone: place, depth, speed; the angle from the vertical."""
+    """Return x' of the brachistochrone. x: position, depth, speed. u: angle from the vertical."""
     return [x[2] * math.sin(u[0]), x[2] * math.cos(u[0]), GRAVITY * math.cos(u[0])]
 
 
 def goddard(x, u, math):
-    """A rocket that goes straight up, in units of its own: height from the centre, speed, mass; thrust."""
+    """Return x' of a vertical rocket in scaled units. x: height from the centre, speed, mass. u: thrust."""
     drag = 310 * x[1] ** 2 * math.exp(-500 * (x[0] - 1))
     return [x[1], (u[0] - drag) / x[2] - 1 / x[0] ** 2, -u[0] / 0.5]
 
 
 def sailing_orbit(x, u, math):
-    """Bryson and Ho's transfer between circles: radius, both speeds, mass; the angle of a thrust that is constant."""
+    """Return x' of Bryson and Ho's orbit transfer. x: radius, velocities, mass. u: angle of a constant thrust."""
     push = 0.1405 / x[3]
     radial = x[2] ** 2 / x[0] - 1 / x[0] ** 2 + push * math.sin(u[0])
     return [x[1], radial, -x[1] * x[2] / x[0] + push * math.cos(u[0]), -0.0749]
 
 
 def chain(x, u, math):
-    """A chain that hangs, along the ground: height, its moment, its length; the slope."""
+    """Return x' of a hanging chain along the ground. x: height, moment, length. u: slope."""
     along = math.sqrt(1 + u[0] ** 2)
     return [u[0], x[0] * along, along]
 
@@ -88,24 +88,24 @@ def van_der_pol(x, u, math):
 
 
 def lander(x, u, math):
-    """Place, height, speeds, mass; thrust and its angle from the vertical. 3000 m/s exhaust on the Moon."""
+    """Return x' of a Moon lander, 3000 m/s exhaust. x: position, velocity, mass. u: thrust, angle from the vertical."""
     push = u[0] / x[4]
     return [x[2], x[3], push * math.sin(u[1]), push * math.cos(u[1]) - 1.62, -u[0] / 3000]
 
 
 def ball_on_beam(x, u, math):
-    """Place, angle of the beam and their rates; the beam's angular acceleration. A ball that rolls."""
+    """Return x' of a rolling ball. x: position, angle of the beam, their rates. u: the beam's angular acceleration."""
     return [x[2], x[3], 5 / 7 * (x[0] * x[3] ** 2 - GRAVITY * math.sin(x[1])), u[0]]
 
 
 def trailer(x, u, math, length):
-    """A unicycle and its trailer: place, heading, the trailer's heading; speed and turning rate."""
+    """Return x' of a unicycle with a trailer. x: position, heading, trailer's heading. u: speed, turning rate."""
     v = u[0]
     return [v * math.cos(x[2]), v * math.sin(x[2]), u[1], v / length * math.sin(x[2] - x[3])]
 
 
 def hovercraft(x, u, math):
-    """Place, heading and their rates; two fans that only push, 0.3 m to either side. 1 kg, drag 0.2."""
+    """Return x' of a hovercraft, 1 kg, drag 0.2. x: position, heading, rates. u: two fans at +-0.3 m that only push."""
     push = u[0] + u[1]
     return [
         x[3],
@@ -118,9 +118,9 @@ def hovercraft(x, u, math):
 
 
 def slung_load(x, u, math):
-    """A planar quadrotor, 0.5 kg, with a load of 0.2 kg on a rod of 0.6 m: the load's place, the rod's and the body's
+    """Return x' of a planar quadrotor of 0.5 kg with a load of 0.2 kg on a rod of 0.6 m.
 
-    angle and their rates; two rotors.
+    x: position of the load, angle of the rod, angle of the body, their rates. u: forces of two rotors.
     """
     m, load, length, arm, inertia = 0.5, 0.2, 0.6, 0.25, 0.004
     force = u[0] + u[1]
@@ -139,7 +139,7 @@ def slung_load(x, u, math):
 
 
 def hang_glider(x, u, math):
-    """COPS: place, height, speeds; the lift coefficient. An updraft about 250 m."""
+    """Return x' of the COPS hang glider, updraft at 250 m. x: position, height, velocity. u: lift coefficient."""
     r = (x[0] / 100 - 2.5) ** 2
     rise = x[3] - 2.5 * (1 - r) * math.exp(-r)
     speed = math.sqrt(x[2] ** 2 + rise**2)

@@ -1,12 +1,12 @@
-"""acados: multiple shooting with four stages of Runge-Kutta in an interval, SQP and HPIPM. JSON lines in and out.
+"""Solve tasks (JSON lines) with acados: multiple shooting, four-stage Runge-Kutta steps, SQP and HPIPM.
 
     python task_peer_acados.py < tasks.json
 
-    pip install comma-deps-acados numpy scipy     # in an environment of its own, with a C compiler
+    pip install comma-deps-acados numpy scipy     # in a separate environment, with a C compiler
 
-A free final time is a state. The Hessian is Gauss and Newton's where the cost is one of least squares, else exact and
-mirrored; steps are cut by its merit function; tolerances are its own, 1e-6. `build` is to write, compile and load C,
-processes that it starts included; `solve` is the solver alone, [s] of processor time.
+A free final time is a state. The Hessian is that of Gauss-Newton for costs of least squares, otherwise exact and
+mirrored. A merit function shortens the steps. Tolerances are the default, 1e-6. The output contains processor time [s]:
+`build` to write, compile and load C, including child processes, and `solve` for the solver alone.
 """
 
 import contextlib
@@ -32,11 +32,11 @@ for library in (
     "hpipm",
     "qpOASES_e",
     "acados",
-):  # which ask for each other by names that the wheel leaves out
+):  # they depend on each other by names that the wheel lacks
     ctypes.CDLL(str(Path(acados.LIB_DIR) / f"lib{library}.so"), ctypes.RTLD_GLOBAL)
 from acados.acados_template import AcadosModel, AcadosOcp, AcadosOcpSolver  # noqa: E402
 
-FAR, GOAL = 1e8, 1e3  # GOAL: what a unit off the goal costs, linear and squared
+FAR, GOAL = 1e8, 1e3  # GOAL: weight of the linear and the squared distance from the goal
 ENDED = {0: "solved", 1: "not a number", 2: "iteration limit", 3: "smallest step", 4: "failure of the QP solver"}
 
 
@@ -45,7 +45,7 @@ class CasadiMath:
 
 
 def spent() -> float:
-    """[s] of this process and those it started."""
+    """Return the processor time [s] of this process and its children."""
     return sum(os.times()[:4])
 
 
@@ -90,7 +90,7 @@ def problem_of(task: dict, number: int) -> "AcadosOcp":
     given = [i for i in range(nx) if task["x_goal"][i] is not None]
     constraints.lbx_e = constraints.ubx_e = np.array([task["x_goal"][i] for i in given], dtype=float)
     constraints.idxbx_e = np.array(given)
-    constraints.idxsbx_e = np.arange(len(given))  # its QPs have no elastic mode: the goal and disks are given slacks
+    constraints.idxsbx_e = np.arange(len(given))  # slacks of the goal and disks, as the QPs have no elastic mode
     for kind in ("l", "u"):
         setattr(ocp.cost, f"z{kind}_e", np.full(len(given), GOAL))
         setattr(ocp.cost, f"Z{kind}_e", np.full(len(given), GOAL))
@@ -151,7 +151,7 @@ def solve(task: dict, number: int) -> dict:
 
 if __name__ == "__main__":
     answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what compilers and templates print is no answer
+    os.dup2(2, 1)  # separate the output of compilers and templates from the answers
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         for number, text in enumerate(sys.stdin):
             print(json.dumps(solve(json.loads(text), number)), file=answers, flush=True)

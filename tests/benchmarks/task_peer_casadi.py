@@ -1,9 +1,9 @@
-"""CasADi and IPOPT by hand: Hermite-Simpson in one SX expression. A task a line as JSON in, an answer a line out.
+"""Solve tasks (JSON lines) with CasADi and IPOPT, by a handwritten Hermite-Simpson scheme in one SX expression.
 
     python task_peer_casadi.py < tasks.json
 
-IPOPT has its defaults but for the tolerance, which is ours, and a limit of 500 iterations. Seconds are of processor
-time: `build` until there is a solver, `solve` of calling it.
+IPOPT has its defaults, except for the tolerance, which is that of `dd.solve`, and a limit of 500 iterations. The output
+contains processor time [s]: `build` to create the solver and `solve` to call it.
 """
 
 import json
@@ -20,7 +20,7 @@ class CasadiMath:
 
 
 def limits(values, sign):
-    """None is free."""
+    """Return the limits, with None replaced by `sign` times infinity."""
     return np.array([sign * np.inf if value is None else value for value in values], dtype=float)
 
 

@@ -1,11 +1,11 @@
-"""Crocoddyl's SolverBoxFDDP on robots from files. A task a line as JSON in, an answer a line out.
+"""Solve tasks (JSON lines) for robots from files with Crocoddyl's SolverBoxFDDP.
 
     python task_peer_crocoddyl.py < tasks.json
 
-    pip install crocoddyl==3.2.1 pin==4.0.0 libpinocchio==4.0.0     # in an environment of its own
+    pip install crocoddyl==3.2.1 pin==4.0.0 libpinocchio==4.0.0     # in a separate environment
 
-Its problems are of effort in a given time: limits of inputs are kept, the goal is a cost of the last state, 1e5 times
-its squared distance, and limits of states are left to the referee. Seconds are of processor time.
+The problems minimize effort in a given time with limits of inputs. The goal is a final cost of 1e5 times the squared
+distance. Only the referee checks limits of states. Seconds are processor time.
 """
 
 import json
@@ -21,7 +21,7 @@ GOAL = 1e5
 
 
 def robot_of(path: str) -> pinocchio.Model:
-    """That of a file, completed as Pinocchio wants it: a link "world", limits of all joints, angles for hinges."""
+    """Read a file, completed for Pinocchio: a link "world", limits of all joints, "revolute" for "continuous"."""
     root = ET.parse(path).getroot()
     if not any(link.get("name") == "world" for link in root.iter("link")):
         ET.SubElement(root, "link", name="world")
@@ -40,7 +40,7 @@ def solve(task: dict) -> dict:
     begun, nx, count = time.process_time(), task["nx"], task["count"]
     robot = robot_of(task["file"])
     state, step = crocoddyl.StateMultibody(robot), task["horizon"][0] / count
-    actuation, nv = crocoddyl.ActuationModelFull(state), robot.nv  # a joint without a motor has limits of 0
+    actuation, nv = crocoddyl.ActuationModelFull(state), robot.nv  # a joint without a motor has effort limits of 0
     driven = [robot.joints[robot.getJointId(name)].idx_v for name in task["driven"]]
     effort = crocoddyl.CostModelSum(state, nv)
     paid, wanted_u, lower, upper = np.full(nv, 1e-9), np.zeros(nv), np.zeros(nv), np.zeros(nv)

@@ -1,10 +1,10 @@
-"""Drake's DirectCollocation with IPOPT or SNOPT, as its own examples use it. A task a line as JSON in, an answer out.
+"""Solve tasks (JSON lines) with Drake's DirectCollocation and IPOPT or SNOPT, as in Drake's examples.
 
     python task_peer_drake.py IPOPT|SNOPT < tasks.json
 
-The plant is read from its file, or is a SymbolicVectorSystem of the formulas. Solvers have their defaults but for the
-tolerance, which is ours, a limit of 500 (major) iterations and of a minute. Seconds are of processor time: `build` of
-the plant and the program, `solve` of the solver.
+The plant is read from its file or is a SymbolicVectorSystem of the formulas. Solvers have their defaults, except for
+the tolerance, which is that of `dd.solve`, and limits of 500 (major) iterations and one minute. The output contains
+processor time [s]: `build` for the plant and the program, `solve` for the solver.
 """
 
 import json
@@ -27,7 +27,7 @@ LONGEST = 60.0  # [s]
 
 
 def system_of(task):
-    """(system, its input port)."""
+    """Return (system, input port)."""
     if task["file"]:
         plant = MultibodyPlant(0.0)
         Parser(plant).AddModels(task["file"])
@@ -39,7 +39,7 @@ def system_of(task):
 
 
 def program_of(task: dict) -> DirectCollocation:
-    """The task's, with a straight line as first guess."""
+    """Return the program of a task with a straight line as initial guess."""
     (system, port), nx, steps = system_of(task), task["nx"], [span / task["count"] for span in task["horizon"]]
     program = DirectCollocation(system, system.CreateDefaultContext(), task["count"] + 1, *steps, input_port_index=port)
     x, u, prog = program.state(), program.input(), program.prog()

@@ -1,9 +1,9 @@
-"""Our solves in turns with a peer's: who solves what, whose plans hold, and how long both take.
+"""Compare `dd.solve` and a peer in alternating solves: solved tasks, plans that hold, and times.
 
-A peer is a script `task_peer_*.py` that runs in the Python of its environment: a task a line as JSON in, an answer a
-line out. Both get the same task: constants, limits, intervals, tolerance, limits of 500 iterations and of a minute, and
-the straight line to the goal as first guess. Seconds are of processor time. Ours are those of `dd.solve` as it is, with
-its certificates and measures, and those of its search alone; a peer's are those of its solver with building it.
+A peer is a script `task_peer_*.py` that runs in the Python of its environment. It reads tasks and writes answers as
+JSON lines. Both get the same task: constants, limits, intervals, tolerance, limits of 500 iterations and one minute,
+and the straight line to the goal as initial guess. Seconds are processor time. For `dd.solve`, they are those of the
+call, with its certificates and measures, and of the search alone. For a peer, they are those of building and solving.
 """
 
 import json
@@ -25,28 +25,28 @@ from drake_diff.optimize.problem.cost import ConstantCost
 from drake_diff.optimize.transcription.collocation import Transcription
 
 HERE = Path(__file__).parent
-PEERS = {  # name -> script and what it is told
+PEERS = {  # name -> script and its arguments
     "CasADi": ("task_peer_casadi.py",),
     "Drake-IPOPT": ("task_peer_drake.py", "IPOPT"),
     "Drake-SNOPT": ("task_peer_drake.py", "SNOPT"),
     "Crocoddyl": ("task_peer_crocoddyl.py",),
     "acados": ("task_peer_acados.py",),
 }
-CHEAPER = 0.01  # of a cost: told apart as another optimum
+CHEAPER = 0.01  # relative difference of costs that indicates another optimum
 TOLERANCE = 1e-8  # of dd.solve
 Row = dict[str, Any]
 
 
-# ------------------------------------------------------------------------------ what a peer is asked
+# ------------------------------------------------------------------------------ tasks for a peer
 
 
 def finite(values: Any) -> list[float | None]:
-    """None for what is free."""
+    """Return the values, with None in place of values that are not finite."""
     return [float(v) if np.isfinite(v) else None for v in values]
 
 
 def asked(case: Case) -> dict[str, Any] | str:
-    """The task for a peer, or why no peer gets it."""
+    """Return the task for a peer, or the reason why no peer gets it."""
     problem, b = case.problem, case.problem.bounds
     if (
         len(problem.constraints) != len(case.disks)
@@ -89,7 +89,7 @@ def asked(case: Case) -> dict[str, Any] | str:
 
 
 def not_said(peer: str, task: dict[str, Any]) -> str:
-    """Why a peer cannot be told the task, "" if it can."""
+    """Return the reason why a peer does not support the task, or ""."""
     if peer in ("CasADi", "acados") and not task["formula"]:
         return "no formulas by hand"
     if peer == "Crocoddyl":
@@ -106,7 +106,7 @@ def not_said(peer: str, task: dict[str, Any]) -> str:
 
 
 class Peer:
-    """A script that runs until it is told no more."""
+    """A script that runs until its input is closed."""
 
     def __init__(self, name: str, python: str):
         script, *arguments = PEERS[name]
@@ -119,7 +119,7 @@ class Peer:
         )
 
     def solve(self, task: dict[str, Any]) -> Row:
-        """Its answer; one that ended the script is a failure, and a new script is needed."""
+        """Return the script's answer. If the script ended, this is a failure, and a new script is needed."""
         try:
             self.process.stdin.write(json.dumps(task) + "\n")
             self.process.stdin.flush()
@@ -141,7 +141,7 @@ class Peer:
 
 @contextmanager
 def search_seconds() -> Iterator[list[float]]:
-    """Adds up what transcribing and solving take, without certificates and measures."""
+    """Add up the processor time of transcription and search, without certificates and measures."""
     spent, own = [0.0], {name: getattr(Transcription, name) for name in ("__init__", "_solve_on")}
 
     def timed(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -164,7 +164,7 @@ def search_seconds() -> Iterator[list[float]]:
 
 
 def plan_from(answer: Row, case: Case) -> dict[str, Any]:
-    """What the referee gets of a peer's plan."""
+    """Return a peer's plan in the form for the referee."""
     problem, b = case.problem, case.problem.bounds
     times, xs, us = (np.array(answer[name]) for name in ("times", "xs", "us"))
     way = PiecewisePolynomial.CubicShapePreserving(times, xs.T)
@@ -192,13 +192,13 @@ def plan_from(answer: Row, case: Case) -> dict[str, Any]:
 
 
 def judged(answer: Row, case: Case) -> str:
-    """Why a plan is false, "" if it holds."""
+    """Return why a plan is wrong, or "" if it holds."""
     times = np.array(answer["times"])
     if not (np.all(np.isfinite(times)) and np.all(np.diff(times) > 0)):
         return "its times do not increase"
     try:
         return judge(plan_from(answer, case), 0.0, NAMED)[0]
-    except RuntimeError as error:  # of Drake's integrator
+    except RuntimeError as error:  # from Drake's integrator
         return f"cannot be simulated: {str(error)[:100]}"
 
 
@@ -213,7 +213,7 @@ def ours(case: Case, time_limit: float) -> Row:
 def beside(
     peer: str, python: str, draw: Callable[[str, int], Case], names: list[str], count: int, time_limit: float
 ) -> Iterator[Row]:
-    """A row for each solve of both, and one with a reason for each task that the peer is not told."""
+    """Yield a row for each pair of solves, and one with the reason for each task that the peer does not get."""
     script, warm = Peer(peer, python), False
     for name in names:
         for number in range(count):
@@ -223,7 +223,7 @@ def beside(
             if why:
                 yield {"peer": peer, "name": name, "left out": why}
                 break
-            if not warm:  # what is loaded at the first call is not counted
+            if not warm:  # the first call, which loads libraries, is not counted
                 ours(case, time_limit)
                 script.solve(task)
                 warm = True
@@ -242,7 +242,7 @@ def beside(
     script.end()
 
 
-# ------------------------------------------------------------------------------ what is told
+# ------------------------------------------------------------------------------ tables
 
 
 def quartiles(values: list[float]) -> str:
@@ -257,9 +257,9 @@ def good(row: Row) -> bool:
 
 
 def ratios(rows: list[Row]) -> tuple[list[float], list[float], list[float]]:
-    """Of `dd.solve` and of its search alone over the peer with building, and of the search over its solver alone.
+    """Return the ratios of `dd.solve` and its search to the whole peer, and of its search to the peer's solver alone.
 
-    Where both say solved: a peer's plan that is false took its time too.
+    Rows in which both report a solution are used, even if the peer's plan is wrong.
     """
     both = [row for row in rows if row["ours"]["solved"] and row["theirs"]["solved"]]
     whole = [row["theirs"]["build"] + row["theirs"]["solve"] for row in both]
@@ -271,7 +271,7 @@ def ratios(rows: list[Row]) -> tuple[list[float], list[float], list[float]]:
 
 
 def told(rows: list[Row]) -> list[str]:
-    """Tables in Markdown: the peers, then the tasks of each with its failures and what it is not told."""
+    """Return Markdown tables of the peers, and of each peer's tasks with its failures and the tasks left out."""
     lines = [
         "| Peer | Tasks | Solves | We solved | It solved | It says solved, plan false | Time of `dd.solve` over its | "
         "Search alone over its | Search over its solver alone | Cheaper plan: ours, its |",

@@ -1,6 +1,6 @@
-"""The tasks of `tasks.py` in phases: feet that stand and fly, impacts, loads that are dropped, gaits that repeat.
+"""The tasks of `tasks.py` in phases: stance and flight of feet, impacts, dropped loads, and periodic gaits.
 
-What the referee gets of each phase is a plant of its own, and of each switch a reset of its own.
+The referee gets an independent plant for each phase and an independent reset for each transition.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ ANY, G = np.inf, 9.81
 
 @dataclass(frozen=True)
 class PhasedCase:
-    """`builds` are the referee's plants, `resets` its resets, `asks` what it measures of each phase."""
+    """A problem in phases, with the plants (`builds`), `resets` and checks (`asks`) of the referee."""
 
     problem: dd.optimize.PhasedProblem
     builds: list[Callable[[float], Any]]
@@ -35,7 +35,7 @@ class PhasedCase:
     optimum: None = None
 
     def plans(self, solution):
-        """What the referee gets: each phase as functions of time, with its bounds and what is asked of it."""
+        """Return each phase for the referee as functions of time, with its bounds and checks."""
         found = []
         for phase, build, asks in zip(solution.phases, self.builds, self.asks, strict=True):
             plan = plan_of(phase, build)
@@ -49,7 +49,7 @@ def same(x):
 
 
 def ends_at(name, value, wanted, allowed):
-    """A guard: a function of the last state."""
+    """Return a check that a function of the last state has the value `wanted`."""
     return name, lambda _, xs: float(abs(value(xs[-1]) - wanted)), allowed
 
 
@@ -61,7 +61,7 @@ def guard(name, value, at=0.0):
 
 
 def simplest_walker_gait(random):
-    """Garcia and others' walker: its hip is free, and only the slope feeds it."""
+    """Find a gait of the walker of Garcia and others, which has a free hip and is driven by the slope alone."""
     slope = random.uniform(0.004, 0.014)
 
     def rates(x, u, math):
@@ -93,15 +93,15 @@ def forward(i):
     return "steps forward [rad]", lambda _, xs: float(xs[-1, i] + 0.05), 0.01
 
 
-HIP, LEG, A_, B_ = 10.0, 5.0, 0.5, 0.5  # [kg], [kg], [m] from the foot to a leg's mass, and from there to the hip
+HIP, LEG, A_, B_ = 10.0, 5.0, 0.5, 0.5  # [kg], [kg], [m] from the foot to a leg's mass, [m] from this mass to the hip
 
 
 def compass_gait_with_a_motor(random):
-    """Goswami and others' compass with a motor in its hip, on slopes down which no or another gait is free."""
+    """Find a gait of Goswami and others' compass with a hip motor, on slopes with no or another passive gait."""
     slope, length = np.deg2rad(random.uniform(1.0, 4.0)), A_ + B_
 
     def terms(x, math):
-        """Of the stance leg's and the swing leg's angle from the vertical, forward positive."""
+        """Return M and h for the angles of stance and swing leg from the vertical, forward positive."""
         c, s = math.cos(x[0] - x[1]), math.sin(x[0] - x[1])
         M = [[(HIP + LEG) * length**2 + LEG * A_**2, -LEG * length * B_ * c], [-LEG * length * B_ * c, LEG * B_**2]]
         h = [
@@ -117,7 +117,7 @@ def compass_gait_with_a_motor(random):
         return [x[2], x[3], (M[1][1] * r[0] - M[0][1] * r[1]) / det, (M[0][0] * r[1] - M[1][0] * r[0]) / det]
 
     def strike(x):
-        """The legs change places; angular momentum about the new foot, and of the old leg about the hip, is kept."""
+        """Swap the legs, with conserved angular momentum about the new foot, and of the old leg about the hip."""
         c = np.cos(x[0] - x[1])
         before = [
             (HIP * length**2 + 2 * LEG * A_ * length) * c * x[2] - LEG * A_ * B_ * (x[2] + x[3]),
@@ -156,7 +156,7 @@ def compass_gait_with_a_motor(random):
 
 
 def ball_by_way_of_the_floor(random):
-    """It is thrown at the floor and flies on to a hoop; how it is thrown is to be found."""
+    """Find the throw of a ball that bounces off the floor into a hoop."""
     kept, hoop = random.uniform(0.6, 0.9), np.array([random.uniform(2, 4), random.uniform(0.3, 1.0)])
 
     def rates(x, u, math):
@@ -181,7 +181,7 @@ def ball_by_way_of_the_floor(random):
 
 
 def spring_leg_hops_to_another_height(random):
-    """A point of 1 kg on a massless leg with a spring and a motor: from the top of one flight to that of the next."""
+    """Hop with a point of 1 kg on a massless leg with spring and motor, from one apex to the next."""
     spring, length = random.uniform(150, 400), 1.0
     low, high, speed = random.uniform(1.0, 1.2), random.uniform(1.0, 1.3), random.uniform(0.5, 1.5)
 
@@ -193,7 +193,7 @@ def spring_leg_hops_to_another_height(random):
         push = (spring * (length - r) + u[0]) / r
         return [x[2], x[3], push * x[0], push * x[1] - G]
 
-    def lands(x):  # the leg, at its length, is put forward; its foot is the origin
+    def lands(x):  # with the leg forward at its rest length, and the foot as origin
         return np.array([-np.sqrt(length**2 - x[1] ** 2), x[1], x[2], x[3]])
 
     air = dd.Dynamics(lambda x, u: [x[2], x[3], 0 * u[0], -G + 0 * x[0]], 4, 1, u_lower=[0], u_upper=[0])
@@ -222,7 +222,7 @@ def spring_leg_hops_to_another_height(random):
 
 
 def drone_drops_its_load(random):
-    """A planar quadrotor carries a load to a place, slows down there, lets it go and flies home, lighter."""
+    """Carry a load to a goal with a planar quadrotor, slow down, drop the load, and fly back with less mass."""
     own, load, arm, inertia = 0.5, random.uniform(0.1, 0.3), 0.25, 0.005
     place, top = random.uniform(1.5, 3.0), random.uniform(4.5, 6.0)
 
@@ -251,7 +251,7 @@ def drone_drops_its_load(random):
     return PhasedCase(problem, builds, [same, same], [(slow,), ()])
 
 
-# ------------------------------------------------------------------------------ feet that stand
+# ------------------------------------------------------------------------------ stance
 
 LINK = """<link name="{}"><inertial><origin xyz="0 0 {}"/><mass value="{}"/>
 <inertia ixx="{}" iyy="{}" izz="{}" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
@@ -270,7 +270,7 @@ MOTORS = "".join(
 
 @cache
 def leg_file():
-    """A body of 5 kg on slides along x and z, with a leg of two links of 0.3 m: it cannot turn."""
+    """Write a body of 5 kg that slides along x and z but cannot turn, with a leg of two links of 0.3 m."""
     path = Path(FOLDER.name) / "leg.urdf"
     parts = ("rail", 0, 0.001, 1e-6), ("body", 0, 5.0, 0.05), ("thigh", -0.15, 0.6, 0.006), ("shin", -0.15, 0.4, 0.004)
     links = "".join(LINK.format(name, at, mass, *[i] * 3) for name, at, mass, i in parts)
@@ -279,7 +279,7 @@ def leg_file():
 
 
 class Held(LeafSystem):
-    """A plant with a point held along x and z, by Drake's mass matrix, bias and Jacobian: nothing of the package."""
+    """A plant with a point fixed along x and z, from Drake's mass matrix, bias and Jacobian, without the package."""
 
     def __init__(self, path, frame, point):
         LeafSystem.__init__(self)
@@ -313,7 +313,7 @@ def held(path, frame, point):
 
 
 def where(path, frame, point):
-    """x -> (height, speed) of a point, by pydrake."""
+    """Return a function of x for the height, speed and Jacobian of a point, and the mass matrix, by pydrake."""
     plant = MultibodyPlant(0.0)
     Parser(plant).AddModels(str(path))
     plant.Finalize()
@@ -329,7 +329,7 @@ def where(path, frame, point):
 
 
 def stands(find):
-    """A foot that neither rises, sinks nor slides while it stands."""
+    """Return the checks that a foot neither rises, sinks nor slides in stance."""
     return (
         ("foot leaves the ground [m]", lambda _, xs: max(abs(find(x)[0]) for x in xs), 3e-3),
         ("foot slides [m/s]", lambda _, xs: max(find(x)[1] for x in xs), 0.02),
@@ -341,7 +341,7 @@ def over(find):
 
 
 def leg_jumps(random):
-    """A leg of two links stands, pushes off within its friction cone, and throws its body to a height."""
+    """Jump with a leg of two links from stance, within its friction cone, to a height of the body."""
     path, foot = leg_file(), [0, 0, -0.3]
     model = dd.load_model(path, time_step=0.01)
     stance = dd.optimize.FixedContacts(model, {"shin": foot})
@@ -365,7 +365,7 @@ def leg_jumps(random):
 
 
 def leg_jumps_and_lands(random):
-    """The same leg jumps forward and lands: an impact, then it stands still."""
+    """Jump forward with the same leg and land with an impact, then come to rest."""
     path, foot = leg_file(), [0, 0, -0.3]
     model = dd.load_model(path, time_step=0.01)
     stance = dd.optimize.FixedContacts(model, {"shin": foot})
@@ -381,7 +381,7 @@ def leg_jumps_and_lands(random):
     ]
     middle = x0 + np.array([way / 2, 0.1, 0, 0, 0, 0, 0, 0])
     fly = dd.Problem(model, x0=middle, num_steps=20, horizon=(0.15, 1.0), running_cost=effort, constraints=land)
-    # The foot is held: the body's place and its rest say where the joints are, and more would say it twice.
+    # The foot is fixed, so that the body determines the joints. Goals of joints would be redundant.
     goal = {"x": way, "z": x0[1], "x_v": 0.0, "z_v": 0.0}
     begun = x0 + np.array([way, 0, 0, 0, 0, 0, 0, 0])
     down = dd.Problem(

@@ -1,4 +1,4 @@
-"""What tasks share: files of robots, plants as the referee builds them, and a solution as it gets it."""
+"""Shared parts of the tasks: robot files, plants of the referee, and solutions in the form for the referee."""
 
 import tempfile
 import xml.etree.ElementTree as ET
@@ -16,7 +16,7 @@ from pydrake.systems.primitives import SymbolicVectorSystem
 
 import drake_diff as dd
 
-NAMED = 0.05  # of a state's range: what the referee allows a motion
+NAMED = 0.05  # tolerance of the referee, relative to a state's range
 BLOCK = """<robot name="block"><link name="world"/><link name="block"><inertial><mass value="{mass}"/>
 <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
 <joint name="slide" type="prismatic"><parent link="world"/><child link="block"/><axis xyz="1 0 0"/>
@@ -35,7 +35,7 @@ def effort(nu, weight=1.0):
 
 
 def plant_of(path):
-    """The plant in a file without contact, as the referee builds it."""
+    """Return a function that builds the referee's plant from a file, without contact."""
 
     def build(step):
         plant = MultibodyPlant(step)
@@ -48,7 +48,7 @@ def plant_of(path):
 
 
 def touching(path):
-    """The same with contact, in a diagram."""
+    """Return a function that builds the referee's plant from a file, with contact, in a diagram."""
 
     def build(step):
         builder = DiagramBuilder()
@@ -66,7 +66,7 @@ def touching(path):
 
 
 def formula(f, nx, nu):
-    """x' = f(x, u) as a system of Drake's expressions."""
+    """Return a function that builds x' = f(x, u) as a system of Drake's expressions."""
 
     def build(_):
         x, u = ([Variable(f"{name}{i}") for i in range(n)] for name, n in (("x", nx), ("u", nu)))
@@ -82,7 +82,7 @@ def block_file(mass, effort, damping):
 
 
 def arm_file(name):
-    """A robot of example-robot-data without shapes, welded to the world, with a motor in each joint."""
+    """Write a robot of example-robot-data without shapes, welded to the world, with a motor in each joint."""
     path = Path(FOLDER.name) / name
     if path.exists():
         return path
@@ -115,16 +115,16 @@ def arm_file(name):
 
 @cache
 def loaded(path, time_step):
-    """Once: the equations of an arm in symbols take seconds."""
+    """Load a model once, because the symbolic equations of an arm take seconds."""
     return dd.load_model(path, time_step=time_step)
 
 
 def plan_of(solution, build):
-    """What the referee gets: functions of time out of the solution's own arrays, as it documents them."""
+    """Return a plan for the referee: functions of time from the solution's arrays, as they are documented."""
     problem, times, xs, us = solution.problem, solution.times, solution.xs, solution.us
     ends, middle, b = solution.inputs_at_knots, solution.us_mid, problem.bounds
     top = np.array(b.x_upper)
-    for constraint in problem.constraints:  # of speeds, all of them
+    for constraint in problem.constraints:  # all are limits of the first speed
         top[1] = min(top[1], constraint.upper[0])
 
     def u(t):

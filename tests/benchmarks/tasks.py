@@ -1,16 +1,16 @@
-"""How many of the tasks that a practitioner asks `dd.solve(problem)` solves: defaults only, random starts, a referee.
+"""Count the tasks of practitioners that `dd.solve(problem)` solves with defaults from random starts, with a referee.
 
     pip install -e '.[test]'
     python tests/benchmarks/tasks.py [--only PATTERN] [--count 20] [--seed 0] [--out tasks.json] [--markdown FILE]
     python tests/benchmarks/tasks.py --beside CasADi [--count 3] [--peers peers.json] [--python PYTHON]
 
-The tasks are those of `task_cases.py`, each with --count random starts and constants by --seed, and 60 s of one core
-for a solve. One that says converged in that time is judged by `referee.py`, which has pydrake alone; a cost is compared
-with the closed form where there is one. What is in --out already is not run again, so that a run that was ended goes
-on; --markdown writes its section of docs/measured.md from it, and from --peers. Seconds are of processor time.
+Each task of `task_cases.py` has --count random starts and constants by --seed, and 60 s of one core for a solve. If a
+solve converges in this time, `referee.py` judges the plan with pydrake alone. A cost is compared with the closed form
+if it is known. Results that are already in --out are not run again, so that an interrupted run can be continued.
+--markdown writes a section of docs/measured.md from --out and --peers. Seconds are processor time.
 
---beside times the solves in turns with a peer's, see `task_peers.py`: CasADi by hand, Drake's DirectCollocation with
-IPOPT or SNOPT, Crocoddyl and acados, the last two by the --python of an environment that has them.
+--beside times the solves in alternation with a peer of `task_peers.py`: CasADi by hand, Drake's DirectCollocation with
+IPOPT or SNOPT, Crocoddyl and acados. The last two need --python of an environment that contains them.
 """
 
 import argparse
@@ -53,16 +53,16 @@ def chosen(name: str, only: str) -> bool:
 
 
 def drawn(name: str, seed: int, number: int) -> Case | PhasedCase:
-    """The case of a task: its number, and not that of the task in the list, decides."""
+    """Return a case of a task, which depends on its number but not on the position of the task in the list."""
     return TASKS[name][1](np.random.default_rng([seed, zlib.crc32(name.encode()), number]))
 
 
 def attempt(name: str, seed: int, number: int, wall_limit: float) -> Row:
-    """One solve with defaults, and what the referee says of it."""
+    """Solve a case with defaults, and return a row with the verdict of the referee."""
     case, begun, clock = drawn(name, seed, number), time.process_time(), time.perf_counter()
     try:
         solution = dd.solve(case.problem, time_limit=wall_limit)
-    except Exception as error:  # an end that no user may meet: it counts as not solved, and the run goes on
+    except Exception as error:  # any error counts as not solved, and the run continues
         told = "refused" if isinstance(error, DrakeDiffError) else f"crashed with {type(error).__name__}"
         row = {"claimed": False, "false": "", "miss": 0.0, "status": told, "message": f"{told}: {error}"}
         return row | {"seconds": round(time.process_time() - begun, 2)}
@@ -97,7 +97,7 @@ def attempt(name: str, seed: int, number: int, wall_limit: float) -> Row:
     }
 
 
-# ------------------------------------------------------------------------------ what is told
+# ------------------------------------------------------------------------------ tables
 
 
 def is_solved(row: Row) -> bool:
@@ -105,7 +105,7 @@ def is_solved(row: Row) -> bool:
 
 
 def told(rows: dict[str, Row], only: str) -> list[str]:
-    """The figures, a line each."""
+    """Return the figures, one per line."""
     expressed = {key: row for key, row in rows.items() if row["name"] in TASKS}
     solved = sum(is_solved(row) for row in expressed.values())
     false = sum(bool(row["false"]) for row in expressed.values())
@@ -153,7 +153,7 @@ def table(rows: dict[str, Row], only: str) -> list[str]:
 
 
 def families(rows: dict[str, Row]) -> list[str]:
-    """A table of the families: tasks, and solves that count."""
+    """Return a table of the families, with tasks and solves that count."""
     lines = ["| Family | Tasks | Solved |", "|---|---|---|"]
     for family in dict.fromkeys(family for family, _ in TASKS.values()):
         own = [row for row in rows.values() if row["name"] in TASKS and TASKS[row["name"]][0] == family]
@@ -164,7 +164,7 @@ def families(rows: dict[str, Row]) -> list[str]:
 
 
 def optima(rows: dict[str, Row]) -> list[str]:
-    """A line for each task whose optimum is known: how far the costs of what is solved are from it."""
+    """Return a table of the differences between costs and known optima, for each task with solved cases."""
     lines = []
     for name in TASKS:
         own = [row for row in rows.values() if row["name"] == name and is_solved(row) and row.get("optimum")]
@@ -177,14 +177,14 @@ def optima(rows: dict[str, Row]) -> list[str]:
 
 
 def ran(rows: list[Row]) -> str:
-    """Of which commits and days the rows are."""
+    """Return the commits and dates of the rows."""
     commits, days = (sorted({row[name] for row in rows if name in row}) for name in ("commit", "date"))
     span = " to ".join(dict.fromkeys([*days[:1], *days[-1:]]))
     return f"commit {', '.join(commits) or 'not known'}, {span or 'no date'}"
 
 
 def markdown(rows: dict[str, Row], peers: list[Row], seed: int, only: str) -> str:
-    """The section of docs/measured.md."""
+    """Return the section of docs/measured.md."""
     text = f"""Tasks with random starts and constants, solved by `dd.solve(problem)` with a time limit as the only
 option. A solve counts if it converges within 60 s of one core and a referee of pydrake alone agrees.
 `python tests/benchmarks/tasks.py --markdown docs/measured.md`, seed {seed}, at {ran(list(rows.values()))}. Tasks with
@@ -208,7 +208,7 @@ their range or misses the goal. A cheaper plan costs at least 1 % less.
 
 
 def compared(given: argparse.Namespace, names: list[str]) -> None:
-    """Our solves beside those of a peer; in --peers the rows of other tasks and other peers stay."""
+    """Time the solves in alternation with a peer's. Rows of other tasks and other peers stay in --peers."""
     import task_peers
 
     rows: list[Row] = []

@@ -1,8 +1,8 @@
-"""Repeated measurement in turns: each round has one block of every peer, so that a slow moment is slow for all.
+"""Measure in rounds with one block of each peer, so that a slow period of the machine affects all peers.
 
-What is compared is processor time, in which other work on the machine counts only by what it takes of caches; all
-threads' count. The first call (import, compilation, allocation) is apart, and a block starts with one that does not
-count where calls are short.
+The compared time is the processor time of all threads, which other work on the machine affects only through caches.
+The first call (import, compilation, allocation) is timed separately. If calls are short, a block starts with a call
+that does not count.
 """
 
 import random
@@ -12,11 +12,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-BLOCK = 0.02  # [s] of calls in one block, one call at least
-SHORT = 0.01  # [s] of calls that one is made before each block for, which does not count
+BLOCK = 0.02  # [s] of calls in one block, at least one call
+SHORT = 0.01  # [s] per call, below which a block starts with a call that does not count
 ROUNDS, FEWEST = 15, 3
 
-Block = Callable[[int], tuple[float, float]]  # calls -> seconds on the wall and of the processor
+Block = Callable[[int], tuple[float, float]]  # number of calls -> wall time and processor time [s]
 
 
 class Spread(NamedTuple):
@@ -27,7 +27,7 @@ class Spread(NamedTuple):
 
 @dataclass
 class Sample:
-    """Seconds a call, one number each block."""
+    """Seconds per call, with one value for each block."""
 
     calls: int
     wall: list[float] = field(default_factory=list)
@@ -35,7 +35,7 @@ class Sample:
 
 
 def block(call: Callable[[], object]) -> Block:
-    """Calls in this process."""
+    """Return a block of calls in this process."""
 
     def run(calls: int) -> tuple[float, float]:
         wall, cpu = time.perf_counter(), time.process_time()
@@ -47,13 +47,13 @@ def block(call: Callable[[], object]) -> Block:
 
 
 def timed(call: Callable[[], Any]) -> tuple[Any, float]:
-    """What it returns, and its seconds on the wall."""
+    """Return the result of a call and its wall time [s]."""
     start = time.perf_counter()
     return call(), time.perf_counter() - start
 
 
 def measure(peers: Mapping[str, Block], budget: float) -> dict[str, Sample]:
-    """Up to ROUNDS rounds, FEWEST at least, the last begun before `budget` [s] is spent."""
+    """Run at least FEWEST and at most ROUNDS rounds. No other round begins after `budget` [s]."""
     samples = {name: _calibrated(run) for name, run in peers.items()}
     order, turn = list(peers), random.Random(0)
     start = time.perf_counter()
@@ -79,11 +79,11 @@ def _calibrated(run: Block) -> Sample:
 
 
 def spread(values: list[float]) -> Spread:
-    """Median and quartiles."""
+    """Return the median and the quartiles."""
     q1, median, q3 = statistics.quantiles(values, n=4, method="inclusive")
     return Spread(median, q1, q3)
 
 
 def ratios(ours: Sample, base: Sample) -> list[float]:
-    """Processor time as a multiple of the base's, round by round."""
+    """Return the processor time as a multiple of the base's for each round."""
     return [a / b for a, b in zip(ours.cpu, base.cpu, strict=True)]

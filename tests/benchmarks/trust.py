@@ -1,10 +1,10 @@
-"""How often a yes is true: detection, false-alarm and false-success rates, each with its 95 % Wilson interval.
+"""Measure detection, false-alarm and false-success rates of the checks, each with its 95 % Wilson interval.
 
     pip install -e '.[test]'
     python tests/benchmarks/trust.py [--only certificate,verify] [--seed 0] [--count N] [--out FILE.json]
 
-Each part plants errors, or builds fresh random cases, by seed, and counts what the toolkit says of them. --count is the
-number of cases of a part; without it each part takes as many as its figures in docs/measured.md.
+Each part plants errors or builds random cases from the seed, and counts the verdicts of the toolkit. --count is the
+number of cases of a part. By default, each part uses as many as its figures in docs/measured.md.
 """
 
 import argparse
@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
 
 from rates import success_rate
 
-# Each is a module trust_NAME beside this file, with `measure(seed, count)` and its usual COUNT.
+# Each is a module trust_NAME in this folder, with `measure(seed, count)` and a default COUNT.
 PARTS = (
     "certificate",
     "rollout",
@@ -45,7 +45,7 @@ PARTS = (
 
 @dataclass(frozen=True)
 class Figure:
-    """`found` of `of` cases, in which the share was to be at least or at most `bound`."""
+    """`found` of `of` cases, whose share must be at least or at most `bound`."""
 
     name: str
     found: int
@@ -68,7 +68,7 @@ class Figure:
 
 
 def run(parts: Sequence[str], seed: int, count: int | None) -> dict[str, list[Figure]]:
-    """The figures of each part, printed as they come."""
+    """Run the parts, print the figures of each part, and return them."""
     found = {}
     for name in parts:
         module, begin = importlib.import_module(f"trust_{name}"), time.perf_counter()
@@ -90,7 +90,7 @@ def main() -> int:
     for name in parts:
         if name not in PARTS:
             parser.error(f"unknown part {name!r}, expected some of {', '.join(PARTS)}")
-    logging.getLogger("drake").setLevel(logging.ERROR)  # tags of robots' files that Drake does not know
+    logging.getLogger("drake").setLevel(logging.ERROR)  # hides warnings about unknown tags in robot files
     found = run(parts, options.seed, options.count)
     if options.out:
         figures = {name: [vars(figure) | {"holds": figure.holds} for figure in ones] for name, ones in found.items()}
@@ -100,5 +100,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.modules["trust"] = sys.modules["__main__"]  # the parts import Figure from here
+    sys.modules["trust"] = sys.modules["__main__"]  # the parts import Figure from `trust`
     sys.exit(main())

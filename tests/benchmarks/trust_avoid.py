@@ -1,9 +1,9 @@
-"""Plans around obstacles: how often one that is said to hold has a robot's true shapes in an obstacle.
+"""Count verified plans around obstacles in which a true shape of the robot enters an obstacle.
 
-Each case is one call of `plan`, for the least effort or the least time, with an obstacle on the straight way to its
-goal. The referee samples the plan at 1 kHz, places Drake's bodies, and looks at points on what the file draws: corners
-and faces of meshes as trimesh reads them, and points on the surfaces of cylinders. It shares no formula with the
-toolkit, whose plans keep capsules clear.
+Each case is one call of `plan`, for the least effort or the least time, with an obstacle on the straight path to its
+goal. The referee samples the plan at 1 kHz, computes Drake's body poses, and checks points on the visual shapes of the
+file: vertices and faces of meshes that trimesh reads, and points on the surfaces of cylinders. It shares no formula
+with the toolkit, whose plans keep a clearance of capsules.
 """
 
 import tempfile
@@ -21,21 +21,21 @@ from drake_diff.planning import plan
 from drake_diff.planning.robot import load_robot
 
 COUNT = 40
-POINTS = 400  # of each shape, and as many on its faces: a plan passes many poses
-FARTHEST = 1.5  # [rad] of a joint
-CLEAR = 0.02  # [m] the ends of a way
+POINTS = 400  # of each shape, and as many on its faces; a plan has many poses
+FARTHEST = 1.5  # [rad] largest motion of a joint
+CLEAR = 0.02  # [m] clearance at the ends of a path
 ARMS = ("double_pendulum", "ur5_robot.urdf", "double_pendulum", "panda")
 
 
 def arm(name):
-    """The file of an arm, as `plan` takes it, and that arm with its start."""
+    """Return the file of an arm for `plan`, and the arm with its start."""
     path = {"double_pendulum": MODELS / "double_pendulum.urdf", "panda": example_files()["panda"]}.get(name)
     path = path or robot_file(name)
     return path, load_robot(path, 0)
 
 
 def surface(shape, random):
-    """(P, 3) points on a shape that is drawn."""
+    """Return points (P, 3) on a visual shape."""
     if isinstance(shape, Mesh):
         mesh = trimesh.load(shape.source().path(), force="mesh")
         corners = mesh.vertices[random.choice(len(mesh.vertices), min(POINTS, len(mesh.vertices)), replace=False)]
@@ -53,7 +53,7 @@ def surface(shape, random):
 
 
 def drawn_points(model, random):
-    """By body: the points of what is drawn of it, in its frame."""
+    """Return points on the visual shapes of each body, in its frame."""
     plant, inspector, found = model.plant, model.double.inspector, {}
     for index in range(1, plant.num_bodies()):
         body = plant.get_body(type(plant.world_body().index())(index))
@@ -67,7 +67,7 @@ def drawn_points(model, random):
 
 
 def depth(model, points, xs, obstacle):
-    """[m] how deep any of the points is in the obstacle along xs."""
+    """Return the largest depth [m] of the points in the obstacle along xs."""
     plant, context, deepest = model.plant, model.plant.CreateDefaultContext(), -np.inf
     for x in xs:
         plant.SetPositions(context, x[: model.nq])
@@ -82,7 +82,7 @@ def depth(model, points, xs, obstacle):
 
 
 def task(random, robot, points):
-    """Where to (nq,), an obstacle on the straight way there, whose ends are clear of it, and that way (K, nq)."""
+    """Return a target (nq,), an obstacle on the straight path to it with clear ends, and this path (K, nq)."""
     model = robot.model
     while True:
         away = random.uniform(-1, 1, model.nq) * np.minimum(FARTHEST, 0.4 * (robot.upper - robot.lower))
@@ -118,7 +118,7 @@ def measure(seed, count):
         with tempfile.TemporaryDirectory() as folder:
             try:
                 done = plan(path, goals=goals, avoid=[obstacle], time=least, out=folder)
-            except dd.exceptions.InputError:  # by its spheres an end is too near
+            except dd.exceptions.InputError:  # an end is too near by the spheres
                 found["refused"] += 1
                 continue
         found["blocked"] += blocked

@@ -1,11 +1,11 @@
-"""The certificate of one step: how many planted errors it finds, and how many right derivatives it passes.
+"""Test the certificate of one step: how many planted errors it detects, and how many right derivatives it accepts.
 
-States of robots of example-robot-data and of the models here, at random step sizes: free, within 0.05 rad of joint
-limits, under PD control, and in contact by the three approximations. Each derivative, by parameters too, is certified
-as it is, and then with errors planted: one entry that matters 1 % off, blocks negated, zeroed or transposed, columns
-swapped. What `dd.solve` asks, a look along a few directions and at the entries where that leaves a doubt, gets the same
-errors. An entry matters from a millionth of the largest entry of its row or of its column on, the columns being moved
-by 1 SI unit, or by the variable's magnitude where that is more.
+The robots are from example-robot-data and this repository. Their states, at random step sizes, are free, within 0.05
+rad of joint limits, under PD control, or in contact by the three approximations. Each derivative, also with respect to
+parameters, is certified as it is, and then with planted errors: a significant entry 1 % off, blocks negated, zeroed or
+transposed, or columns swapped. The check of `dd.solve`, which uses a few directions and the entries in doubt, gets the
+same errors. An entry is significant if it is at least MATTERS times the largest entry of its row or of its column. The
+columns are scaled by 1 SI unit, or by the variable's magnitude if it is larger.
 """
 
 import warnings
@@ -26,20 +26,20 @@ from drake_diff.model.parameters import applied, select
 
 COUNT = 1000
 FLOATING = ("solo12.urdf", "go2.urdf", "bolt.urdf", "simple_humanoid.urdf")
-WITH_FEET = ("solo12.urdf", "go2.urdf", "bolt.urdf")  # nothing but spheres touches
+WITH_FEET = ("solo12.urdf", "go2.urdf", "bolt.urdf")  # only spheres are in contact
 FIXED = ("ur5_robot.urdf", "panda.urdf", "z1.urdf", "kinova.urdf", "xarm7.urdf", "finger_edu.urdf", "so100.urdf")
 SMOOTH = ("pendulum.urdf", "cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "projectile.sdf")
 TOUCHING = ("sphere_on_ground.sdf", "sliding_block.sdf")
 APPROXIMATIONS = ("sap", "lagged", "similar")
 STEPS = (0.0005, 0.001, 0.002, 0.005, 0.01)
 KINDS = ("free", "limits", "gains", *APPROXIMATIONS)
-ENTRIES = 6  # planted at each state
+ENTRIES = 6  # planted entries at each state
 MATTERS = 1e-4
 
 
 @dataclass(frozen=True)
 class Case:
-    """A state to certify, and the parameters to differentiate by."""
+    """A state to certify, and the parameters of the derivative."""
 
     kind: str
     name: str
@@ -50,7 +50,7 @@ class Case:
 
 
 def near_a_limit(model, random, x):
-    """The state with one joint within 0.05 of one of its limits."""
+    """Return the state with one joint moved to within 0.05 of one of its limits."""
     plant, x = model.plant, x.copy()
     joints = [plant.get_joint(JointIndex(i)) for i in range(plant.num_joints())]
     limited = [j for j in joints if j.num_positions() == 1 and np.isfinite(j.position_upper_limits()[0])]
@@ -63,7 +63,7 @@ def near_a_limit(model, random, x):
 
 
 def some_parameters(model, random, kind):
-    """One that the step depends on: of contact where it touches, else of a body, joint or motor."""
+    """Return a parameter that affects the step: of the contact if there is one, else of a body, joint or motor."""
     touching = (".friction", ".stiffness", ".dissipation", ".relaxation_time")
     wanted = touching if kind in APPROXIMATIONS else (".mass", ".damping", ".kp", ".kd")
     names = [p.name for p in dd.list_parameters(model) if p.name.endswith(wanted) and np.all(np.asarray(p.value) > 0)]
@@ -71,7 +71,7 @@ def some_parameters(model, random, kind):
 
 
 def build(kind, random):
-    """A random case of this kind."""
+    """Return a random case of this kind."""
     step = float(random.choice(STEPS))
     if kind in APPROXIMATIONS:
         name = str(random.choice([*WITH_FEET, *TOUCHING]))
@@ -106,19 +106,19 @@ def build(kind, random):
 
 
 def least(certificate):
-    """(m, n) the smallest entry in which an error matters, in displacements scaled as the certificate's."""
+    """Return the smallest significant entries (m, n), scaled by the certificate's displacements."""
     a = np.abs(certificate.derivative) * certificate.scale
     row, column = a.max(axis=1, keepdims=True), a.max(axis=0, keepdims=True)
     return np.maximum(MATTERS * np.minimum(row, column), 1e-7 * row)
 
 
 def mattering(certificate):
-    """The entries (k, 2) in which an error matters."""
+    """Return the indices (k, 2) of the significant entries."""
     return np.argwhere(np.abs(certificate.derivative) * certificate.scale >= least(certificate))
 
 
 def blocks(case, certificate):
-    """The slices of A, B and C that have columns: whole, and the rows of velocities."""
+    """Return the slices of A, B and C that are not empty, with all rows and with the rows of velocities."""
     size, nu, half = len(certificate.rows), case.model.nu, len(certificate.rows) - case.model.nv
     ends = np.cumsum([0, size, nu, len(certificate.columns) - size - nu])
     columns = [slice(*pair) for pair in pairwise(ends) if pair[1] > pair[0]]
@@ -126,7 +126,7 @@ def blocks(case, certificate):
 
 
 def corrupted(case, certificate, random):
-    """Blocks that were negated, zeroed, transposed, or had two columns swapped, where that changes what matters."""
+    """Yield derivatives with a block negated, zeroed, transposed, or with two columns swapped, if significant."""
     right, scale = certificate.derivative, certificate.scale
     listed = blocks(case, certificate)
     for how in ("negated", "zeroed", "swapped", "transposed"):
@@ -148,13 +148,13 @@ def corrupted(case, certificate, random):
 
 
 def certified(case):
-    """The certificate of the derivative that is exact wherever one is: by the parameters of contact, too."""
+    """Certify the derivative that is exact if there is one, also with respect to parameters of contact."""
     method = "analytic" if case.kind in APPROXIMATIONS else "auto"
     return dd.certify(case.model, case.x, case.u, parameters=case.parameters, method=method)
 
 
 def first_look(case, derivative):
-    """Whether a look along a few directions passes a derivative: what `dd.solve` asks before anything else."""
+    """Return whether a derivative passes the check along a few directions, the first check of `dd.solve`."""
     vector = select(case.model, case.parameters)
     with applied(vector) as model:
         step = StepAround.of_point(model, vector, case.x, case.u)
@@ -163,7 +163,7 @@ def first_look(case, derivative):
 
 
 def plant_entries(case, certificate, random, tally, report):
-    """Single entries 1 % off."""
+    """Plant single entries 1 % off, and count those that are detected."""
     entries = mattering(certificate)
     for i, j in entries[random.choice(len(entries), min(ENTRIES, len(entries)), replace=False)]:
         wrong = certificate.derivative.copy()
@@ -185,7 +185,7 @@ def plant_entries(case, certificate, random, tally, report):
 
 
 def silent(case, certificate, why):
-    """Where nobody looks at the cases themselves."""
+    """Do not report the cases."""
 
 
 def measure(seed, count, report=silent):
@@ -202,7 +202,7 @@ def measure(seed, count, report=silent):
             continue
         if certificate.verdict != "agree":
             report(case, certificate, certificate.verdict)
-        if "finite" not in certificate.method:  # differences of Drake's own steps are wrong where its solver stops
+        if "finite" not in certificate.method:  # differences of Drake's own steps have the error of its solver
             tally["exact"] += 1
             tally["alarms"] += certificate.verdict in {"disagree", "discontinuous"}
             tally["undecided"] += certificate.verdict == "undecided"

@@ -1,7 +1,7 @@
-"""How often `compare` finds that an engine simulates another model, and says why; and what it says of the same model.
+"""Count how often `compare` detects an engine with another model and the reason, and its false alarms.
 
-A mismatch is one number of the model that an engine is given: of the MJCF that MuJoCo reads, or of the plant that
-another engine is built from. Every other one is of contact. What is not changed is written out anew and must hold.
+A mismatch is one changed number in the model of an engine: in the MJCF that MuJoCo reads, or in the plant from which
+another engine is built. Every second mismatch concerns contact. Models without a change are also built and must hold.
 """
 
 import warnings
@@ -25,7 +25,7 @@ STEPS = 8
 MODELS = Path(__file__).parents[2] / "models"
 FREE = ("pendulum.urdf", "double_pendulum.urdf", "cart_pole.urdf", "acrobot.xml", "ur5_robot.urdf", "z1.urdf")
 TOUCHING = ("sphere_on_ground.sdf", "sliding_block.sdf", "hopper.sdf", "solo12.urdf", "bolt.urdf")
-# Of a link: what follows from another mass, and from another place of it; MuJoCo makes contact stiffness of masses.
+# Terms that follow from another mass or position of a link. MuJoCo computes contact stiffness from masses.
 TERMS = {"M(q)", "bias(q, v)"}
 SOFTNESS = {"stiffness", "dissipation", "other contact terms"}
 FOLLOWS = {
@@ -43,7 +43,7 @@ FOLLOWS = {
 
 
 class Edit(NamedTuple):
-    """Elements of an MJCF that have the attribute, what it becomes, and the line of the contract that must fail."""
+    """A change of an attribute in the elements of an MJCF, and the line of the contract that must fail."""
 
     path: str
     attribute: str
@@ -85,7 +85,7 @@ OF_CONTACT = (
 class Case(NamedTuple):
     model: dd.Model
     engine: object
-    quantity: str  # what was changed, "" where nothing was
+    quantity: str  # the changed quantity, or ""
     said: str
 
 
@@ -112,7 +112,7 @@ def measure(seed: int, count: int) -> list[Figure]:
 
 
 def judged(case: Case, random: np.random.Generator) -> tuple[bool, set[str], str]:
-    """Whether `compare` lets it pass, the lines that are broken, and what is said."""
+    """Return whether the case passes `compare`, the broken lines of the contract, and the message."""
     x = state_of(case.model, random)
     us = np.tile(0.5 * random.standard_normal(case.model.nu), (STEPS, 1))
     result = dd.compare(case.model, [case.engine], x0=x, us=us, seed=int(random.integers(1000)))
@@ -123,7 +123,7 @@ def judged(case: Case, random: np.random.Generator) -> tuple[bool, set[str], str
 
 
 def state_of(model: dd.Model, random: np.random.Generator) -> np.ndarray:
-    """Touching the ground where the model can, or with a joint near its limit."""
+    """Return a random state, in contact with the ground if the model supports it, or with a joint near its limit."""
     if model.plant.GetFloatingBaseBodies() and model.contract.contact.collision_pairs:
         if model.nu:
             return state_in_contact(model, random)
@@ -141,7 +141,7 @@ def state_of(model: dd.Model, random: np.random.Generator) -> np.ndarray:
 
 
 def load(name: str, time_step: float, approximation: str = "lagged", **changes: float) -> dd.Model:
-    """A file of models/, or a robot that was made elsewhere, `changes` made to its feet."""
+    """Load a file of models/, or a robot of example-robot-data with `changes` of its feet."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)
         if (MODELS / name).exists():
@@ -150,7 +150,7 @@ def load(name: str, time_step: float, approximation: str = "lagged", **changes: 
 
 
 def built(engine: str, model: dd.Model) -> object:
-    """An engine of that name; the approximation in the name of Drake's is that of `model`."""
+    """Return the engine of this name. The approximation in the name of Drake's engine is that of `model`."""
     return dd.engines.load_engine(engine.split(":")[0], model)
 
 
@@ -165,18 +165,18 @@ def mismatch(random: np.random.Generator, *, touching: bool) -> Case:
 
 
 def others(model: dd.Model) -> list[str]:
-    """The engines beside MuJoCo that have what the model needs."""
+    """Return the engines other than MuJoCo that support the model."""
     touches = model.contract.contact.collision_pairs > 0
     modules = {"newton": "newton", "pybullet": "pybullet", "sapien": "sapien"}
     installed = [engine for engine, module in modules.items() if find_spec(module)]
     rotors = any(link.armature for link in describe(model).links)
-    if rotors:  # Bullet has none
+    if rotors:  # Bullet does not support armature
         installed = [engine for engine in installed if engine != "pybullet"]
     return ["drake:sap", "drake:similar", *installed] if touches else ["drake", "pinocchio", "casadi", *installed]
 
 
 def edited(random: np.random.Generator, name: str, model: dd.Model, edits: tuple[Edit, ...]) -> Case:
-    """MuJoCo on the model's own MJCF with one attribute changed."""
+    """Return a case of MuJoCo with the model's own MJCF, in which one attribute is changed."""
     text = generated(describe(model), model.time_step)
     for i in random.permutation(len(edits)):
         edit = edits[int(i)]
@@ -188,7 +188,7 @@ def edited(random: np.random.Generator, name: str, model: dd.Model, edits: tuple
 
 
 def make(random: np.random.Generator, root: ElementTree.Element, edit: Edit) -> str:
-    """Make the change; what it is, "" where there is nothing to change or it would change nothing."""
+    """Make the change and return its description, or "" if there is nothing to change or no effect."""
     pairs = root.findall(".//contact/pair")
     elements = changeable(root, edit)
     if not elements:
@@ -211,7 +211,7 @@ def make(random: np.random.Generator, root: ElementTree.Element, edit: Edit) -> 
 
 
 def changeable(root: ElementTree.Element, edit: Edit) -> list[ElementTree.Element]:
-    """The elements where the change is one of the model: of what moves, and of what can touch something."""
+    """Return the elements whose change affects the model: of moving bodies, and of shapes in contact pairs."""
     elements = [e for e in root.findall(edit.path) if not edit.attribute or e.get(edit.attribute)]
     if edit.change == "add":
         elements = root.findall(edit.path)
@@ -221,7 +221,7 @@ def changeable(root: ElementTree.Element, edit: Edit) -> list[ElementTree.Elemen
         elements = [e for e in elements if e.get("name") in touching]
         if edit.attribute == "size" or edit.change == "shift":
             elements = [e for e in elements if e.get("type") != "plane"]
-    if edit.quantity in ("mass", "inertia", "center of mass"):  # what moves, and has a mass that is felt
+    if edit.quantity in ("mass", "inertia", "center of mass"):  # moving bodies, if their mass has an effect
         fixed = {e for body in root.findall("./worldbody/body") for e in still(body)}
         elements = [e for e in elements if e not in fixed and float(e.get("mass")) > 1e-3]
     if edit.attribute == "diaginertia":
@@ -230,7 +230,7 @@ def changeable(root: ElementTree.Element, edit: Edit) -> list[ElementTree.Elemen
 
 
 def still(body: ElementTree.Element) -> list[ElementTree.Element]:
-    """The inertias of a body that is fixed to the world, and of what is fixed to it."""
+    """Return the inertias of a body that is fixed to the world, and of the bodies that are fixed to it."""
     if body.findall("joint") or body.findall("freejoint"):
         return []
     return [*body.findall("inertial"), *(e for child in body.findall("body") for e in still(child))]
@@ -265,7 +265,7 @@ def on_mjcf(model: dd.Model, text: str) -> object:
 
 
 def rebuilt(random: np.random.Generator, name: str, model: dd.Model, engine: str, *, touching: bool) -> Case:
-    """Another engine, built from the same plant with one number changed."""
+    """Return a case of another engine, built from the same plant with one number changed."""
     factor = float(np.exp(random.choice([-1, 1]) * random.uniform(0.01, 0.5)))
     time_step, other = model.time_step, None
     approximation = engine.split(":")[1] if ":" in engine else "lagged"
@@ -294,7 +294,7 @@ def rebuilt(random: np.random.Generator, name: str, model: dd.Model, engine: str
 
 
 def with_number(name: str, time_step: float, approximation: str, tag: str, factor: float) -> dd.Model:
-    """A file of models/ whose last number of this tag is another."""
+    """Load a file of models/ with the last number of this tag multiplied by `factor`."""
     text = (MODELS / name).read_text()
     before, rest = text.rsplit(f"<{tag}>", 1)
     number, after = rest.split("<", 1)
@@ -305,7 +305,7 @@ def with_number(name: str, time_step: float, approximation: str, tag: str, facto
 
 
 def same_model(random: np.random.Generator, *, touching: bool) -> Case:
-    """Any engine on the model itself: MuJoCo also on an MJCF in another order, or with other names of geometries."""
+    """Return a case of an engine with the same model, which for MuJoCo may be an MJCF in another order and naming."""
     name = str(random.choice(TOUCHING if touching else FREE))
     model = load(name, float(random.choice([0.001, 0.002, 0.005])))
     engine = str(random.choice(["mujoco", "own MJCF", *others(model)]))

@@ -1,9 +1,9 @@
-"""The certificates of what a search may move beside the motion: how many planted errors in its columns they find.
+"""Test certificates of derivatives with respect to parameters: how many planted errors in their columns they detect.
 
-Of the equations that a collocation gets, by parameters of masses, lengths, springs, dampings and motors, on robots of
-example-robot-data and the models here; and of discrete steps by a parameter and by the step's own length, smooth and in
-contact. Each derivative is certified as it is, and then with one column negated, 1 % off, or in the place of another.
-An error counts where the column is above a millionth of the largest of its kind, and where it is another one at all.
+Derivatives of collocation equations are with respect to masses, lengths, springs, dampings and motors of robots from
+example-robot-data and this repository. Derivatives of discrete steps, smooth and in contact, are with respect to a
+parameter and the time step. Each derivative is certified as it is, and then with one column negated, 1 % off, or
+swapped. An error counts if the column is above a millionth of the largest column, and if swapped columns differ.
 """
 
 import warnings
@@ -23,7 +23,7 @@ COUNT = 200
 ROBOTS = ("ur5_robot.urdf", "panda.urdf", "z1.urdf", "kinova.urdf", "xarm7.urdf", "finger_edu.urdf", "so100.urdf")
 OWN = ("pendulum.urdf", "cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml", "mass_spring_damper.sdf")
 TOUCHING = ("hopper.sdf", "two_spheres.sdf", "sliding_block.sdf")
-SMOOTH = ("ur5_robot.urdf", "z1.urdf", "kinova.urdf", *OWN)  # no couplers, in the middle of their joints' ranges
+SMOOTH = ("ur5_robot.urdf", "z1.urdf", "kinova.urdf", *OWN)  # without couplers, in the middle of the joints' ranges
 MOVABLE = ("mass", "center_of_mass", "offset", "damping", "spring_stiffness", "gear_ratio", "rotor_inertia")
 MATTERS, SAME = 1e-6, 0.02
 
@@ -47,7 +47,7 @@ def some(model, random, count, kinds=MOVABLE):
 
 
 def of_equations(random):
-    """The certificate at one random knot, and how many columns are parameters'."""
+    """Return the certificate at one random knot, and the number of columns of parameters."""
     model = load(str(random.choice([*ROBOTS, *OWN])), random)
     names = some(model, random, int(random.integers(1, 4)))
     problem = dd.Problem(
@@ -66,7 +66,7 @@ def of_equations(random):
 
 
 def of_steps(random, touching):
-    """The same of one discrete step by a parameter and by the length of the step."""
+    """Return the certificate of a discrete step with a parameter and the time step, and their number of columns."""
     name = str(random.choice(TOUCHING if touching else SMOOTH))
     model = load(name, random)
     kinds = ("mass", "stiffness", "friction") if touching else MOVABLE
@@ -84,7 +84,7 @@ def of_steps(random, touching):
 
 
 def planted(certificate, count, random):
-    """Derivatives with one error in the last `count` columns."""
+    """Yield derivatives with one error in the last `count` columns."""
     D = np.array(certificate.derivative)
     first = D.shape[1] - count
     units = np.abs(D * certificate.scale).max(axis=0)
@@ -102,7 +102,7 @@ def planted(certificate, count, random):
 
 
 def measure(seed, count):
-    """The figures of `count` certificates of equations, and of a quarter as many of each kind of step."""
+    """Return the figures of `count` certificates of equations, and of a quarter as many of each kind of step."""
     found, of, passed, honest = {}, {}, {}, {}
     for number, (kind, make) in enumerate(
         {
@@ -119,7 +119,7 @@ def measure(seed, count):
             except DrakeDiffError:
                 continue
             if certificate.verdict == "discontinuous":
-                continue  # a contact begins or ends there: nothing is to be certified
+                continue  # a contact begins or ends, so that there is no derivative
             honest[kind] += 1
             passed[kind] += certificate.verdict == "agree"
             for _, derivative in planted(certificate, columns, random):

@@ -1,8 +1,8 @@
-"""Where else a plan is said to hold: how often that is true, by formulas of what becomes of it there.
+"""Test verdicts on plans in continuous time and in another simulator against formulas of the motion.
 
-Balls fall on springs with losses, and what discrete steps make of the blow is the plan: where they are in continuous
-time is found by SciPy, from one formula of the force. Balls slide to rest over d = v^2 / (2 mu g) in MuJoCo, where one
-number is off.
+Balls fall on springs with losses, and the plan is the motion of the discrete steps. SciPy integrates the motion in
+continuous time from a formula of the force. Balls slide to rest over d = v^2 / (2 mu g) in MuJoCo, where one number
+may be wrong.
 """
 
 import re
@@ -22,9 +22,9 @@ from drake_diff.runs.cross_check import WIDER, follower_of, replays_in
 
 COUNT = 120
 G, RADIUS, FREE = 9.81, 0.1, np.nan
-CLEAR = 0.8  # a miss of more than this part of what is allowed, and of less than its inverse, decides nothing
-OFF = 0.2  # how far a number of MuJoCo's is off
-# By what it is: where it stands in the MJCF.
+CLEAR = 0.8  # errors between this part of the tolerance and its inverse are not counted
+OFF = 0.2  # relative error of a number in MuJoCo
+# Patterns of the numbers in the MJCF by quantity.
 NUMBERS = {
     "friction": r'(pair [^>]*friction=")([0-9.e+-]+) ([0-9.e+-]+)',
     "stiffness": r'(pair [^>]*solref=")(-[0-9.e+-]+)',
@@ -41,7 +41,7 @@ def measure(seed: int, count: int) -> list[Figure]:
 
 
 def _measured(random, count, folder):
-    said = {True: [0, 0], False: [0, 0]}  # by the truth: told so, of all
+    said = {True: [0, 0], False: [0, 0]}  # by the truth: right verdicts, all verdicts
     for _ in range(count):
         truth, held = fallen(random, folder)
         if truth is not None:
@@ -72,7 +72,7 @@ def _measured(random, count, folder):
 
 
 def unlike(row):
-    """What a simulator has otherwise than Drake."""
+    """Return the checks for differences between a simulator's model and Drake's."""
     return [c for c in row.checks if c.what == "model"]
 
 
@@ -86,7 +86,7 @@ def given(model, x0, steps, goal):
 
 
 def fallen(random, folder):
-    """(whether it holds in continuous time, None where that is near; what was said)."""
+    """Return whether a plan holds in continuous time (None if near the tolerance), and the toolkit's verdict."""
     k, tau = 10 ** random.uniform(4.3, 6), float(random.choice([0.0, 10 ** random.uniform(-4, -2)]))
     h, fall = float(random.choice([0.005, 0.01, 0.02, 0.05])), random.uniform(0.02, 0.15)
     model = ball_on_ground(folder, time_step=h, stiffness=k, relaxation_time=tau)
@@ -101,7 +101,7 @@ def fallen(random, folder):
 
 
 def by_formula(k, tau, fall, duration):
-    """[m] over the ground of a ball of 1 kg after it fell on a spring that never pulls: f = k (d + tau d')+, d > 0."""
+    """Return the height [m] of a 1 kg ball after a fall on a spring that never pulls: f = k (d + tau d')+, d > 0."""
 
     def rates(_, state):
         z, v = state
@@ -114,7 +114,7 @@ def by_formula(k, tau, fall, duration):
 
 
 def slid(random, quantity, folder):
-    """(whether its motion ends where it was to, None where that is near or not told by the formula; the row)."""
+    """Return whether a slide ends at its goal (None if near the tolerance or without a formula), and the replay."""
     mu, speed, h = random.uniform(0.2, 0.8), random.uniform(0.5, 2.0), float(random.choice([0.005, 0.01]))
     model = ball_on_ground(folder, time_step=h, stiffness=2e4, relaxation_time=0.01, friction=mu)
     steps = round(1.3 * speed / (mu * G) / h)
@@ -136,7 +136,7 @@ def slid(random, quantity, folder):
 
 
 def planted(text, quantity, off):
-    """The MJCF with a number 20 % off; a damping of nothing becomes one."""
+    """Return the MJCF with a number 20 % off. A damping of 0 becomes OFF."""
 
     def changed(found):
         numbers = [float(number) for number in found.groups()[1:]]

@@ -1,8 +1,8 @@
-"""Rigid impacts: how many planted errors their certificates and the judge of phases find, and what they refuse wrongly.
+"""Test rigid impacts: how many planted errors certificates and the judge of phases detect, and their false alarms.
 
-Points of arms strike a floor in random states, sticking or without friction. What the derivative is compared with is
-another form of the law, from Drake's mass matrix and Jacobian. In phases a plan of one impact is said to be that of
-another.
+Points of arms strike a floor in random states, sticking or without friction. The derivative is compared with another
+form of the law, from Drake's mass matrix and Jacobian. Plans in phases are judged with another restitution than that
+of their impact, or with a displaced phase.
 """
 
 from dataclasses import replace
@@ -30,7 +30,7 @@ G = 9.81
 
 
 def struck(random):
-    """(certificate's function, state, derivative) of an arm's impact with the floor; None where it would pull."""
+    """Return the function, state and derivative of an arm's impact with the floor; None if the impulse would pull."""
     robot = str(random.choice(list(ARMS)))
     model, at = example_robot(robot), random.uniform(-0.1, 0.1, 3)
     x = state_in_range(model, random, speed=10 ** random.uniform(-1, 0.5))
@@ -41,7 +41,7 @@ def struck(random):
     if (floor.terms(x)[1] @ x[model.nq :])[2] > 0:
         x[model.nq :] *= -1
     P = impact.impulses(x)
-    if not P[-1] > 0.2 * np.linalg.norm(P):  # it pulls, or nearly does
+    if not P[-1] > 0.2 * np.linalg.norm(P):  # the impulse pulls, or nearly pulls
         return None
     given = (impact.restitution, 0.0 if slides else 1e9)
     by_x = np.eye(model.nx)
@@ -52,7 +52,7 @@ def struck(random):
 
 
 def planted(by_x, random):
-    """Wrong derivatives: single entries that matter 1 % off, rows negated, blocks zeroed."""
+    """Yield wrong derivatives: single significant entries 1 % off, and blocks negated or zeroed."""
     size = np.max(np.abs(by_x), axis=1, keepdims=True)
     for i, j in random.permutation(np.argwhere(np.abs(by_x) >= MATTERS * size))[:ENTRIES]:
         wrong = by_x.copy()
@@ -67,7 +67,7 @@ def planted(by_x, random):
 
 
 def counted(cases, random):
-    """(found, planted, called wrong, right)"""
+    """Return the numbers of detected errors, planted errors, false alarms and right derivatives."""
     found = of = alarms = right = 0
     for case in cases:
         if case is None:
@@ -83,7 +83,7 @@ def counted(cases, random):
 
 
 def remembered(function):
-    """The same function, which is asked at the same places for every planted error."""
+    """Return the function with a cache, as each planted error evaluates it at the same points."""
     seen = {}
 
     def f(z):
@@ -96,7 +96,7 @@ def remembered(function):
 
 
 def bounced(random):
-    """A ball that two motors bounce into a target, by random restitution."""
+    """Solve for a ball that two motors bounce into a target, with random restitution."""
     plant, properties = Plant(0.01, "lagged"), contact_properties(2e4)
     plant.ball("ball", random.uniform(0.5, 2), 0.1, properties, "x", "z")
     plant.ground(properties)
@@ -118,7 +118,7 @@ def rejudged(solution, **fields):
 
 
 def phases(random, count):
-    """(accepted, planted, right plans refused, right plans)"""
+    """Return the numbers of accepted errors, planted errors, refused right plans and right plans."""
     accepted = of = refused = right = 0
     for _ in range(count):
         solution, contacts, e = bounced(random)

@@ -1,8 +1,8 @@
-"""Couplings, rates, stays and terminal sets: does a plan that breaks one come out as one that holds?
+"""Test whether plans that violate a coupling, a rate, a dwell or a terminal set are accepted.
 
-A random robot's random problem is solved with a weaker condition than the one that its plan is judged by: another
-period, a faster motor, a shorter stay, an end anywhere about the set. By how much the plan breaks what it is judged by
-is measured here, from its arrays and by pydrake's plant alone.
+A random problem of a random robot is solved with a weaker condition than the one that judges its plan: another period,
+a faster motor, a shorter dwell, or an end near the terminal set. The violation of the judged condition is measured from
+the plan's arrays and by pydrake's plant alone.
 """
 
 import dataclasses
@@ -23,8 +23,8 @@ from drake_diff.optimize.verification import trials
 
 COUNT = 150
 ROBOTS = ("pendulum.urdf", "cart_pole.urdf", "double_pendulum.urdf")
-PLANTED = 0.02  # of a limit, or of a range: what has to be noticed
-NEAR = 0.02  # a stay's tolerance
+PLANTED = 0.02  # violation of a limit or range that must be detected
+NEAR = 0.02  # tolerance of a dwell
 
 
 def plant_of(path, h):
@@ -36,7 +36,7 @@ def plant_of(path, h):
 
 
 def dense(solution):
-    """Times (S,), states and inputs (S, ...) of a plan, 20 places to an interval, its ends twice."""
+    """Return times (S,), states and inputs (S, ...) of a plan at 20 points per interval, including both ends."""
     state, given = solution.trajectory()
     tau = np.linspace(1e-9, 1 - 1e-9, 20)
     times = (solution.times[:-1, None] + np.diff(solution.times)[:, None] * tau).ravel()
@@ -44,7 +44,7 @@ def dense(solution):
 
 
 def steepest(times, values):
-    """(n,) the largest slope of `values` (S, n) within an interval."""
+    """Return the largest slope (n,) of `values` (S, n) within intervals."""
     slopes = np.abs(np.diff(values, axis=0)) / np.diff(times)[:, None]
     inside = np.arange(len(slopes)) % 20 != 19
     return slopes[inside].max(axis=0)
@@ -129,7 +129,7 @@ def terminal(random):
     region = caught.region(model, weaker.bounds)
     inside = np.clip(weaker.bounds.x_lower + 0.1, -1e3, 1e3), np.clip(weaker.bounds.x_upper - 0.1, -1e3, 1e3)
     start = np.clip(upright + (region.random_state(random) - upright) * random.uniform(0.2, 1.2), *inside)
-    pushed = np.full((5, 1), random.uniform(-0.3, 0.3) * limit)  # what it can be brought to
+    pushed = np.full((5, 1), random.uniform(-0.3, 0.3) * limit)  # with a reachable final state
     end = np.clip(dd.rollout(model, start, pushed).xs[-1], *inside)
     weaker = dataclasses.replace(weaker, x0=start, x_goal=end, running_cost=dd.QuadraticCost(R=[[1.0]]))
 
@@ -157,7 +157,7 @@ KINDS = (periodic, rate, rate, stay, terminal)
 
 
 def case(seed, number):
-    """(how far what the plan is judged by is broken, whether it comes out as one that holds); None of no plan."""
+    """Return the violation of the judged condition, and whether the plan is accepted; None without a plan."""
     random = np.random.default_rng([seed, number])
     weaker, asked, broken = KINDS[number % len(KINDS)](random)
     solution = dd.solve(weaker, method="collocation", time_limit=60)
@@ -185,7 +185,7 @@ def measure(seed, count):
 
 
 def solved(seed, number):
-    """Whether the condition itself, which can be met, leads to a plan that holds."""
+    """Return whether a solve with the judged condition, which can be satisfied, finds a plan that holds."""
     _, asked, _ = KINDS[number % len(KINDS)](np.random.default_rng([seed, number]))
     found = dd.solve(asked, method="collocation", time_limit=60)
     if not found.success:

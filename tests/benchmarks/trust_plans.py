@@ -1,12 +1,12 @@
-"""Claims of `converged` on random slides, pendulums, cart-poles, wheels and satellites, refuted or confirmed.
+"""Check claims of `converged` on random slides, pendulums, cart-poles, wheels and satellites with a referee.
 
     python tests/benchmarks/trust.py --only plans --seed 0 --count 200
-    python tests/benchmarks/trust_plans.py 0 3000 --out plans.jsonl [--seconds 170]     # goes on where it stopped
-    python tests/benchmarks/trust_plans.py 17 18                                         # one case, in words
+    python tests/benchmarks/trust_plans.py 0 3000 --out plans.jsonl [--seconds 170]     # continues a stopped run
+    python tests/benchmarks/trust_plans.py 17 18                                         # one case
 
 Each seed draws a system (a URDF file or `Dynamics`), masses, lengths, limits, a horizon, units of 1e-6 to 1e6, hard or
-soft goals or both, and a method. The referee is plain pydrake (a plant of its own) or the formula, stepped or
-integrated by SciPy, open loop and under a TVLQR of its own about `xs` and `us`. It shares no code with drake_diff.
+soft goals or both, and a method. The referee uses a separate plant of pydrake or the formula, stepped or integrated by
+SciPy, in open loop and under a separate TVLQR about `xs` and `us`. It shares no code with drake_diff.
 """
 
 import argparse
@@ -30,10 +30,10 @@ from scipy.integrate import solve_ivp
 
 import drake_diff as dd
 
-COUNT, EVERY_BLOCK = 200, 25  # cases; one of so many seeds has a narrow force or cost
-PART = 0.01  # of what a state travels, and of a cost: what a replay may be off
-WIDE = 0.05  # the same of a state along a motion under the referee's feedback, whose weights are others
-EFFORTS = (0.1, 0.01, 1.0, 1e30)  # what the referee's regulators weigh an input by; so much is no feedback
+COUNT, EVERY_BLOCK = 200, 25  # number of cases; one of 25 seeds has a narrow force or cost
+PART = 0.01  # tolerance of a replay, relative to a state's travel and to the cost
+WIDE = 0.05  # the same for a state along a motion under the referee's feedback, whose weights differ
+EFFORTS = (0.1, 0.01, 1.0, 1e30)  # weights of an input in the referee's regulators; 1e30 is no feedback
 FREE = np.nan
 FOLDER = tempfile.TemporaryDirectory()
 JOINT = """<link name="{name}"><inertial><origin xyz="0 0 {com!r}"/><mass value="{mass!r}"/><inertia ixx="{inertia!r}"
@@ -47,24 +47,24 @@ MOTOR = """<transmission name="{name}_motor"><type>transmission_interface/Simple
 
 @dataclass
 class Task:
-    """A random problem, and what the referee needs to know of it."""
+    """A random problem, with data for the referee."""
 
     row: str
     system: Any  # the path of a file, or a function (x, u) -> rates
     goal: np.ndarray  # (nx,), NaN where free
-    natural: np.ndarray  # (nx,) a size of each state that the task has
+    natural: np.ndarray  # (nx,) typical size of each state
     duration: float
     num_steps: int
     limits: np.ndarray  # (nu,)
     x0: np.ndarray
     gravity: float = 0.0
-    kind: str = "hard"  # "hard", "soft", "both" goals, "free horizon"
+    kind: str = "hard"  # "hard", "soft" or "both" goals, or "free horizon"
     method: str = "auto"
-    feasible: bool | None = None  # by a closed form
-    speed: float = np.inf  # the limit of the first speed
-    waypoint: float = FREE  # of the first coordinate, half way
+    feasible: bool | None = None  # from a closed form
+    speed: float = np.inf  # limit of the first velocity
+    waypoint: float = FREE  # of the first coordinate, at the middle knot
     weights: dict[str, np.ndarray] = field(default_factory=dict)  # of the cost: Q, R, F
-    peak: Any = None  # a part of the running cost, a function of the first coordinate
+    peak: Any = None  # part of the running cost, as a function of the first coordinate
     narrow: float = np.inf  # [s] in which a force or cost acts
 
     @property
@@ -108,11 +108,11 @@ class Task:
         return dd.Problem(system, x0=self.x0, num_steps=self.num_steps, bounds=dd.Bounds(**limits), **more)
 
 
-# ------------------------------------------------------------------------------ systems, in units of their own
+# ------------------------------------------------------------------------------ systems, in random units
 
 
 def file_of(name, links, motors):
-    """A URDF of `links` in a chain, those in `motors` driven."""
+    """Write a URDF of `links` in a chain, of which those in `motors` are driven, and return the path."""
     parents = ["world", *(link["name"] for link in links)]
     usual = {"com": 0.0, "offset": 0.0, "damping": 0.0, "kind": "continuous", "axis": "0 1 0", "effort": 1e30}
     text = "".join(
@@ -129,7 +129,7 @@ def _plain(link):
 
 
 def rod(name, m, l, **more):  # noqa: E741
-    """A uniform rod that hangs from its joint."""
+    """Return a uniform rod that hangs from its joint."""
     return {"name": name, "mass": m, "com": -l / 2, "inertia": m * l * l / 12, **more}
 
 
@@ -146,7 +146,7 @@ def slide(random, name, L, M, S):
     elif random.random() < 0.2:
         task.waypoint = random.uniform(0.3, 0.7) * way
     else:
-        task.feasible = bool(strength >= 1)  # F T^2 / 4 m is the longest way from rest to rest
+        task.feasible = bool(strength >= 1)  # F T^2 / 4 m is the longest distance from rest to rest
     return task
 
 
@@ -170,7 +170,7 @@ def pendulum(random, name, L, M, S):
 
 
 def cart_pole(random, name, L, M, S):
-    """As in the README within a tenth, or any other."""
+    """Return a task of a cart-pole, either that of the README within a tenth or a random one."""
     readme = random.random() < 0.4
     heavy, light, l = np.array([M, 0.3 * M, 0.5 * L]) * random.uniform(*(0.9, 1.1) if readme else (0.4, 2.5), 3)  # noqa: E741
     g = 9.81 * L / S**2
@@ -217,7 +217,7 @@ def wheel(random, name, L, M, S):
 
 
 def satellite(random, name, L, M, S):
-    """Modified Rodrigues parameters and the rates of a body, or three hinges through one point."""
+    """Return a task of a body with modified Rodrigues parameters, or with three hinges through one point."""
     inertia, duration = random.uniform(0.5, 2, 3) * M * L * L, random.uniform(2, 5) * S
     inertia[2] = min(inertia[2], 0.9 * (inertia[0] + inertia[1]))
     limits, count = random.uniform(2, 8, 3) * inertia / duration**2, int(random.integers(10, 30))
@@ -238,7 +238,7 @@ def satellite(random, name, L, M, S):
 
 
 def block(random, name, L, M, S):
-    """A slide past a force or a cost that acts over a few ten-thousandths to a hundredth of its way."""
+    """Return a task of a slide with a force or a cost that acts over 10^-3.5 to 10^-2 of its path."""
     m, way, duration = random.uniform(0.5, 2) * M, random.uniform(0.1, 3) * L, random.uniform(0.5, 3) * S
     width, at, is_cost = 10 ** random.uniform(-3.5, -2) * way, random.uniform(0.2, 0.8) * way, random.random() < 0.5
     limits, speed = random.uniform(1.5, 4, 1) * 4 * m * way / duration**2, 1.5 * way / duration
@@ -258,7 +258,7 @@ SYSTEMS = (slide, slide, pendulum, pendulum, cart_pole, double_pendulum, wheel, 
 
 
 def drawn(seed):
-    """The task of a seed."""
+    """Return the task of a seed."""
     random, units = np.random.default_rng([37, seed]), np.ones(3)
     make = block if seed % EVERY_BLOCK == EVERY_BLOCK - 1 else SYSTEMS[seed % len(SYSTEMS)]
     if random.random() < (0.7 if make is slide else 0.3):
@@ -288,7 +288,7 @@ def drawn(seed):
 
 
 class Referee:
-    """Steps and rates of a task's own system, and motions of a solution's arrays under them."""
+    """Independent steps and rates of a task's system, and the motions of a solution's arrays with them."""
 
     def __init__(self, task: Task, solution: Any):
         self.task, self.xs, self.us = task, np.array(solution.xs), np.array(solution.us)
@@ -333,7 +333,7 @@ class Referee:
         return plant.EvalTimeDerivatives(context).CopyToVector()
 
     def input(self, k, s):
-        """(nu,) at the part `s` of interval k."""
+        """Return the input (nu,) at the fraction `s` of interval k."""
         if len(self.ends) == len(self.us):
             return self.us[k]
         first, last = self.ends[k], self.ends[k + 1]
@@ -341,13 +341,13 @@ class Referee:
         return first * (1 - s) * (1 - 2 * s) + mid * 4 * s * (1 - s) + last * s * (2 * s - 1)
 
     def state(self, k, s):
-        """(nx,) of the plan there: the cubic by states and rates at both ends."""
+        """Return the plan's state (nx,) at the fraction `s` of interval k, by the cubic from states and rates."""
         h, x, y = self.times[k + 1] - self.times[k], self.xs[k], self.xs[k + 1]
         f, g = self.rates(x, self.input(k, 0.0)), self.rates(y, self.input(k, 1.0))
         return (1 + 2 * s) * (1 - s) ** 2 * x + s * s * (3 - 2 * s) * y + h * s * (1 - s) * ((1 - s) * f - s * g)
 
     def along(self, k, x):
-        """(nx + 1,) the state and the cost over interval k, integrated accurately under the plan's input."""
+        """Integrate the state and the cost (nx + 1,) accurately over interval k under the plan's input."""
         h = self.times[k + 1] - self.times[k]
 
         def slopes(s, z):
@@ -360,7 +360,7 @@ class Referee:
         return done.y[:, -1]
 
     def open_loop(self, plant):
-        """(xs (N+1, nx), cost) of the plant "steps" or "continuous" under the inputs alone."""
+        """Return xs (N+1, nx) and the cost of the plant "steps" or "continuous" under the inputs alone."""
         x, cost, xs = self.xs[0], 0.0, [self.xs[0]]
         for k, u in enumerate(self.us):
             if plant == "steps":
@@ -374,7 +374,7 @@ class Referee:
         return np.array(xs), cost + self.task.final(x)
 
     def pieces(self, plant, parts):
-        """(state of the plan, a map (x, change of the input) -> next x, its length [s]) of `parts` an interval."""
+        """Return (plan's state, map (x, change of the input) -> next x, length [s]) of `parts` pieces per interval."""
         made = []
         for k in range(len(self.us)):
             for j in range(parts):
@@ -397,7 +397,7 @@ class Referee:
     def _integrated(self, k, s, h, x, change):
         whole = self.times[k + 1] - self.times[k]
         count = max(2, math.ceil(3 * h / self.task.narrow))
-        for i in range(count):  # Runge and Kutta's fourth order
+        for i in range(count):  # fourth-order Runge-Kutta
             d = h / count
             first, mid, last = (self._within(self.input(k, s + (i * d + c) / whole) + change) for c in (0, d / 2, d))
             a = self.rates(x, first)
@@ -407,7 +407,7 @@ class Referee:
         return x
 
     def under_feedback(self, plant, parts, effort):
-        """(N parts + 1, nx) under TVLQR about the plan that weighs the input by `effort`, and the plan's states."""
+        """Return states (N parts + 1, nx) under TVLQR about the plan with input weight `effort`, and the plan's."""
         pieces, n = self.pieces(plant, parts), len(self.scale)
         range_u = np.minimum(np.maximum(np.ptp(self.us, axis=0), 1e-3 * self.task.limits), self.task.limits)
         if (plant, parts) not in self.slopes:
@@ -430,7 +430,7 @@ class Referee:
         return np.array(xs), np.array([piece[0] for piece in pieces] + [self.xs[-1]])
 
     def complaints(self, xs, plan, goal_part, part):
-        """Where a motion is not what the plan says, or not what the task asks."""
+        """Return messages on the deviations of a motion from the plan and from the task."""
         told = []
         if not np.all(np.isfinite(xs)):
             return ["it diverges"]
@@ -450,14 +450,14 @@ class Referee:
         return told
 
     def cost_complaints(self, cost):
-        """Where the cost of a motion is not the one that is reported; a millionth of that of no motion is nothing."""
+        """Return a message if a motion's cost is not the reported cost; 1e-6 of the cost without motion is allowed."""
         task = self.task
         nothing = task.duration * task.rate(task.x0, 0 * task.limits) + task.final(task.x0)
         room = max(PART * max(abs(cost), abs(self.cost)), np.nan_to_num(self.cost_error), 1e-6 * nothing)
         return [] if abs(cost - self.cost) <= room else [f"the cost is {cost:.5g}, {self.cost:.5g} reported"]
 
     def judge_open(self, plant):
-        """Complaints of the motion open loop."""
+        """Return the complaints about the motion in open loop."""
         try:
             with np.errstate(all="ignore"):
                 xs, cost = self.open_loop(plant)
@@ -466,7 +466,7 @@ class Referee:
         return self.complaints(xs, self.xs, PART, PART) + self.cost_complaints(cost)
 
     def judge_feedback(self, plant, parts, goal_part, part=WIDE, efforts=EFFORTS):
-        """Those of the best of the regulators."""
+        """Return the complaints about the first regulator, or [] if one of the regulators has no complaints."""
         best = None
         for effort in efforts:
             try:
@@ -480,7 +480,7 @@ class Referee:
         return best
 
     def always(self):
-        """What is wrong in the arrays themselves."""
+        """Return the complaints about the arrays."""
         told = []
         if not (np.all(np.isfinite(self.xs)) and np.all(np.isfinite(self.us)) and np.isfinite(self.cost)):
             return ["a number is not finite"]
@@ -493,7 +493,7 @@ class Referee:
 
 
 def claims(task, solution):
-    """(plant, feedback) that a solution is to hold in: what it says, or what the issue asks of its method."""
+    """Return (plant, feedback) in which a solution must hold, by its claim or, without a claim, by its method."""
     steps = task.has_model and task.kind != "free horizon" and task.method != "collocation"
     if hasattr(solution, "plant"):
         return solution.plant, solution.feedback
@@ -504,7 +504,7 @@ def claims(task, solution):
 
 
 def refute(task, solution):
-    """Complaints about what the solution claims, in which plant and under which feedback; in steps, those of h/8."""
+    """Return the complaints about a solution, its plant and its feedback, and for steps the complaints at h/8."""
     referee = Referee(task, solution)
     plant, feedback = claims(task, solution)
     wanted = task.has_model and task.kind != "free horizon" and task.method != "collocation"
@@ -527,7 +527,7 @@ def refute(task, solution):
 
 
 def judged(seed):
-    """A row of the table: what was asked, what was said, and what the referee says."""
+    """Solve the task of a seed, and return a row with the task, the status, and the complaints of the referee."""
     task, begin = drawn(seed), time.perf_counter()
     line = {"seed": seed, "row": task.row, "kind": task.kind, "method": task.method, "feasible": task.feasible}
     line["system"] = "model" if task.has_model else "Dynamics"
@@ -543,7 +543,7 @@ def judged(seed):
 
 
 def counts(lines, key):
-    """A line for each value of `key`."""
+    """Return the counts for each value of `key`."""
     table = {}
     for line in lines:
         row = table.setdefault(line[key], Counter())
@@ -557,7 +557,7 @@ def counts(lines, key):
 
 
 def show(lines):
-    """The table, by row and by method."""
+    """Print the table by row, kind, system and method."""
     columns = ("cases", "success", "false", "not at h/8", "rejected", "no answer")
     print(f"{'':27s}" + "".join(f"{name:>12s}" for name in columns) + "   false, 95 % interval")
     for key in ("row", "kind", "system", "method"):

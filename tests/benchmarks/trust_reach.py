@@ -1,4 +1,4 @@
-"""Plans that touch nothing: where the cost asks a body to move that nothing moves, there is no success to claim."""
+"""Test plans without contact, which must not be successes if the cost requires a motion of an undriven body."""
 
 from collections import Counter
 
@@ -11,14 +11,14 @@ from trust import Figure
 import drake_diff as dd
 
 COUNT = 300
-STILL = 1e-9  # [m] a ball that starts at rest and has gone no further was not touched
+STILL = 1e-9  # [m] a ball that moved less than this from rest was not touched
 STEPS = 30
 FORMS = ("running", "final", "of both", "function", "concave", "linear")
 CASES = ("ilqr", "shooting", "ilqr", "constant", "shooting", "in place", "ilqr", "follower", "auto", "shooting")
 
 
 def rail(random, *, touch=True):
-    """A driven ball and a free one on a rail, of random masses, radii, damping, law of contact and step."""
+    """Return a driven and a free ball on a rail with random constants, and the distance of their centres in contact."""
     made = Plant(random.uniform(0.005, 0.04), str(random.choice(["sap", "lagged", "similar"])))
     radius = random.uniform(0.03, 0.15)
     for name in ("pusher", "ball"):
@@ -33,7 +33,7 @@ def rail(random, *, touch=True):
 
 
 def asking(random, form, start):
-    """A cost that asks the ball to be elsewhere, in that form, some of the pusher too; weights over four decades."""
+    """Return a cost of this form that requires a motion of the ball, with weights over four decades."""
     goal, weight = start + random.uniform(0.05, 1.0), 10 ** random.uniform(-2, 2)
     effort = dd.QuadraticCost(R=[[1e-3]])
     x_ref, both = [random.uniform(-0.02, 0.02), goal, 0, 0], weight * np.diag([0.5, 1, 0.1, 0.1])
@@ -48,12 +48,12 @@ def asking(random, form, start):
 
 
 def legitimate(random, case, start):
-    """A cost that no touch can serve, or that asks nothing of the ball."""
+    """Return a cost that contact cannot reduce, or that requires no motion of the ball."""
     weight, x_ref = 10 ** random.uniform(-2, 2), [random.uniform(0.05, 0.2), start, 0, 0]
-    if case == "follower":  # keeps a distance that it cannot keep by touching
+    if case == "follower":  # requires a distance at which there is no contact
         way = start + random.uniform(0.0, 0.1)
         return {"running_cost": lambda x, u: weight * (x[1] - x[0] - way) ** 2 + 1e-3 * u[0] ** 2}
-    if case == "constant":  # the ball has no shape that could be touched
+    if case == "constant":  # the ball has no collision shape
         x_ref[1] += random.uniform(0.1, 1.0)
     else:
         x_ref[0] = random.uniform(-0.1, 0.0)
@@ -61,7 +61,7 @@ def legitimate(random, case, start):
 
 
 def pays(problem):
-    """Whether some constant push is cheaper than none."""
+    """Return whether some constant force has a lower cost than no force."""
 
     def cost(force):
         us = np.full((STEPS, 1), force)

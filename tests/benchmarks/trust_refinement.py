@@ -1,11 +1,11 @@
-"""How often refinement agrees with a gradient that is wrong about the motion, and with one of a smooth motion.
+"""Count how often refinement agrees with a gradient that is wrong for the motion, and with one of a smooth motion.
 
 Bounces: a ball of random mass falls from a random height on a floor of random stiffness, dissipation and relaxation
-time, in steps of random length, in each of Drake's approximations in turn. The truth is the same law event by event
-(`helpers.bounces`), which has no step. An `agree` is false where an entry is more than 20 % off.
+time, with random time steps, in each of Drake's approximations in turn. The truth is the same law event by event
+(`helpers.bounces`), without time steps. An `agree` is false if an entry is more than 20 % off.
 
 Smooth motions: pendulums and other models of this repository, arms and free bodies of example-robot-data, from random
-states to a random goal. Nothing of them touches or reaches a limit; every one that does not agree is a false alarm.
+states to a random goal. They have no contact and reach no limit. Each one that does not agree is a false alarm.
 """
 
 import re
@@ -24,9 +24,9 @@ from drake_diff.exceptions import DrakeDiffError, ModelWarning
 
 COUNT = 200
 APPROXIMATIONS = ("sap", "lagged", "similar")
-FALSE, NEGLIGIBLE = 0.2, 1e-3  # of an entry, and of the largest one
-RIGHT = 0.05  # a gradient that near is one that should agree
-# File of this repository or of example-robot-data, the link to weld, and whether its motors push.
+FALSE, NEGLIGIBLE = 0.2, 1e-3  # error relative to an entry, entry relative to the largest
+RIGHT = 0.05  # a gradient with at most this error should agree
+# File of this repository or of example-robot-data, the link to weld, and whether it has motors.
 SMOOTH = (
     ("pendulum.urdf", None, True),
     ("double_pendulum.urdf", None, True),
@@ -47,7 +47,7 @@ SMOOTH = (
 
 
 def bounce(random, index):
-    """(the ball, its approximation, h, steps, start, weight of the last rate in the loss, truth); the truth exists."""
+    """Return (ball, approximation, h, steps, start, weight of the last velocity in the loss, truth)."""
     while True:
         ball = Bounce(
             stiffness=10 ** random.uniform(2, 5),
@@ -66,7 +66,7 @@ def bounce(random, index):
 
 
 def bounces(random, count):
-    """(of `count` bounces those with a false agree, those whose gradient is right, those of them that agree)."""
+    """Return the bounces with a false agree, the number of right gradients, and the number of these that agree."""
     false, right, agreed = [], 0, 0
     with TemporaryDirectory() as folder:
         for index in range(count):
@@ -87,7 +87,7 @@ def bounces(random, count):
 
 
 def smooth_model(index, h, folder):
-    """The robot; without motors where its inputs would be too many, and without what couples two joints."""
+    """Load a robot without coupled joints, and without motors if its inputs would be too many."""
     name, weld, motors = SMOOTH[index % len(SMOOTH)]
     file = MODELS / name
     if not file.exists():
@@ -100,7 +100,7 @@ def smooth_model(index, h, folder):
 
 
 def smooth_motion(random, model):
-    """(x0, us) of 30 to 60 steps in which nothing touches and no limit is near."""
+    """Return (x0, us) of 30 to 60 steps without contact and with no limit nearby."""
     lower, upper = model.plant.GetPositionLowerLimits(), model.plant.GetPositionUpperLimits()
     for _ in range(1000):
         steps, x0 = int(random.integers(30, 60)), state_in_range(model, random)
@@ -113,7 +113,7 @@ def smooth_motion(random, model):
 
 
 def smooth(random, index, folder):
-    """The certificate of one smooth motion to a random goal."""
+    """Return the name of the model and the certificate of one smooth motion to a random goal."""
     model = smooth_model(index, 10 ** random.uniform(-3.3, -2.3), folder)
     x0, us = smooth_motion(random, model)
     goal = x0 + 0.5 * random.standard_normal(model.nx)
@@ -121,7 +121,7 @@ def smooth(random, index, folder):
 
 
 def smooth_motions(random, count):
-    """How many of `count` agree."""
+    """Return how many of `count` certificates of smooth motions agree."""
     agreed = 0
     with TemporaryDirectory() as folder:
         for index in range(count):

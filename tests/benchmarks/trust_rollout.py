@@ -1,14 +1,14 @@
-"""Certificates of whole rollouts: what they say of right gradients, and which planted errors they find.
+"""Test certificates of whole rollouts: their verdicts on right gradients, and the planted errors that they detect.
 
-Robots of example-robot-data and models from here, with random inputs or under random feedback, random weights of the
-loss and scales of it from 1e-12 to 1e8; free, and with feet on the ground by the three approximations.
+The robots are from example-robot-data and this repository, with random inputs or feedback, random weights of the loss
+and scales of the loss from 1e-12 to 1e8. They are free or have feet on the ground with the three approximations.
 
-- By random directions: each plan is certified as it is, and then with planted errors: 1 % in one entry that matters,
-  and states, inputs, parameters of the policy and of the model left out, negated, or with two entries swapped.
-- Entry by entry: small robots, for which every column is a rollout or 26.
-- Policies with a fault each: parameters or states of which some are plain numbers, a derivative that is stated 8 % off,
-  a memory by time. Staircases in the loss or in the policy, of steps from 1e-5 to 0.1; a switch of the policy in one
-  state, which the first step passes, or 3 beyond the start, which is no fault.
+- By random directions: each plan is certified as it is, and then with planted errors: 1 % in one significant entry,
+  and states, inputs, parameters of the policy and of the model zeroed, negated, or with two entries swapped.
+- Entry by entry: small robots, as each column takes up to 26 rollouts.
+- Faulty policies: some parameters or states are plain numbers, a stated derivative is 8 % off, or the policy has a
+  memory. The loss or the policy is piecewise constant with steps from 1e-5 to 0.1. The policy switches at a value of
+  one state that the first step passes, or at 3 beyond the start, which is not a fault.
 """
 
 import dataclasses
@@ -26,19 +26,19 @@ from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.motion.policy import ParametricPolicy
 
 COUNT = 300
-FLOATING = ("solo12.urdf", "go2.urdf", "bolt.urdf")  # nothing but spheres touches
+FLOATING = ("solo12.urdf", "go2.urdf", "bolt.urdf")  # only spheres are in contact
 FIXED = ("z1.urdf", "xarm7.urdf", "finger_edu.urdf", "so100.urdf", "panda.urdf")
 SMALL = ("pendulum.urdf", "cart_pole.urdf", "double_pendulum.urdf", "acrobot.xml")
 SCALES = (1e-12, 1e-8, 1e-4, 1.0, 1e8)
 FAULTS = ("detached parameter", "detached state", "wrong by hand", "memory", "loss in steps", "policy in steps")
 SWITCHES = ("switch in steps", "switch far away")
 KNOTS = 100
-PLANTED = 3  # in each plan
+PLANTED = 3  # errors in each plan
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """What `certify_rollout` is called with."""
+    """The arguments of `certify_rollout`."""
 
     model: dd.Model
     x0: np.ndarray
@@ -52,7 +52,7 @@ class Plan:
 
 
 def weighted(x0, weight, scale, h):
-    """A loss of the whole motion and of the inputs."""
+    """Return a loss of the whole motion and the inputs."""
 
     def loss(xs, us):
         return scale * (h * ((xs - x0) ** 2 @ weight).sum() + (xs[-1] - x0) @ weight + 1e-3 * (us**2).sum())
@@ -61,7 +61,7 @@ def weighted(x0, weight, scale, h):
 
 
 def feedback(random, nu, x0):
-    """u = tanh of a random gain, and its parameters (nu nx,)."""
+    """Return the policy u = 2 tanh(K (x - x0) / 2), with random K (nu nx,) as its parameters."""
     gains = 0.3 * random.standard_normal((nu, len(x0)))
 
     def policy(x, t, p):
@@ -78,7 +78,7 @@ def some_parameters(model, random, touching):
 
 
 def large_plan(random):
-    """Of a robot from elsewhere; half of those that stand on a floating base touch the ground."""
+    """Return a plan of a robot of example-robot-data, which in some cases has a floating base and ground contact."""
     floats = random.uniform() < 0.6
     name = str(random.choice(FLOATING if floats else FIXED))
     touching = floats and random.uniform() < 0.7
@@ -101,7 +101,7 @@ def large_plan(random):
 
 
 def small_plan(random):
-    """Of a model from here, over 10 to 40 steps."""
+    """Return a plan of a model of this repository over 10 to 40 steps."""
     model = dd.load_model(MODELS / str(random.choice(SMALL)), time_step=float(random.choice([0.005, 0.01, 0.02])))
     x0, count = 0.5 * random.standard_normal(model.nx), int(random.integers(10, 40))
     scale = float(random.choice(SCALES))
@@ -113,7 +113,7 @@ def small_plan(random):
 
 
 def planted(certificate, model, random):
-    """(what, gradient) with an error that matters each, in the parts that the gradient has."""
+    """Yield (kind of error, gradient), with one significant error in each part of the gradient."""
     g = certificate.gradient
     parts = {
         "positions": ("by_x0", slice(0, model.nq)),
@@ -148,7 +148,7 @@ def planted(certificate, model, random):
 
 
 def wrong_plan(plan, fault, random):
-    """The plan with a fault in its policy, or a staircase."""
+    """Return the plan with a fault in its policy, or with a piecewise constant loss or policy."""
     nu, nx, x0 = plan.model.nu, plan.model.nx, plan.x0
     gains = random.uniform(0.05, 0.2, (nu, nx)) * random.choice([-1, 1], (nu, nx))
     column = int(random.integers(nx))
@@ -190,7 +190,7 @@ def wrong_plan(plan, fault, random):
 
 
 def by_hand(x, p, d, values, column):
-    """The derivative of u = values d stated by hand, by one state 8 % off."""
+    """Return u = values d with a stated derivative, which is 8 % off with respect to one state."""
     z = np.concatenate([x, p])
     if not any(isinstance(entry, AutoDiffXd) for entry in z):
         return values @ d

@@ -1,10 +1,10 @@
-"""How often a certificate's truth in continuous time is the truth, and what it says of gradients that are wrong.
+"""Test the slopes in continuous time that certificates measure, and their verdicts on wrong gradients.
 
-Random motions through impact (`impact_cases`): bounces, tosses, slides, rolls, rods, hits of two bodies, walls,
-pendulums. Their slopes are measured by Drake alone (`impact_truth`): its own continuous plant, error-controlled
-Runge-Kutta 3 of accuracy 1e-8, central differences of three widths that agree to 0.1 %. The gradient in continuous time
-is right where it is within 1 % of these. Errors are planted in it: 5 % more, negated, left out, and the gradient of the
-discrete steps in its place.
+The motions are random motions with impacts (`impact_cases`): bounces, tosses, slides, rolls, rods, collisions of two
+bodies, walls, pendulums. Drake alone measures their true slopes (`impact_truth`): its own continuous plant,
+error-controlled Runge-Kutta 3 of accuracy 1e-8, central differences of three widths that agree to 0.1 %. The gradient
+in continuous time is right if it is within 1 % of these slopes. The planted errors are 5 % more, negated, zeroed, and
+the gradient of the discrete steps.
 """
 
 import dataclasses
@@ -23,14 +23,14 @@ from drake_diff.model.parameters import select
 
 COUNT = 64
 SECONDS = 30.0
-SAME = 3e-3  # of a slope: what two differences over several widths may be apart
+SAME = 3e-3  # allowed relative difference between two slopes over several widths
 RIGHT = 1e-2
-LEAST = 1e-3  # a slope in SI units that is smaller is zero to both
+LEAST = 1e-3  # a smaller slope in SI units counts as zero in both
 PLANTED = {"5 % more": 1.05, "negated": -1.0, "left out": 0.0}
 
 
 def gradient(one, model, us, method):
-    """By the first state, in `model.state_names`; None where the toolkit refuses the motion."""
+    """Return the gradient of a rollout's loss, or None if the toolkit refuses the motion."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -41,7 +41,7 @@ def gradient(one, model, us, method):
 
 
 def told(one, model, us, g, columns):
-    """The certificate's truth beside a gradient."""
+    """Return the slopes in continuous time that a certificate compares with a gradient."""
     moved = Displaced(model, np.array(one.x0), us, one.loss, None, select(model, ()), "continuous")
     return truth_of(moved, g, SECONDS, columns)
 

@@ -1,14 +1,14 @@
-"""How often a gradient in continuous time is called undefined where the loss has a slope, and given where it has none.
+"""Count gradients in continuous time that are reported as undefined although a slope exists, and the converse.
 
-The motions are hard by design: a ball that just touches the ground before the end, or not; one that passes another by
-1e-5 to 1e-1 m, or grazes it; a rod and a box that fall flat, or nearly so; boxes that tumble; balls that bounce many
-times; a slide that comes to rest about at the end; two balls that hit each other head on or aside; a rolling ball whose
-friction turns round. The truth is Drake's own continuous plant by error-controlled Runge-Kutta 3 (impact_truth.py): a
-slope exists where those over +-1e-2, 1e-3 and 1e-4 agree to 0.1 %. Where the last two agree and the first does not, a
-derivative within 1 % is right, and so is `undefined`.
+The motions are difficult by design: a ball that may touch the ground just before the end, or pass another ball by 1e-5
+to 1e-1 m or graze it; a rod and a box that fall flat or nearly flat. Boxes tumble, balls bounce many times, a slide
+comes to rest close to the end, two balls collide centrally or off-centre, and the friction of a rolling ball reverses.
+The truth is Drake's own continuous plant with error-controlled Runge-Kutta 3 (impact_truth.py). A slope exists if the
+slopes over +-1e-2, 1e-3 and 1e-4 agree to 0.1 %. If only the last two agree, both a derivative within 1 % and
+`undefined` are right.
 
-Smoothed slopes are those of a ball that touches the ground at the end, or not. Their truth is an integral over the
-motions event by event of helpers.bounces, which have no step.
+Smoothed slopes are those of a ball that may touch the ground at the end. Their truth is an integral over the motions
+event by event of helpers.bounces, which have no time step.
 """
 
 import warnings
@@ -28,17 +28,17 @@ from drake_diff.exceptions import DrakeDiffError, GradientError, GradientWarning
 from drake_diff.motion.gradient import RolloutGradient
 
 COUNT = 64
-RIGHT = 0.01  # part of the slope
-SMALL = 1e-5  # [of the loss by the unit of a column] what differences cannot tell from 0
-TINY = 1e-3  # [the same] what the accuracy may make of many bounces
-SMOOTHED, SAMPLES = 2, 100  # every so many cases there is one of a smoothed slope
+RIGHT = 0.01  # relative to the slope
+SMALL = 1e-5  # [loss per unit of a column] slope that differences cannot distinguish from 0
+TINY = 1e-3  # [loss per unit of a column] error of the integration over many bounces
+SMOOTHED, SAMPLES = 2, 100  # every second case also has a smoothed slope
 QUANTILE = 1.96
-INTEGRAL = 1e-4  # of a smoothed slope: what the trapezoid rule leaves of it where the loss has kinks
-NODES = np.linspace(-6, 6, 801)  # standard deviations, of the integral
+INTEGRAL = 1e-4  # error of the trapezoidal rule relative to a smoothed slope, if the loss has kinks
+NODES = np.linspace(-6, 6, 801)  # nodes of the integral [standard deviations]
 
 
 def material(random, mass, *, friction=None):
-    """Of each side of a contact; a pair is half as stiff."""
+    """Return the material of each side of a contact. A pair is half as stiff."""
     return Material(
         random.uniform(0.1, 0.9) if friction is None else friction,
         2 * mass * 10 ** random.uniform(3, 4.7),
@@ -62,7 +62,7 @@ def law_of(random):
 
 
 def softer_law_of(random):
-    """Of what bounces or tumbles for long, whose truth under sap takes minutes."""
+    """Return a law for long bouncing or tumbling, whose truth with sap takes minutes."""
     return str(random.choice(["lagged", "similar"]))
 
 
@@ -71,7 +71,7 @@ def gap_of(random):
 
 
 def touch(random):
-    """It touches `gap` [m] too early or too late."""
+    """Return a ball that is a random gap [m] above or below its contact at the end."""
     mass = 10 ** random.uniform(-1, 0.5)
     ball = Mover("ball", mass, (0.1,), 0.1, ((0, 0, 0),), material(random, mass), "xz")
     duration, vz = INTERVAL * int(random.integers(15, 60)), random.uniform(-2, 2)
@@ -83,7 +83,7 @@ def touch(random):
 
 
 def passing(random):
-    """By a ball that is fixed."""
+    """Return a ball that passes or hits a fixed ball."""
     mass = 10 ** random.uniform(-1, 0.5)
     own = material(random, mass)
     ball = Mover("ball", mass, (0.1,), 0.1, ((0, 0, 0),), own, "xz")
@@ -101,7 +101,7 @@ def many(random):
 
 
 def slide(random):
-    """It comes to rest some way before or after the end, or just there."""
+    """Return a block that comes to rest before, after or at the end."""
     mass = 10 ** random.uniform(-1, 0.5)
     own = material(random, mass)
     block = Mover("block", mass, (0.1,), 0.1, ((0, 0, 0),), own, "xz")
@@ -112,7 +112,7 @@ def slide(random):
 
 
 def flat(random):
-    """A rod whose ends strike nearly at once: which of them does so first changes."""
+    """Return a rod whose ends strike at nearly the same time, so that their order can change."""
     mass = 10 ** random.uniform(-0.5, 0.5)
     ends = ((-0.2, 0.0, 0.0), (0.2, 0.0, 0.0))
     rod = Mover("rod", mass, (0.4, 0.04, 0.04), 0.02, ends, material(random, mass))
@@ -124,7 +124,7 @@ def flat(random):
 
 
 def tumble(random):
-    """The box of ORACLES D01 and others, under gravity of the moon to the earth."""
+    """Return a box, that of ORACLES D01 and others, with gravity from that of the Moon to that of the Earth."""
     mass, side = 10 ** random.uniform(-1, 0), random.uniform(0.08, 0.15)
     own = material(random, mass, friction=0.5)
     far = 0.49 * side
@@ -139,7 +139,7 @@ def tumble(random):
 
 
 def hit(random):
-    """Head on, aside, or just past each other."""
+    """Return two balls that collide centrally or off-centre, or just pass each other."""
     masses = 10 ** random.uniform(-0.5, 0.5, 2)
     own = material(random, float(min(masses)))
     balls = tuple(
@@ -154,7 +154,7 @@ def hit(random):
 
 
 def roll(random):
-    """With a spin that turns its way round, or nearly."""
+    """Return a rolling ball whose spin reverses its motion, or nearly reverses it."""
     mass = 10 ** random.uniform(-0.5, 0.5)
     own = material(random, mass)
     ball = Mover("ball", mass, (0.1,), 0.1, ((0, 0, 0),), own)
@@ -169,7 +169,7 @@ KINDS = (touch, passing, many, slide, flat, tumble, hit, roll)
 
 
 def slopes_of(one: Case) -> list[Slopes]:
-    """The truth of its columns, more accurately where its own error may be what does not agree."""
+    """Return the true slopes of the columns, with a finer integration if its error may cause a disagreement."""
     motion, found = Motion(one), []
     for column in one.columns:
         each = Slopes(column, 1.0, tuple(slope(one, motion, column, width) for width in WIDTHS))
@@ -182,7 +182,7 @@ def slopes_of(one: Case) -> list[Slopes]:
 
 
 def judged(one: Case) -> tuple[RolloutGradient, set[int]]:
-    """The gradient, and which of the case's columns are undefined; each is warned of."""
+    """Return the gradient and the undefined columns of the case, and check that there is a warning."""
     model = one.model()
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always", GradientWarning)
@@ -194,7 +194,7 @@ def judged(one: Case) -> tuple[RolloutGradient, set[int]]:
 
 
 def smoothed(random, folder):
-    """Whether the 95 % interval of a smoothed slope covers the truth; None where there is none."""
+    """Return whether the 95 % interval of a smoothed slope covers the truth, or None without such a slope."""
     approximation = str(random.choice(["lagged", "sap"]))
     ball = Bounce(
         10 ** random.uniform(3, 4.5),

@@ -1,8 +1,8 @@
-"""`verify` against a forger who may edit everything in a run directory and hash it again.
+"""Test `verify` against a forger who may edit everything in a run directory and update its hashes.
 
-The runs are small ones of several kinds, some of them failures. A forger picks one, changes something by chance, and
-seals the directory as a true one is sealed: the trace carries the changed record, and every hash is renewed. A forgery
-is accepted where `verify` says "holds" and does not name what was changed as not checked or as rounding.
+The runs are small and of several kinds, some of them failures. A forger chooses a run, makes a random change, and seals
+the directory like a genuine one: the trace contains the changed record, and all hashes are updated. A forgery is
+accepted if `verify` reports that the run holds, without the change among the unchecked values or as rounding.
 """
 
 import copy
@@ -23,7 +23,7 @@ from trust import Figure
 import drake_diff as dd
 
 COUNT = 1000
-# By the words of `Verification.unchecked`: what nothing can make again, and what was asked.
+# Terms of `Verification.unchecked` for values that cannot be reproduced, and for the problem itself.
 UNCHECKED = ("wall_clock", "provenance", "name")
 ASKED = ("problem.", "model.", "inputs.search.")
 EFFORT = dd.QuadraticCost(R=[[1.0]])
@@ -35,7 +35,7 @@ def pendulum(**changes):
 
 
 def sliding(place):
-    """A block that is thrown onto a floor and slides to `place`, at a speed that is found."""
+    """Return a problem of a block that is thrown onto a floor with a variable speed and slides to `place`."""
     model = dd.load_model(MODELS / "sliding_block.sdf", time_step=0.01)
     x0, goal, free = np.zeros(13), np.full(13, np.nan), np.zeros(13, dtype=bool)
     x0[[0, 6, 10]], goal[4], free[10] = (1, 0.1, 1), place, True
@@ -44,7 +44,7 @@ def sliding(place):
 
 
 def save_runs(folder, rng):
-    """Successes and failures, smooth and in contact, by all three methods, with goals by chance."""
+    """Save successes and failures, smooth and in contact, of all three methods, with random goals."""
     goal = float(rng.uniform(0.3, 1.5))
     weak = dd.Bounds(u_lower=[-2], u_upper=[2])
     tasks = {
@@ -61,7 +61,7 @@ def save_runs(folder, rng):
 
 
 def leaves(value, path=()):
-    """(path, value) of every value of a record that has no others in it."""
+    """Yield (path, value) for each value of a record that is not a dictionary or a list."""
     parts = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     if not isinstance(value, (dict, list)):
         yield path, value
@@ -70,7 +70,7 @@ def leaves(value, path=()):
 
 
 def changed(value, rng):
-    """Another value of the same type: a number by 0.1 % to 100 % or by a small step, a text by a word."""
+    """Return another value of the same type: a number changed by 0.1 % to 100 % or a small step, a text by a word."""
     if isinstance(value, bool):
         return not value
     if isinstance(value, int):
@@ -82,7 +82,7 @@ def changed(value, rng):
 
 
 def edit_leaf(folder, fields, rng):
-    """One value of the record, anywhere but in its list of files, which is made again."""
+    """Change one value of the record, except in its list of files, which is written again."""
     found = [(p, v) for p, v in leaves(fields) if p[0] not in ("files", "record_sha256")]
     path, value = found[rng.integers(len(found))]
     part = fields
@@ -93,7 +93,7 @@ def edit_leaf(folder, fields, rng):
 
 
 def delete_part(folder, fields, rng):
-    """An entry of a list, or a whole list, of what was found."""
+    """Delete an entry of a list of results, or the whole list."""
     lists = ("metrics", "invariants", "events", "replays", "failures", "parameters")
     places = [(fields, name) for name in lists if fields[name]]
     places += [(fields["gradient"], name) for name in ("certificates", "columns") if fields["gradient"][name]]
@@ -106,7 +106,7 @@ def delete_part(folder, fields, rng):
 
 
 def claim_success(folder, fields, rng):
-    """A failure told as a success; of a success a better one."""
+    """Report a failure as a success, or a success as a better success."""
     how = rng.choice(["delete", "zero", "tolerance"])
     tolerated = [m for m in fields["metrics"] if m["tolerance"] is not None]
     failing = [m for m in tolerated if m["verdict"] != "pass"] or tolerated[:1]
@@ -125,13 +125,13 @@ def claim_success(folder, fields, rng):
     fields.update(verdict="pass", sentence="the solver converged, and every measure that was taken again holds")
     fields["events"] = [e for e in fields["events"] if e["kind"] != "failure"]
     fields["failures"] = []
-    if rng.random() < 0.3:  # a better goal error beside it, which no failure had
+    if rng.random() < 0.3:  # also a goal error of 0, which no failure has
         fields["metrics"][0]["value"] = 0.0
     return f"success, {how}"
 
 
 def edit_channel(folder, fields, rng):
-    """One byte that matters of one message of the trace: the message is decoded first, so that it stays one."""
+    """Change one byte in the decoded data of one message of the trace, so that it remains a message."""
     path = folder / "trace.mcap"
     count = sum(1 for _ in NonSeekingReader(BytesIO(path.read_bytes())).iter_messages())
     chosen, told = int(rng.integers(count)), []
@@ -149,7 +149,7 @@ def edit_channel(folder, fields, rng):
 
 
 def edit_trace(folder, fields, rng):
-    """A message left out, metadata, or the configuration."""
+    """Drop a message of the trace, or change its metadata or its configuration."""
     how = rng.choice(["drop", "status", "configuration"])
     changes = {
         "drop": {"drop": int(rng.integers(40))},
@@ -161,7 +161,7 @@ def edit_trace(folder, fields, rng):
 
 
 def change_page(folder, fields, rng):
-    """A page of another run, or other words in it."""
+    """Replace a page by that of another run, or change a letter in it."""
     name = rng.choice(["report.html", "replay.html"])
     page = folder / name
     if rng.random() < 0.5:
@@ -175,7 +175,7 @@ def change_page(folder, fields, rng):
 
 
 def edit_plan(folder, fields, rng):
-    """A number of the plan, or the plan of another run, and the trace as it was."""
+    """Change a number of the plan, and leave the trace as it was."""
     with np.load(folder / "plan.npz") as file:
         arrays = {name: np.array(file[name]) for name in file.files}
     name = rng.choice([name for name, values in arrays.items() if values.size])
@@ -189,19 +189,19 @@ def add_file(folder, fields, rng):
     return "a file more"
 
 
-# How often each is tried.
+# Relative frequency of each forgery.
 FORGERIES = {edit_leaf: 9, delete_part: 2, claim_success: 3, edit_channel: 3, edit_trace: 1, change_page: 2}
 FORGERIES |= {edit_plan: 1, add_file: 1}
 
 
-EDITS = ("edit_leaf", "edit_channel")  # some are of what nothing can make again, or within rounding
+EDITS = ("edit_leaf", "edit_channel")  # some concern values that cannot be reproduced, or are within rounding
 
 
 def is_told(what, found):
-    """Whether an accepted change, the only one, is named: as not checked, as what was asked, or as rounding."""
+    """Return whether the only change, which was accepted, is reported as unchecked, as the problem, or as rounding."""
     listed = " ".join(found.unchecked)
     named = what.startswith((*UNCHECKED, *ASKED)) and what.split(".")[0] in listed
-    return named or (what == "a file more" and "nothing that drake_diff writes" in listed) or bool(found.rounded)
+    return named or (what == "a file more" and "drake_diff does not write such a file" in listed) or bool(found.rounded)
 
 
 def measure(seed, count):

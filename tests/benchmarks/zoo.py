@@ -1,15 +1,15 @@
-"""How many robot files end in a verified plan, first try: `drake-diff plan FILE` with default arguments.
+"""Count robot files with a verified plan at the first attempt: `drake-diff plan FILE` with default arguments.
 
     pip install -e '.[test]'
-    pip download --no-deps -d wheels dm_control underactuated     # optional: their models are counted where they are
+    pip download --no-deps -d wheels dm_control underactuated     # optional: counts their models
     python tests/benchmarks/zoo.py [--only PATTERN] [--count N] [--seed 0] [--wheels wheels] [--out zoo.json]
 
-The files: all URDFs of example-robot-data, the models that come with Drake, MuJoCo and drake_diff, and those in the
-wheels (of dm_control its suite). Each runs in a process of its own with 60 s of one core (the verification included)
-and 8 GiB of memory. What counts is what Drake's own parser takes and can move, by Drake's word, not by ours, and what
-drake_diff reads where Drake does not. Single bodies without a joint (boxes, walls) count apart, drones do not. What is
-in --out already is not run again, so that a run that was ended goes on; --markdown writes its section
-of docs/measured.md from it.
+The files are all URDFs of example-robot-data, the models that come with Drake, MuJoCo and drake_diff, and those in the
+wheels (of dm_control, its suite). Each file runs in a separate process with 60 s of one core (including verification)
+and 8 GiB of memory. A file counts if Drake's own parser accepts it and Drake reports that something can move, or if
+drake_diff reads it and Drake does not. Single bodies without a joint (boxes, walls), except drones, are counted
+separately. Results that are already in --out are not run again, so that an interrupted run can be continued. --markdown
+writes a section of docs/measured.md from them.
 """
 
 import argparse
@@ -43,8 +43,8 @@ SOURCES = {
     "dm_control": (("dm_control",), (".xml",)),
     "underactuated": (("underactuated",), FORMATS),
 }
-DRONES = ("quadrotor", "iris")  # in the names of files: single bodies that a reasonable user wants to fly
-# What Drake alone says of a file: whether its parser takes it, and how many velocities its joints and free bodies have.
+DRONES = ("quadrotor", "iris")  # in the names of files: single bodies that a user may want to fly
+# Check a file with Drake alone: whether its parser accepts it, and the numbers of velocities of joints and free bodies.
 ALONE = """
 import re
 import sys
@@ -72,7 +72,7 @@ def installed(package: str) -> list[Path]:
 
 
 def files(wheels: Path | None, unpacked: Path) -> Iterator[tuple[str, Path]]:
-    """(source, file) of every model."""
+    """Yield (source, file) of each model."""
     for source, (packages, endings) in SOURCES.items():
         found = [path for package in packages for path in installed(package)]
         if not found and wheels:
@@ -97,14 +97,14 @@ def limited() -> None:
 
 
 def alone(path: Path) -> tuple[bool, int, int]:
-    """Whether Drake's parser takes the file, and the numbers of velocities of its joints and of its free bodies."""
+    """Return whether Drake's parser accepts the file, and the numbers of velocities of joints and free bodies."""
     done = subprocess.run([sys.executable, "-c", ALONE, str(path)], capture_output=True, text=True, errors="replace")
     words = next((line.split() for line in done.stdout.splitlines() if line.startswith("TAKES")), None)
     return (True, int(words[1]), int(words[2])) if words and done.returncode == 0 else (False, 0, 0)
 
 
 def attempt(path: Path, seed: int) -> dict[str, object]:
-    """One command on one file: how it ended, what was mended, and the processor time it took."""
+    """Run the command on one file, and return its outcome, the repairs, and the processor time."""
     takes, of_joints, free = alone(path)
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     with tempfile.TemporaryDirectory() as folder:
@@ -147,17 +147,17 @@ def attempt(path: Path, seed: int) -> dict[str, object]:
 
 
 def counts(name: str, row: dict[str, object]) -> str:
-    """A "robot", a "thing" (a single body without a joint), or why it does not count: "refused", "still"."""
+    """Return "robot", "thing" (a single body without a joint), or why a file does not count: "refused", "still"."""
     if not row["drake"] and not row["loaded"]:
         return "refused"
     if row["drake"] and not row["joints"] and not row["free"]:
         return "still"
-    single = not row["joints"] if row["drake"] else row["flies"]  # where Drake does not read it, by what was told
+    single = not row["joints"] if row["drake"] else row["flies"]  # by the output if Drake does not read it
     return "thing" if single and not any(word in name for word in DRONES) else "robot"
 
 
 def told(rows: dict[str, dict[str, object]]) -> list[str]:
-    """The figures, a line each."""
+    """Return the figures, one per line."""
     kinds = {name: counts(name, row) for name, row in rows.items()}
     taken = {name: row for name, row in rows.items() if kinds[name] == "robot"}
     things = [row for name, row in rows.items() if kinds[name] == "thing"]
@@ -165,8 +165,8 @@ def told(rows: dict[str, dict[str, object]]) -> list[str]:
     share = len(good) / len(taken) if taken else 0.0
     number = Counter(kinds.values())
     lines = [
-        f"{len(rows)} files: {number['robot']} robots; {number['thing']} single bodies without a joint; "
-        f"{number['still']} in which nothing can move; {number['refused']} that neither Drake nor drake_diff reads",
+        f"{len(rows)} files: {number['robot']} robots, {number['thing']} single bodies without a joint, "
+        f"{number['still']} in which nothing can move, {number['refused']} that neither Drake nor drake_diff reads",
         f"robots with a verified plan: {len(good)} of {len(taken)}, {100 * share:.1f} %, target {100 * AIM:g} %"
         + ("" if share >= AIM else ": MISSED"),
         f"of these robots {sum(bool(r['stands']) for r in good)} stand on their feet, "
@@ -185,7 +185,7 @@ def told(rows: dict[str, dict[str, object]]) -> list[str]:
 
 
 def markdown(rows: dict[str, dict[str, object]], seed: int) -> str:
-    """The section of docs/measured.md."""
+    """Return the section of docs/measured.md."""
     begin = told(rows)
     python = f"{platform.python_implementation()} {platform.python_version()}"
     mark = "at commit {commit}, {date}".format(**marked())

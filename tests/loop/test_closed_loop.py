@@ -15,15 +15,12 @@ from drake_diff.exceptions import InputError
 from drake_diff.loop.run import (
     Actuator,
     Fallback,
-    Hold,
     Loop,
-    OpenLoop,
     Predictor,
     Push,
     Recorded,
     Sensor,
     closed_loop,
-    name_of,
     replayed,
 )
 from drake_diff.model.tangent import tangent_space
@@ -375,15 +372,3 @@ def test_a_run_that_broke_off_breaks_off_again(cart):
         endings = [(r.ended, r.failed_part, r.controller_error, r.events, r.controller_status) for r in (made, run)]
         assert endings[0] == endings[1]
         assert run.ended
-
-
-def test_parts_say_what_they_are(cart):
-    assert repr(OpenLoop([[1.0], [2.0]], 0.1)) == "OpenLoop of 0.2 s in steps of 0.1 s"
-    assert repr(Predictor(cart, 3)) == "Predictor of cart: samples 3 steps old"
-    assert repr(Hold()) == "Hold: the last sample"
-    assert name_of(Broken("call")) == "Broken"
-    assert name_of(gain(1, 1)) == "gain.<locals>.<lambda>"
-    run = closed_loop(cart, OpenLoop([[1.0]], 0.1), [0.0, 0.0], 2)
-    assert repr(run).startswith(
-        "closed loop of cart under OpenLoop of 0.1 s in steps of 0.1 s\n  2 steps of the controller"
-    )

@@ -179,9 +179,6 @@ def test_a_model_with_other_joints_has_none():
     assert "rpy_floating" in why.reason
 
 
-# ------------------------------------------------------------------------------ solves without expressions
-
-
 def test_a_branch_goes_the_other_way_and_says_so():
     motion = move(10, Dynamics(lambda x, u: [x[1], u[0] if u[0] > -1e9 else 0.0 * u[0]], 2, 1))
     assert motion.options["derivatives"].startswith("first derivatives, limited-memory Hessian: dynamics: TypeError")

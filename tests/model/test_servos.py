@@ -7,6 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from helpers.models import MODELS
 from pydrake.multibody.tree import PdControllerGains
 
 import drake_diff as dd
@@ -232,8 +233,7 @@ def test_servos_that_drake_has_not_are_refused_or_told(tmp_path, actuator, says)
 
 def test_a_servo_is_planned_for_with_a_free_horizon():
     """Collocation does not support PD control, so that "auto" must choose shooting."""
-    with pytest.warns(ModelWarning, match="commanded positions"):
-        model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.02, inputs="position", gains=(20, 2))
+    model = load(MODELS / "pendulum.urdf", time_step=0.02, inputs="position", gains=(20, 2))
     cost = dd.QuadraticCost(R=[[0.1]])
     problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=40, horizon=(0.5, 1.5), running_cost=cost)
     solution = dd.solve(problem, restarts=0)

@@ -21,7 +21,6 @@ from drake_diff.optimize.problem.goals import USED, Goal, GoalConstraint, name_o
 MIDDLE = 0.25  # part at either end of a swing in which its clearance is not constrained
 KEPT = 1000  # number of states with cached positions of the feet
 OF_FRICTION = 0.7  # part of the possible friction that a guess uses
-Phases = tuple[tuple[int, tuple[str, ...]], ...]
 # Scales of a plan's deviation from its guess: of quaternions, [m], [rad], [rad/s or m/s] of the base, [rad/s], and of
 # inputs relative to the guess's largest; then the weight of the last state relative to a second of motion.
 TURN, PLACE, JOINT, BASE_SPEED, JOINT_SPEED, EFFORT, LAST_STATE = 0.3, 0.2, 1.0, 3.0, 10.0, 1.5, 10.0
@@ -52,7 +51,7 @@ class ContactSchedule(Goal):
         (52, ('left', 'right'))
     """
 
-    phases: Any  # becomes Phases
+    phases: Any  # becomes tuple[tuple[int, tuple[str, ...]], ...]
     _: KW_ONLY
     feet: Any = None  # becomes names
     clearance: float = 5e-3
