@@ -380,8 +380,8 @@ class MovingTree:
     def body_force(self, force: BodyForce) -> Any:
         """Return the generalized force (nv,) of a BodyForce of 1 N, in a tree without coupling."""
         R, p, dofs = self.body(force.body)
-        axis = R @ (ca.DM(list(force.direction)) / np.linalg.norm(force.direction))
-        wrench = ca.vertcat(force.moment_ratio * axis + ca.cross(p + R @ ca.DM(list(force.point)), axis), axis)
+        axis = R @ (ca.DM(np.asarray(force.direction) / np.linalg.norm(force.direction)))
+        wrench = ca.vertcat(force.moment_ratio * axis + ca.cross(p + R @ ca.DM(np.asarray(force.point)), axis), axis)
         column = ca.SX(self.nv, 1)
         column[dofs] = self.S[:, dofs].T @ wrench
         return column
