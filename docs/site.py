@@ -10,8 +10,29 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "drake_diff"
 NAME = re.compile(r"^from \.([\w.]+) import (\w+) as \w+$", re.MULTILINE)
+# The packages in the order of use.
+USE = [
+    "model",
+    "planning",
+    "derivatives",
+    "motion",
+    "certificates",
+    "optimize",
+    "runs",
+    "logs",
+    "trials",
+    "loop",
+    "engines",
+    "comparison",
+    "export",
+]
 NOTEBOOKS, GALLERY = ROOT / "docs/notebooks", ROOT / "docs/gallery"
 TOP = {"changelog.md": "CHANGELOG.md", "contributing.md": "CONTRIBUTING.md"}
+
+
+def by_use(path: str) -> int:
+    """Return the rank of a name "drake_diff.PACKAGE..." in the order of use."""
+    return next((i for i, package in enumerate(USE) if f"drake_diff.{package}." in f"{path}."), len(USE))
 
 
 def names_of(package: str) -> dict[str, str]:
@@ -24,9 +45,9 @@ def names_of(package: str) -> dict[str, str]:
 
 def reference() -> dict[str, str]:
     """Return the text of each reference page: one for the names of `dd`, one for each package with further names."""
-    root = names_of("")
+    root = dict(sorted(names_of("").items(), key=lambda item: by_use(item[1])))
     pages = {}
-    for stub in sorted(PACKAGE.glob("*/__init__.pyi")):
+    for stub in sorted(PACKAGE.glob("*/__init__.pyi"), key=lambda stub: by_use(f"drake_diff.{stub.parent.name}")):
         package = stub.parent.name
         names = {name: where for name, where in names_of(package).items() if root.get(name) != where}
         if names:
