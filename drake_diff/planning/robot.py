@@ -292,14 +292,13 @@ def _placed(draft: _Draft, random: np.random.Generator) -> Robot:
         return _placed(draft, random)
     if posture.always:
         pairs = _few(map(" and ".join, sorted(posture.always)))
-        repairs.append(f"{pairs} overlap in every posture, which is not looked at")
+        repairs.append(f"{pairs} overlap in every posture and are not checked")
     if (driven or flies) and touches:
         model = apart
-        seen = "" if shapes is None else ": overlap is looked for along the plan"
-        repairs.append(f"contact is left out of its steps (contact=False){seen}")
+        seen = "" if shapes is None else ", and overlap is checked along the plan"
+        repairs.append(f"contact is disabled in its time steps (contact=False){seen}")
     if np.any(np.abs(posture.q - model.default_state[: model.nq]) > 1e-9):
-        where = "inside their limits, nothing overlaps and its motors hold it"
-        repairs.append(f"its start is moved to where joints are {where}")
+        repairs.append("the start is moved to a posture within joint limits, without overlap, that the motors can hold")
     other = apart if model is not apart else None
     return Robot(model, shapes, posture.q, lower, upper, tuple(repairs), driven, posture.always, apart=other)
 

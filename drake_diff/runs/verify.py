@@ -61,13 +61,13 @@ UNREAD = "hashes match, contents not checked"
 WAITED = 60.0  # [s] default time limit for reproducing a run
 HASHED = ("schema_version", "files", "record_sha256")  # record fields that `compare_fields` does not compare
 OF_FUNCTIONS = (
-    "all that rests on the functions: only the plan's first and last state and its bounds were compared with the "
-    "metrics, and the plan with the trace"
+    "all values that depend on the functions: only the plan's first and last state and its bounds were compared with "
+    "the metrics, and the plan with the trace"
 )
 NOT_RERUN = {
     "comparison": "the engines were not run again",
     "robustness": "the trials were not run again",
-    "rollout": "a loss is a function, which no record holds",
+    "rollout": "a loss is a function, which records do not contain",
     "panel": "no trial was evaluated again: their function is not in the directory",
     "trial": "it was not evaluated again: its function is not in the directory",
 }
@@ -129,10 +129,10 @@ class Verification(ShowsItsRepr):
     def sentence(self) -> str:
         """The reason for the verdict."""
         if self.verdict == "holds":
-            return f"run again, all {self.checked} values came out" + (" but for rounding" if self.rounded else "")
+            return f"reproduced all {self.checked} values" + (", up to rounding" if self.rounded else "")
         if self.verdict == "intact":
-            why = "" if self.record is None else f": {NOT_RERUN.get(self.record.subject, 'nothing was made again')}"
-            rest = f"; {self.checked} values that follow from others came out again" if self.checked else ""
+            why = "" if self.record is None else f": {NOT_RERUN.get(self.record.subject, 'nothing was reproduced')}"
+            rest = f"; {self.checked} derived values were reproduced" if self.checked else ""
             return f"{UNREAD}{why}{rest}"
         return "; ".join(self.complaints or self.undecided)
 
@@ -165,7 +165,7 @@ class Verification(ShowsItsRepr):
     def __repr__(self) -> str:
         content = self.sentence if self.verdict in ("holds", "intact") else f"{len(self.complaints)} problems"
         if self.verdict == "undecided":
-            content = "what the verdict rests on could not be made again"
+            content = "the values that the verdict depends on could not be reproduced"
         return "\n  ".join((f"Verification of {self.directory}: {self.verdict}, {content}", *self.lines))
 
 
@@ -280,7 +280,7 @@ def _looked_at(folder: Path) -> Verification:
         return replace(result, unchecked=("all other contents, as the directory is damaged",))
     unsolved = record.subject in ("plan", "phases") and isinstance(record, PlanRecord) and record.solver is None
     if record.state == "incomplete" or unsolved:
-        return replace(result, undecided=(f"there is nothing to run again: {record.sentence}",))
+        return replace(result, undecided=(f"there is nothing to reproduce: {record.sentence}",))
     return result
 
 
@@ -317,7 +317,7 @@ def has_recordings(record: SealedRecord) -> bool:
 
 def _without_its_model(verification: Verification, record: SealedRecord, error: Exception) -> Verification:
     """Check the files of a run that cannot be reproduced against each other."""
-    content, folder = (f"not run again: {error}",), verification.directory
+    content, folder = (f"not reproduced: {error}",), verification.directory
     if not isinstance(record, PlanRecord) or record.subject not in ("plan", "phases"):
         return replace(verification, undecided=content, unchecked=("everything but the hashes",))
     try:
@@ -461,18 +461,16 @@ def _told_of_a_solve(
     unchecked: list[str],
 ) -> Verification:
     """Derive the verdict from the differences and from what they depend on."""
-    undecided = [*again.undecided, *(f"the search was not run again: {why}" for why in again.unrepeated)]
+    undecided = [*again.undecided, *(f"the search was not repeated: {why}" for why in again.unrepeated)]
     if again.missing:
         unchecked.append(f"what rests on the search: {', '.join(again.missing)}")
     if again.apart > SAME_PLAN:
-        undecided.append(
-            f"the search, run again, ends at a plan that differs by {again.apart:.2g} of its largest number"
-        )
+        undecided.append(f"the repeated search ends at a plan that differs by {again.apart:.2g} of its largest number")
     differing = [d for item in compared for d in item.differing]
     rounds_otherwise = again.apart > 0 or any(d.allowed for d in differing)
     rounded = []
     if 0 < again.apart <= SAME_PLAN:
-        rounded.append(f"{PLAN}: the plan of the search, run again, differs by {again.apart:.2g} of its largest number")
+        rounded.append(f"{PLAN}: the plan of the repeated search differs by {again.apart:.2g} of its largest number")
     for d in differing:
         if is_below(d.key, again.missing) and d.file.endswith(SealedRecord.FILE):
             continue
@@ -485,7 +483,7 @@ def _told_of_a_solve(
     checked = sum(item.count for item in compared)
     if OF_RECOVERED in again.unrepeated and not problems:
         files = ", ".join(item.file for item in compared)
-        undecided.append(f"what holds: measured again from the plan, all {checked} other values of {files} came out")
+        undecided.append(f"without the search: all {checked} other values of {files} were reproduced from the plan")
     content = replace(verification, unchecked=tuple(unchecked), rounded=tuple(rounded), checked=checked)
     return _judged(content, problems, undecided)
 
@@ -526,7 +524,7 @@ def _other_versions(record: SealedRecord) -> tuple[str, ...]:
         used.append("numba")  # the motions are computed with numba if it is installed
     used = [n for n in used if n in was] if record.subject == "trial" else used  # a trial has the packages of its panel
     names = [n for n in used if was.get(n) != now.get(n)]
-    content = [f"recorded with {name} {was.get(name)}, run again with {now.get(name)}" for name in names]
+    content = [f"recorded with {name} {was.get(name)}, reproduced with {now.get(name)}" for name in names]
     if not record.schema_version.startswith(SAME_VALUES):
         content.append(f"recorded by schema {record.schema_version}, and converted to {SCHEMA_VERSION}")
     return tuple(content)

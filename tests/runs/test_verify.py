@@ -356,7 +356,7 @@ def test_another_version_of_drake_is_a_reason_for_doubt_not_a_lie(run, copy):
     record.model_copy(update=changes).write(copy)
     result = dd.verify(copy)
     assert (result.verdict, result.complaints) == ("undecided", ())
-    assert result.undecided[0].startswith("recorded with drake 1.40.0, run again with")
+    assert result.undecided[0].startswith("recorded with drake 1.40.0, reproduced with")
     assert any("metrics[cost].value: recorded 1, again" in line for line in result.undecided)
 
 
@@ -366,7 +366,7 @@ def test_a_search_that_a_time_limit_or_the_user_ended_cannot_be_found_again(solu
         dd.save(solution.told(status=status), tmp_path / status.value)
         result = dd.verify(tmp_path / status.value)
         assert (result.verdict, result.complaints) == ("undecided", ())
-        assert "the search was not run again" in str(result)
+        assert "the search was not repeated" in str(result)
 
 
 @each_row(
@@ -558,7 +558,7 @@ def test_a_model_from_a_diagram_cannot_be_run_again(solution, tmp_path):
     dd.save(swing_up(model), tmp_path / "run")
     result = dd.verify(tmp_path / "run")
     assert result.verdict == "undecided"
-    assert "not run again: the system is a user's own diagram" in str(result)
+    assert "not reproduced: the system is a user's own diagram" in str(result)
 
 
 @pytest.mark.slow
