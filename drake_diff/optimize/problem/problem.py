@@ -924,5 +924,5 @@ def _check_horizon(given: Any) -> tuple[float, float]:
         raise InputError("horizon", got=repr(given), expected="a number of seconds, or (lower, upper)")
     lower, upper = (seconds("horizon [s]", value) for value in pair)
     if lower > upper:
-        raise InputError("horizon", got=repr(given), expected="lower at most upper")
+        raise InputError("horizon", got=repr(given), expected="a lower bound of at most the upper bound")
     return lower, upper
