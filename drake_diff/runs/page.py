@@ -27,7 +27,7 @@ from drake_diff.runs.messages import asked_for
 CONTROLS = {
     "open loop": "Inputs alone (open loop)",
     "TVLQR": "With feedback (TVLQR)",
-    "TVLQR without offsets": "With its gains alone",
+    "TVLQR without offsets": "Feedback without offsets",
 }
 
 
