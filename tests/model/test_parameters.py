@@ -174,9 +174,6 @@ def ball_state(model):
     return x
 
 
-# ------------------------------------------------------------------------------------------- closed forms, no contact
-
-
 @pytest.mark.parametrize(("mass", "h", "u", "count"), [(2.0, 0.01, 3.0, 20), (0.3, 0.05, -1.1, 7)])
 def test_a_pushed_block_by_its_mass(write_urdf, mass, h, u, count):
     """v_N = v0 + N h u/m, x_N = x0 + N h v0 + h^2 N (N + 1) u / (2 m)."""
@@ -381,9 +378,6 @@ def test_a_projectile_by_gravity_and_the_time_step(load, h, count):
         assert g.parameter_sources == ("chain_rule",) * 3 + ("implicit",)
 
 
-# ---------------------------------------------------------------------------------------------- closed forms, contact
-
-
 def railed_ball(h, approximation, ours, ground, *, mass=1.0, axes=("z",), radius=0.1):
     """Return a plant with a ball on rails over the ground. `ours` and `ground` are arguments of contact_properties."""
     made = Plant(h, approximation)
@@ -497,8 +491,6 @@ def test_the_stopping_distance_by_friction(count, mu, h):
     assert g.by_parameters.sum() == pytest.approx(-G * h**2 * count * (count + 1) / 2, rel=2e-3)
 
 
-# ------------------------------------------------------------------------------------------------------------- names
-
 BY_DIFFERENCES = ("time_step", "kp", "kd", "friction", "dissipation", "relaxation_time", "hydroelastic_modulus")
 BY_CHAIN_RULE = ("model.gravity", "rail.spring_stiffness", "rail.spring_rest_length")
 
@@ -605,9 +597,6 @@ def test_bodies_with_a_slash_in_their_name_are_no_geometries_of_one_another():
         add_slide(made.plant, f"slide of {name}", made.plant.world_frame(), body, "x")
     d = dd.differentiate_step(made.model(), np.zeros(4), parameters=("arm.mass", "arm/link.mass"))
     assert d.parameters == ("arm.mass", "arm/link.mass")
-
-
-# ------------------------------------------------------------------------------------------------- values by mapping
 
 
 def same_motion(model, values, built, x, us):
@@ -729,9 +718,6 @@ def test_results_do_not_depend_on_the_order_of_parameters():
     assert together == pytest.approx(np.hstack([wanted[n] for n in names]), rel=1e-7, abs=1e-9)  # finite differences
 
 
-# --------------------------------------------------------------------------------------------- certificates, errors
-
-
 def arm_point(load):
     return arm(), *ARM_POINT
 
@@ -841,9 +827,6 @@ def test_a_value_of_zero_is_an_error_or_a_motion_but_not_the_end_of_the_process(
     except (InputError, SimulationError):
         return
     assert found[12] == pytest.approx(-0.1 - G * model.time_step, abs=1e-12)  # it falls without a contact force
-
-
-# ----------------------------------------------------------------------------------------------------------- inertia
 
 
 def random_inertia(random, size=1.0):
