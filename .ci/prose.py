@@ -38,7 +38,7 @@ LEFT_OUT: dict[str, tuple[str, ...]] = {
     "runs/plan_record.py": ("cost per s and squared unit",),
 }
 VECTOR = re.compile(r"\[[^\]]*\]")  # such as [q; v], whose semicolon does not join clauses
-CODE = re.compile(r"^(\s*)(```|~~~).*?^\s*\2|<!--.*?-->|<[^>]+>|\$\$.*?\$\$", re.M | re.S)
+CODE = re.compile(r"^(\s*)(```|~~~).*?^\s*\2|<!--.*?-->|<[a-zA-Z/][^>]*>|\$\$.*?\$\$", re.M | re.S)
 BLOCK = re.compile(r"\n\s*\n|\n(?=\s*(?:[-*|#]|\d+\.) ?)")  # a paragraph, an item, a heading, or a row of a table
 SENTENCE = re.compile(r"(?<=[.!?:])\s+(?=[A-Z`\"(*\[])")
 

@@ -74,6 +74,8 @@ def _compared(
     tree = tree_for(model) or tree_of(model, free=True, body_forces=True)
     if isinstance(tree, Refusal):
         return tree
+    if tree.coupling is not None and model.nq != model.nv:
+        return Refusal("it has coupled joints and a floating base")
     equations, random = EquationsOfMotion(model), np.random.default_rng(1)
     here = model.double.state()
     tail = np.zeros(0) if coordinates is None else coordinates.from_values(coordinates.start.values)

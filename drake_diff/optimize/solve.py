@@ -712,12 +712,12 @@ def choose_method(problem: Problem) -> tuple[str, str]:
         reason = "the motion is in continuous time, which collocation does not take"
         return "ilqr" if takes(problem) else "shooting", reason
     smooth = not contract.constraints and all(actuator.kp is None for actuator in contract.actuators)
-    if problem.horizon is not None and smooth and not _touches_at_first(problem):
-        return "collocation", "the horizon is " + ("free" if problem.horizon[0] < problem.horizon[1] else "given")
     if not problem.optimizes_controls:
         return "shooting", "the controls are not optimized"
     if problem.trajectory_cost is not None:
         return "shooting", "collocation and iLQR take no cost of the whole trajectory"
+    if problem.horizon is not None and smooth and not _touches_at_first(problem):
+        return "collocation", "the horizon is " + ("free" if problem.horizon[0] < problem.horizon[1] else "given")
     if problem.couplings and (contract.contact.collision_pairs or not smooth):
         return "shooting", "iLQR takes no couplings of knots, and collocation leaves out what acts on the model"
     if contract.contact.collision_pairs:

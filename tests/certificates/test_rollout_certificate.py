@@ -139,9 +139,6 @@ def test_a_policy_and_inputs_are_one_too_many(load):
         dd.certify_rollout(load("cart_pole.urdf"), X0, np.zeros((3, 1)), end, policy=lambda x, t: [0.0])
 
 
-# --- along random directions ------------------------------------------------------------------------------------------
-
-
 def linear(gradient, offset=0.0):
     return lambda displacements: offset + displacements @ gradient
 
@@ -254,9 +251,6 @@ def test_a_quadrupeds_plan_of_100_knots_is_certified_in_20_rollouts(approximatio
         values.ravel()[np.argmax(np.abs(values))] *= 1.01
         wrong = dataclasses.replace(g, **{name: values})
         assert dd.certify_rollout(model, x0, us, loss, gradient=wrong, **options).verdict == "disagree"
-
-
-# --- staircases -------------------------------------------------------------------------------------------------------
 
 
 def rounded(values, step):

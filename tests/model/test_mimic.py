@@ -10,8 +10,10 @@ from helpers.models import robot_file
 from helpers.table import each_row
 
 import drake_diff as dd
+from drake_diff._base.values import Refusal
 from drake_diff.derivatives.analytic import ReducedStep
 from drake_diff.exceptions import GradientError, ModelError, ModelWarning
+from drake_diff.mechanics.casadi_tree import symbolic_plant
 from drake_diff.mechanics.description import describe
 from drake_diff.model.plant import actuators
 from drake_diff.model.plant import joints as joints_of
@@ -242,6 +244,7 @@ def test_an_engine_of_its_own_takes_the_same_step(tmp_path, name):
     )  # fmt: skip
     model = load(path)
     assert (model.nq, model.nv, model.nu) == (8, 7, 2)
+    assert symbolic_plant(model) == Refusal("it has coupled joints and a floating base")
     engine, random = dd.engines.load_engine(name, model), np.random.default_rng(3)
     for _ in range(3):
         x, u = random.standard_normal(model.nx), random.standard_normal(2)
