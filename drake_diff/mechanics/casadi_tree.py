@@ -136,7 +136,6 @@ def _functions(plant: "SymbolicTree", model: Model, c: Any, actuation: Any) -> P
     slopes = ca.Function("slopes", [knot, a], [ca.vertcat(*rows)])
     slope = ca.gradient(ca.dot(mu, r), ca.vertcat(xu, a, c))  # mu' r is linear in a and u; the factors have q and c
     by_v = ca.jacobian(slope[nq:nx], v)
-    pace.go_on()
     curves = ca.Function("curves", [knot, a, mu], [ca.jacobian(slope, q), by_v, ca.jacobian(slope, c)])
     pace.go_on()
     by_knot = -ca.ldl_solve(slopes(knot, solved), *factors)

@@ -472,7 +472,8 @@ class Run:
     def _judge(self, draft: Solution, result: NlpResult) -> Solution:
         """Judge the draft. It is no success if the cost demands a motion that no variable of the plan can start."""
         if self.closest:
-            outcome = Outcome.SOLVED if result.outcome is Outcome.INACCURATE else result.outcome
+            acceptable = Outcome.INACCURATE, Outcome.ITERATION_LIMIT
+            outcome = Outcome.SOLVED if result.outcome in acceptable else result.outcome
             result = dataclasses.replace(result, outcome=outcome, note=NEAR)
         self._reach(3, draft, result)
         if isinstance(draft, PhasedSolution):

@@ -391,7 +391,8 @@ def _in_steps(task: _Task, asked: Attempt, plan: Solution, chain: list[dict[str,
     refined: list[Solution] = []
     first = asked.by("shooting", "the collocated plan in the model's own steps")
     nearest = "the motion in the model's own steps that is nearest to the collocated plan"
-    for attempt in (replace(first, max_iterations=REFINING), replace(first, reason=nearest, closest=True)):
+    near = replace(first, reason=nearest, closest=True, max_iterations=5 * REFINING)
+    for attempt in (replace(first, max_iterations=REFINING), near):
         try:
             make = task.prepare(attempt, plan)
         except DrakeDiffError as error:
@@ -404,9 +405,7 @@ def _in_steps(task: _Task, asked: Attempt, plan: Solution, chain: list[dict[str,
             break
     if not refined:
         return plan.noted("in continuous time alone: no method takes the problem in the model's own steps")
-    if refined[-1].success:
-        return refined[-1]
-    return not_in_steps(plan, refined[0])
+    return refined[-1] if refined[-1].success else not_in_steps(plan, refined[0])
 
 
 def _best_of(solutions: list[Solution]) -> Solution:

@@ -46,7 +46,7 @@ def outstretched(tmp_path, effort):
 def test_a_plan_starts_where_the_motors_hold_the_robot(tmp_path):
     found = load_robot(outstretched(tmp_path, 1.0), 0)
     assert abs(np.cos(found.q[0])) * G * 0.25 <= 0.63  # the gravity torque relative to the limit of 1 N m
-    assert "motors hold" in " ".join(found.repairs)
+    assert "motors can hold" in " ".join(found.repairs)
     assert plan(outstretched(tmp_path, 1.0), out=tmp_path / "out").success
 
 
