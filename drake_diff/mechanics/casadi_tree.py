@@ -141,7 +141,6 @@ def _functions(plant: "SymbolicTree", model: Model, c: Any, actuation: Any) -> P
     by_knot = -ca.ldl_solve(slopes(knot, solved), *factors)
     pace.go_on()
     jacobian = ca.Function("jacobian", [knot], [ca.vertcat(ca.jacobian(rates, knot), by_knot)])
-    pace.go_on()
     rows = ca.SX.sym("rows", jacobian.sparsity_out(0))
     by_q, by_v, by_c = curves(knot, solved, ca.ldl_solve(weights[nq:], *factors))
     ends = [nq, nx, width, width + n]

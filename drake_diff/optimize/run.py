@@ -48,9 +48,8 @@ from drake_diff.optimize.transcription.collocation import (
 )
 from drake_diff.optimize.transcription.drake import solve_collocation
 from drake_diff.optimize.transcription.steps import solve_shooting
-from drake_diff.optimize.verification import ended, judged, may_be_too_coarse, refused, status_of, unmeasured
+from drake_diff.optimize.verification import NEAR, ended, judged, may_be_too_coarse, refused, status_of, unmeasured
 
-NEAR = "a motion near the collocated optimum, but not an optimum in these steps"
 GRACE = 0.05  # extra time, as a fraction of the time limit, for measures of a result that the limit cut off
 # The stages of a solve, in order. A message on the time limit names the stages that were skipped.
 STAGES = ("certificates of the guess", "the search", "certificates of the result", "replays and other measures")

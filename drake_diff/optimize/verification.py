@@ -23,6 +23,7 @@ REFINED = "raise max_num_steps, or take more steps (num_steps)"  # if the mesh w
 SHORTER = "take a smaller time step"
 _ALIKE = ("ITERATION_LIMIT", "TIME_LIMIT", "INFEASIBLE", "INTERRUPTED", "DIVERGED", "NO_GRADIENT", "FAILED")
 # The solver stopped before it met its own tolerance, and independent measures decide whether the plan is a solution.
+NEAR = "a motion near the collocated optimum, but not an optimum in these steps"
 STOPPED = (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.NO_GRADIENT, Outcome.FAILED)
 ON_A_BOUND = 1e-6  # relative distance of a horizon from its bound, below which it counts as on the bound
 STATIONARY = 1e-6  # fraction of the terms of the Lagrangian's gradient; the remaining gain is about its square
@@ -202,7 +203,7 @@ def limits_of(solution: Solution, restarts: int) -> Iterator[str]:
         free = [n for n, *sides in zip(problem.input_names, b.u_lower, b.u_upper, strict=True) if np.isinf(sides).any()]
         if isinstance(problem.running_cost, ConstantCost) and free:
             yield f"the least time of inputs without limits: {messages.joined(free)}"
-    if not restarts:
+    if not restarts and NEAR not in solution.notes:
         yield "a local optimum: no other first guess was tried (restarts=0)"
 
 

@@ -18,6 +18,7 @@ from drake_diff.optimize.live import differ, scene_of_plan
 from drake_diff.optimize.messages import joined
 from drake_diff.optimize.replay import OPEN_LOOP
 from drake_diff.optimize.solution import Status
+from drake_diff.optimize.verification import NEAR
 from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.pages.meshcat import write_replay
 from drake_diff.pages.scene import Scene
@@ -47,7 +48,8 @@ def checks_of(m: Measurement, record: Mapping[str, Any]) -> list[PageCheck]:
     """Return the checks of a run in the order in which they were made."""
     status, count = m.solution.status, record["solver"]["iterations"]
     rounds = f"{count} iteration{'s' * (count != 1)} of {record['solver']['solver']}"
-    ended = "stopped at a solution" if status is Status.CONVERGED_NOT_VERIFIED else status.value.replace("_", " ")
+    at_solution = status is Status.CONVERGED_NOT_VERIFIED or NEAR in m.solution.notes
+    ended = "stopped at a solution" if at_solution else status.value.replace("_", " ")
     stopped = status in (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
     result = [PageCheck("Solver", "pass" if stopped else "fail", f"{ended} after {rounds}")]
     decided = [m for m in (*record["metrics"], *record["invariants"]) if m["verdict"] != "info"]
