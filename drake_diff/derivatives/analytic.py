@@ -59,7 +59,7 @@ class Analytic:
         """Differentiate all steps in one call."""
         parameters, count = steps.vector.parameters, steps.model.nx + steps.model.nu
         if parameters and any(p.kind.quantity not in QUANTITIES for p in parameters):
-            return Refusal("derivatives by parameters other than those of contact are requested")
+            return Refusal("derivatives with respect to parameters other than those of contact are requested")
         if steps.model.coupling is not None:
             return self._of_reduced(steps, steps.model.coupling)
         smooth = analytic_of(steps.model)
@@ -77,6 +77,8 @@ class Analytic:
                 values[free, :, :count], known[free] = smooth(steps.subset(free))
         answer = Jacobians(values, {int(k): NotSmoothError(ACTS) for k in np.flatnonzero(~known)}, {})
         pushed = ~known & (impulsive | smooth.at_a_limit(steps))
+        if smooth.body_forces:  # their derivatives are not in the equation with impulses
+            return answer
         for touch in (True, False):
             which = np.flatnonzero(pushed & (steps.touching == touch))
             if len(which):
@@ -87,7 +89,7 @@ class Analytic:
         """Differentiate the steps of a model with reduced mimic joints by those of the whole plant."""
         model = steps.model
         if steps.vector.parameters:
-            return Refusal("derivatives by parameters are requested of a model with reduced mimic joints")
+            return Refusal("derivatives with respect to parameters of a model with reduced mimic joints are requested")
         smooth = analytic_of(model.whole)
         if isinstance(smooth, Refusal):
             return smooth
@@ -97,7 +99,7 @@ class Analytic:
         if isinstance(of_whole, Refusal):
             return of_whole
         values, refused = reduced.jacobians(steps, whole, of_whole.values), dict(of_whole.refused)
-        refused |= {int(k): NotSmoothError("it leads elsewhere") for k in np.flatnonzero(~same)}
+        refused |= {int(k): NotSmoothError("the whole plant's step ends differently") for k in np.flatnonzero(~same)}
         trial = model.cache("trial of reduced steps", lambda: SourceTrial(CERTIFIED_STATES), of_structure=True)
         for k in range(len(steps)):
             if k not in refused:
@@ -110,7 +112,7 @@ class Analytic:
 def analytic_of(model: Model) -> SmoothStep | Refusal:
     """Return the model's smooth step, certified at its first use, or a Refusal."""
     if model.other_quantities.difference(QUANTITIES):
-        return Refusal("parameters are applied that are not the model's own")
+        return Refusal("parameter values other than the model's own are applied")
 
     def make() -> SmoothStep | Refusal:
         try:
@@ -155,9 +157,9 @@ def _first_difference(model: Model, smooth: SmoothStep) -> str:
         try:
             missing = differentiate_equation(smooth.form, steps, 0, exact)
         except (SimulationError, ModelError) as error:
-            return f"AutoDiffXd cannot certify it: {error}"
+            return f"AutoDiffXd cannot certify the analytic step: {error}"
         if not missing <= RESIDUAL_TOLERANCE:
-            return f"its step leaves {missing:.2g} of the forces in Drake's equation"
+            return f"its step has a residual of {missing:.2g} of the forces in Drake's equation"
         moved = x[: model.nq] + model.time_step * np.asarray(model.double.rates(v_next)) - ends[0, : model.nq]
         if not np.abs(moved).max() <= SAME_STEP * max(1.0, float(np.abs(ends).max())):
             return f"its positions differ from Drake's by {np.abs(moved).max():.2g}"
@@ -253,16 +255,16 @@ def _unlike_differences(steps: Steps, k: int, jacobian: Array, *, iterated: bool
     for size in DIFFERENCES:
         sides = _differences(steps, k, size)
         if isinstance(sides, Refusal):
-            return f"neither AutoDiffXd nor differences can certify it: {sides}", ""
+            return f"neither AutoDiffXd nor differences can certify the step: {sides}", ""
         forward, backward = sides
         central = (forward + backward) / 2
         if _gap(jacobian, central) <= SAME_DIFFERENCES:
-            return "", f"with impulses equal to {STEP_DIFFERENCES}, as AutoDiffXd takes no such step"
+            return "", f"with impulses equal to {STEP_DIFFERENCES}, as AutoDiffXd does not support this step"
         mine = jacobian[:, : central.shape[1]]
         gaps += [np.abs(mine - side).max(axis=0) / np.abs(mine).max() for side in (forward, backward, central)]
     gap = float(np.max(np.min(gaps, axis=0)))
     if iterated and gap <= SAME_WHERE_ITERATED:
-        note = f"with impulses within {SAME_WHERE_ITERATED:g} of {STEP_DIFFERENCES}, as Drake iterates to the contact"
+        note = f"with impulses within {SAME_WHERE_ITERATED:g} of {STEP_DIFFERENCES}, as Drake iterates contact points"
         return "", note
     return f"{DIFFERS} {STEP_DIFFERENCES} by {gap:.2g} of its largest entry", ""
 

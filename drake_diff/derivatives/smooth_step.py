@@ -20,7 +20,8 @@ For a tree (`SmoothStep`), the derivatives of the tree's accelerations are used 
 
 where M is the mass matrix plus reflected inertia, K the stiffness of springs and of PD control (kp), D joint damping
 plus the damping of PD control (kd + h kp), and c the constant force of their rest positions. As h D is added to the
-reflected inertia, the whole step is forward dynamics with h D as additional armature (`mechanics.tree`). Inputs are
+reflected inertia, the whole step is forward dynamics with h D as additional armature (`mechanics.tree`). B includes the
+BodyForces, and depends on q then. Inputs are
 clipped at their effort limits as in Drake. A PD controller at its limit, and any force that this form does not include,
 is detected because Drake's own step then differs.
 """
@@ -37,6 +38,7 @@ from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.values import Refusal
 from drake_diff.derivatives.steps import Jacobians, NotSmoothError, Steps
 from drake_diff.exceptions import DrakeDiffError, ModelError
+from drake_diff.mechanics.casadi_tree import body_forces_of
 from drake_diff.mechanics.coordinates import Coordinates, euler_jacobian, euler_step
 from drake_diff.mechanics.description import describe_tree
 from drake_diff.mechanics.tree import ForwardDynamics, compiled_tree
@@ -87,9 +89,13 @@ def differentiate_equation(form: "Form", steps: Steps, k: int, jacobian: Array) 
     effort, free, (kp, kd) = form.effort(x[:nq], v_next, u, h)
     applied = form.actuation @ np.minimum(np.maximum(effort, -form.limit), form.limit)  # three times faster than clip()
 
-    variables = InitializeAutoDiff(np.concatenate([x, vector.values])).ravel()
-    write_autodiff(vector, model, variables[nx:])
+    by_system = u if model.body_forces else u[:0]
+    variables = InitializeAutoDiff(np.concatenate([x, vector.values, by_system])).ravel()
+    end = nx + len(vector.values)
+    write_autodiff(vector, model, variables[nx:end])
     set_state(model.autodiff, variables[:nx])
+    if len(by_system):
+        model.autodiff.set_input(variables[end:])
     needed = model.autodiff.inverse_dynamics(np.array([AutoDiffXd(a) for a in change / h])).reshape(-1, 1)
     force, rest = ExtractValue(needed).ravel(), damping * change - applied
     missing = float(np.abs(force + rest).max() / max(1.0, np.abs(force).max(), np.abs(rest).max()))
@@ -99,7 +105,8 @@ def differentiate_equation(form: "Form", steps: Steps, k: int, jacobian: Array) 
     if vector.parameters:
         rows = rows + gradient_rows(model.autodiff.damping() * change, len(variables))
     pressed = form.actuation * free  # (nv, nu) the actuation of the efforts that are not at their limits
-    by_point = np.concatenate([rows[:, :nx], -pressed * form.per_input, rows[:, nx:]], axis=1)
+    by_u = rows[:, end:] - pressed * form.per_input if len(by_system) else -pressed * form.per_input
+    by_point = np.concatenate([rows[:, :nx], by_u, rows[:, nx:end]], axis=1)
     by_next = model.double.mass_matrix() / h
     by_next[form.diagonal] += damping
     by_point[:, nq:nx] -= by_next  # through (v' - v) / h and D (v' - v)
@@ -112,14 +119,14 @@ def differentiate_equation(form: "Form", steps: Steps, k: int, jacobian: Array) 
         if form.pd:
             by_point[:, step] += (pressed * kp * form.ratio) @ v_next[form.velocity]
     velocities = -np.linalg.solve(by_next, by_point)
-    jacobian[:nq] = _positions(model, form, v_next, velocities, len(vector.values))
+    jacobian[:nq] = _positions(model, form, v_next, velocities, len(variables))
     jacobian[nq:] = velocities
     if step is not None:
         jacobian[:nq, step] += np.asarray(twin.rates(v_next))
     return missing
 
 
-def _positions(model: Model, form: "Form", v_next: Array, velocities: Array, num_parameters: int) -> Array:
+def _positions(model: Model, form: "Form", v_next: Array, velocities: Array, width: int) -> Array:
     """Return the derivative (nq, nx + nu + np) of q' = q + h N(q) v', with the AutoDiffXd twin at the step's state."""
     if form.q_dot_is_v:
         moved = model.time_step * velocities
@@ -128,7 +135,7 @@ def _positions(model: Model, form: "Form", v_next: Array, velocities: Array, num
     moved_positions = np.eye(model.nq, velocities.shape[1])
     twin = model.autodiff
     q_dot = twin.rates(np.array([AutoDiffXd(v) for v in v_next]))
-    moved_positions[:, : model.nx] += model.time_step * gradient_rows(q_dot, model.nx + num_parameters)[:, : model.nx]
+    moved_positions[:, : model.nx] += model.time_step * gradient_rows(q_dot, width)[:, : model.nx]
     n = np.array([model.double.rates(e) for e in np.eye(model.nv)]).T
     return np.asarray(moved_positions + model.time_step * n @ velocities)
 
@@ -202,9 +209,9 @@ def _read_form(model: Model) -> Form:
     for instance, target in model.pd_targets.items():
         driven = [i for i, a in enumerate(plant_actuators) if a.model_instance() == instance]
         references[:, driven] = np.asarray(target).reshape(2, -1)[:, : len(driven)]
-    why = _why_driven(model)
+    why, others = _why_driven(model), "" if model.body_forces else model.systems_act
     return Form(
-        excluded="constraints act at every step" if model.num_constraints else why or model.systems_act,
+        excluded="constraints act at every step" if model.num_constraints else why or others,
         driven=why,
         actuators=plant_actuators,
         velocity=velocity,
@@ -214,7 +221,7 @@ def _read_form(model: Model) -> Form:
         actuation=model.actuation,
         limit=np.where(inputs.actuator >= 0, starts_and_limits[:, 2], np.inf),
         cut=np.where((inputs.actuator >= 0) & ~controlled, starts_and_limits[:, 2], np.inf),
-        reference=references,
+        reference=inputs.of_actuators(references.T).T,
         commanded=inputs.commanded,
         diagonal=np.diag_indices(model.nv),
         pd=any(a.has_controller() for a in plant_actuators),
@@ -255,6 +262,7 @@ class SmoothStep:
     sprung: bool  # whether any K is not 0
     loaded: bool  # whether any K, D or c is not 0
     limited: bool  # whether any input is clipped
+    body_forces: Any | None = None  # see `body_forces_of`
 
     def __call__(self, steps: Steps) -> tuple[Array, NDArray[np.bool_]]:
         """Return the Jacobians (N, nx, nx + nu), and which steps (N,) are smooth, i.e. equal Drake's steps."""
@@ -267,17 +275,22 @@ class SmoothStep:
         c, h = self.coordinates, self.time_step
         q, v = xs[:, : c.nq], xs[:, c.nq :]
         force, clipped = self.force_of(q, v, us)
+        columns, slopes = self._pushes(q, us)
+        force += (columns @ us[:, us.shape[1] - columns.shape[2] :, None])[:, :, 0]
         by_q, by_v, inverse, a = self.dynamics.accelerate(q, v, force)
-        parts = by_q - inverse * self.stiffness, by_v - inverse * self.damping, self._by_input(inverse, clipped)
+        by_u = self._by_input(inverse, clipped)
+        by_u[:, :, us.shape[1] - columns.shape[2] :] = inverse @ columns
+        by_q += inverse @ slopes
+        parts = by_q - inverse * self.stiffness, by_v - inverse * self.damping, by_u
         x_next = euler_step(c, h, xs, a)
         return euler_jacobian(c, h, xs, x_next, np.concatenate(parts, axis=2)), x_next
 
     def single(self, x: Array, u: Array, x_next: Array) -> Array | None:
         """Return the Jacobian (nx, nx + nu) of one step to x_next (nx,), in a third of the time of `__call__`.
 
-        Returns None for a tree with free bodies, inputs at or beyond their limits, or if the smooth step differs.
+        Returns None with free bodies or BodyForces, for inputs beyond their limits, or if the smooth step differs.
         """
-        if self.coordinates.free or (self.limited and (np.abs(u) >= self.limit).any()):
+        if self.coordinates.free or self.body_forces or (self.limited and (np.abs(u) >= self.limit).any()):
             return None
         n, h = len(self.damping), self.time_step
         nx, width = 2 * n, 2 * n + len(u)
@@ -303,12 +316,12 @@ class SmoothStep:
         return jacobian
 
     def curvature(self, xs: Array, us: Array, along: Array) -> Array | None:
-        """Return the second derivative (N, nx + nu, nx + nu) of along' x' (N, nx each), or None with free bodies.
+        """Return the second derivative (N, nx + nu, nx + nu) of along' x' (N, nx each), or None as in `single`.
 
         v' = v + h a, where the inverse dynamics tau(q, v, a) equal the forces, which are linear in q, v and u. So with
         mu = M^-1 w, w'a has the second derivative of -mu' tau(q, v, a), with the first derivative of a inserted.
         """
-        if self.coordinates.free:
+        if self.coordinates.free or self.body_forces:
             return None
         n, h = self.coordinates.nv, self.time_step
         q, v = xs[:, :n], xs[:, n:]
@@ -343,6 +356,17 @@ class SmoothStep:
             force -= self.stiffness * q[:, self.positions]
         return force, clipped if some else None
 
+    def _pushes(self, q: Array, us: Array) -> tuple[Array, Array]:
+        """Return the BodyForces' columns of B (N, nv, m), and their force's derivative by the tangent of q."""
+        c, count = self.coordinates, len(q)
+        if self.body_forces is None:
+            return np.zeros((count, c.nv, 0)), np.zeros((1, c.nv, c.nv))
+        columns, slopes = self.body_forces(q)
+        columns = columns.reshape(count, -1, c.nv)
+        slopes = slopes.reshape(count, c.nq, -1, c.nv)
+        by_q = np.einsum("kimj,km->kji", slopes, us[:, us.shape[1] - columns.shape[1] :])
+        return columns.swapaxes(1, 2), by_q @ c.rate(q)
+
     def _by_input(self, inverse: Array, clipped: NDArray[np.bool_] | None) -> Array:
         """Return M^-1 B (N, nv, nu), with 0 for clipped inputs."""
         columns = self.form.feedforward(inverse.take(self.form.velocity, axis=2))
@@ -352,9 +376,11 @@ class SmoothStep:
 def build_analytic(model: Model) -> SmoothStep:
     """Build the smooth step, not yet certified; raise ModelError if the plant is not a supported tree."""
     form = form_of(model)
-    if form.driven or model.systems_act:
-        raise ModelError(form.driven or model.systems_act)
-    description = describe_tree(model)
+    pushes = body_forces_of(model) if model.body_forces else None
+    for refusal in (form.driven, "" if pushes else model.systems_act, pushes if isinstance(pushes, Refusal) else ""):
+        if refusal:
+            raise ModelError(str(refusal))
+    description = describe_tree(model, body_forces=True)
     kp, kd = form.gains()
     stiffness, damping = description.by_velocity("stiffness"), description.by_velocity("damping")
     rest = stiffness * description.by_velocity("rest")
@@ -383,4 +409,5 @@ def build_analytic(model: Model) -> SmoothStep:
         sprung=bool(stiffness.any()),
         loaded=bool(stiffness.any() or damping.any() or rest.any()),
         limited=bool(np.isfinite(form.cut).any()),
+        body_forces=pushes,
     )

@@ -25,6 +25,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.clock import Pace, check_time
 from drake_diff._base.values import Refusal
 from drake_diff.mechanics.description import Link, RigidLink, read_links, springs_of
+from drake_diff.mechanics.symbol import Mapped
 from drake_diff.mechanics.tree import TreeModel, tree_for, tree_of
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.inputs import BodyForce
@@ -110,6 +111,17 @@ def _values(coordinates: ParameterCoordinates, c: Any) -> Any:
         full = ca.trace(S) * ca.DM.eye(3) - S
         values[s] = ca.vertcat(full[0, 0], full[1, 1], full[2, 2], full[0, 1], full[0, 2], full[1, 2])
     return values
+
+
+def body_forces_of(model: Model) -> Mapped | Refusal:
+    """Return a function of q (K, nq): the model's BodyForces of 1 N (K, m nv), and their derivatives (K, nq m nv)."""
+    tree = tree_of(model, free=True, body_forces=True)
+    if isinstance(tree, Refusal):
+        return tree
+    q = ca.SX.sym("q", model.nq)
+    moving = MovingTree(SymbolicTree(tree), q, ca.SX(model.nv, 1))
+    columns = ca.vertcat(*[moving.body_force(force) for force in model.body_forces])
+    return Mapped(ca.Function("body_forces", [q], [ca.densify(columns), ca.densify(ca.jacobian(columns, q))]))
 
 
 def _functions(plant: "SymbolicTree", model: Model, c: Any, actuation: Any) -> PlantFunctions:

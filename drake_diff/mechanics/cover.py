@@ -126,7 +126,7 @@ def _doubts(pieces: Sequence[Piece], bare: Sequence[str]) -> Iterator[str]:
             f"{min(radii):.3g} to {max(radii):.3g} m"
         )
     if bare:
-        yield f"{', '.join(bare)}: no shape, no mass and no next joint, and no clearance"
+        yield f"{', '.join(bare)}: not part of the clearance, as there is no shape, no mass and no next joint"
 
 
 def _of_shapes(model: Model, inspector: Any, body: Any, unread: list[str]) -> Iterator[tuple[Any, list[Piece]]]:
@@ -143,7 +143,7 @@ def _of_shapes(model: Model, inspector: Any, body: Any, unread: list[str]) -> It
             around = [(g, list(_around(inspector.GetShape(g), inspector.GetPoseInFrame(g)))) for g in geometries]
         except (ModelError, RuntimeError) as error:
             kind = "collision shapes" if role == Role.kProximity else "drawn shapes"
-            unread.append(f"{body.name()}: its {kind} cannot be read ({error}) and are replaced by others")
+            unread.append(f"{body.name()}: its {kind} cannot be read ({error}) and are replaced by other shapes")
             continue
         shapes = [(g if role == Role.kProximity else None, pieces) for g, pieces in around if pieces]
         if shapes:
@@ -179,7 +179,7 @@ def pieces_around(shape: Any) -> list[Around]:
         return [(-end, end, radius)]
     if isinstance(shape, (Mesh, Convex)):
         return around_mesh(*_surface(shape))
-    raise ModelError(f"shape {type(shape).__name__}: expected one that Drake's files can have")
+    raise ModelError(f"shape {type(shape).__name__}: expected a shape of Drake's file formats")
 
 
 def _around_box(size: Array) -> list[Around]:

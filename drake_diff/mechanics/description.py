@@ -206,8 +206,8 @@ def describe_whole(model: Model) -> Description:
     return replace(description, followers=tuple(followers))
 
 
-def describe_tree(model: Model) -> Description:
-    """Describe `model` as `describe` does, but ignore the PD control of the actuators and the constraints."""
+def describe_tree(model: Model, *, body_forces: bool = False) -> Description:
+    """Describe `model` as `describe` does, but ignore PD control and constraints, and BodyForces if requested."""
     plant = model.plant
     refusals = [
         f"joint {j.name()} is of type {j.type_name()}" for j in joints(plant) if j.type_name() not in ("weld", *MOVING)
@@ -221,7 +221,7 @@ def describe_tree(model: Model) -> Description:
         refusals.append('its mimic joints are reduced (mimic="fix" holds them)')
     if model.forces:
         refusals.append("forces are added to Drake's")
-    refusals += [model.systems_act] if model.systems_act else []
+    refusals += [model.systems_act] if model.systems_act and not (body_forces and model.body_forces) else []
     springs = springs_of(plant)
     if refusals or isinstance(springs, Refusal):
         reasons = [*refusals, str(springs)] if isinstance(springs, Refusal) else refusals

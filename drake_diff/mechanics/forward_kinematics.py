@@ -139,11 +139,11 @@ class ForwardKinematics:
         return independent
 
     def frame(self, x: Any, frame: Any, *, speeds: bool = False) -> Moving:
-        """Return a `frame` of the plant at the state x (nx,); without `speeds`, its velocities are 0, to trace less."""
+        """Return a `frame` of the plant at the state x (nx,), or without `speeds`, as 0, at K states (K, nx)."""
         x = np.asarray(x)
-        turns, places = self(x[: self.model.nq])
+        turns, places = self(x[..., : self.model.nq])
         link, pose = self._on(frame)
-        still = Moving(turns[link], places[link], np.zeros(3), np.zeros(3))
+        still = Moving(turns[..., link, :, :], places[..., link, :], np.zeros(3), np.zeros(3))
         return (self._moving(x, turns, places, link) if speeds else still).shifted(*pose)
 
     def _on(self, frame: Any) -> tuple[int, tuple[Array, Array]]:

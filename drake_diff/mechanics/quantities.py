@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike
 from pydrake.autodiffutils import AutoDiffXd
 from pydrake.math import RotationMatrix_
 from pydrake.multibody.tree import FrameIndex
+from scipy.spatial.transform import Rotation
 
 from drake_diff._base.arrays import finite_array
 from drake_diff._base.autodiff import plain
@@ -60,7 +61,7 @@ def frame_position(model: Model, frame: str, point: ArrayLike = ORIGIN, relative
         relative_to: The frame in which the position is expressed.
 
     Returns:
-        x (nx,) -> (3,) [m].
+        x (nx,) -> (3,) [m], or (K, nx) -> (K, 3) for floats.
 
     Raises:
         UnknownNameError: The frame does not exist. The message lists the existing frames.
@@ -78,7 +79,7 @@ def frame_position(model: Model, frame: str, point: ArrayLike = ORIGIN, relative
         R, origin = _pose(model, x, here, base)
         return origin + R @ p
 
-    return recorded(position, "frame_position", frame=frame, point=p.tolist(), relative_to=relative_to)
+    return of_rows(model, recorded(position, "frame_position", frame=frame, point=p.tolist(), relative_to=relative_to))
 
 
 def frame_rotation_error(model: Model, frame: str, R_goal: ArrayLike, relative_to: str = "world") -> OfState:
@@ -95,7 +96,7 @@ def frame_rotation_error(model: Model, frame: str, R_goal: ArrayLike, relative_t
         relative_to: The frame that both rotations are relative to.
 
     Returns:
-        x (nx,) -> (3,) [rad, for small rotations].
+        x (nx,) -> (3,) [rad, for small rotations], or (K, nx) -> (K, 3) for floats.
 
     Raises:
         UnknownNameError: The frame does not exist.
@@ -111,7 +112,7 @@ def frame_rotation_error(model: Model, frame: str, R_goal: ArrayLike, relative_t
     goal = finite_array("R_goal", R_goal, (3, 3))
     off, determinant = float(np.abs(goal.T @ goal - np.eye(3)).max()), np.linalg.det(goal)
     if off > ROTATION_TOLERANCE or determinant < 0:
-        got = f"R' R off by {off:.2g}, determinant {determinant:.2g}"
+        got = f"R' R with an error of {off:.2g}, determinant {determinant:.2g}"
         raise InputError("R_goal", got=got, expected="a rotation matrix")
 
     def error(x: Any) -> Any:
@@ -121,9 +122,14 @@ def frame_rotation_error(model: Model, frame: str, R_goal: ArrayLike, relative_t
             relative = product(product(CONJUGATE * origin, turned), CONJUGATE * _quaternion(goal, float))
             return 2 * relative[0].sign() * relative[1:]
         R, _ = _pose(model, x, here, base)
+        if R.ndim == 3:
+            turned = Rotation.from_matrix(R @ goal.T).as_quat()
+            return np.where(turned[:, 3:] < 0, -2.0, 2.0) * turned[:, :3]
         return 2 * _quaternion(R @ goal.T, float if R.dtype == float else AutoDiffXd)[1:]
 
-    return recorded(error, "frame_rotation_error", frame=frame, R_goal=goal.tolist(), relative_to=relative_to)
+    return of_rows(
+        model, recorded(error, "frame_rotation_error", frame=frame, R_goal=goal.tolist(), relative_to=relative_to)
+    )
 
 
 def frame_velocity(model: Model, frame: str, point: ArrayLike = ORIGIN) -> OfState:
@@ -290,6 +296,12 @@ def recorded(function: Any, name: str, **arguments: Any) -> Any:
     return function
 
 
+def of_rows(model: Model, function: Any) -> Any:
+    """Mark a `function` of the state that also takes rows (K, nx) of floats, if the model has forward kinematics."""
+    function.takes_rows = not isinstance(forward_kinematics(model), Refusal)
+    return function
+
+
 def description_of(function: Any) -> dict[str, Any] | None:
     """Return the name and arguments of this module's function that made `function`, or None for other functions."""
     made, description = getattr(function, RECORDED, (None, None))
@@ -312,10 +324,13 @@ def made_from(model: Model, description: Any) -> OfState | OfStateAndInput:
 
 def _pose(model: Model, x: Any, here: FrameIndex, base: FrameIndex) -> tuple[Any, Any]:
     """Return the rotation (3, 3) and origin (3,) of the frame `here` in the frame `base`."""
-    if _is_symbolic(x):
+    if np.ndim(x) == 2 and np.shape(x)[1] != model.nx:
+        raise ShapeError("x", got=np.shape(x), expected=(len(x), model.nx))
+    if np.ndim(x) == 2 or _is_symbolic(x):
         tree = _tree_of(model, PLACE)
         moving, origin = (tree.frame(x, model.plant.get_frame(i)) for i in (here, base))
-        return origin.R.T @ moving.R, origin.R.T @ (moving.p - origin.p)
+        back = np.swapaxes(origin.R, -1, -2)
+        return back @ moving.R, (back @ (moving.p - origin.p)[..., None])[..., 0]
     twin, _ = _twin_at(model, PLACE, x)
     pose = twin.plant.get_frame(here).CalcPose(twin.context, twin.plant.get_frame(base))
     return pose.rotation().matrix(), pose.translation()

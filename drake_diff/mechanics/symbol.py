@@ -1,10 +1,11 @@
-"""CasADi's scalar expressions as entries of NumPy arrays of objects, and CasADi functions in any arithmetic.
+"""CasADi's scalar expressions as entries of NumPy arrays, CasADi functions in any arithmetic, and at many points.
 
 NumPy computes with arrays of `Symbol` as it does with arrays of AutoDiffXd. A `Symbol` has no float() and no truth
 value, so that tracing a function that branches on its inputs raises an error.
 """
 
 import operator
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -12,7 +13,10 @@ import casadi as ca
 import numpy as np
 from pydrake.autodiffutils import AutoDiffXd, ExtractValue
 
+from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import gradient_rows
+
+THREAD_WORTH = 500_000  # instructions of 1 to 5 ns; starting a thread takes 50 us
 
 
 class Symbol:
@@ -89,3 +93,33 @@ def called(function: Any, jacobian: Any, z: Any) -> Any:
     seeds = gradient_rows(full, width)
     rows = np.asarray(jacobian(values)) @ seeds
     return np.array([AutoDiffXd(v, row) for v, row in zip(np.asarray(function(values)).ravel(), rows, strict=True)])
+
+
+class Mapped:
+    """A CasADi function mapped over points: it takes rows (K, .) and returns the nonzeros (K, .) of every output."""
+
+    def __init__(self, function: Any):
+        self.function = function
+        self._maps: dict[int, Any] = {}
+
+    def __call__(self, *rows: Array) -> list[Array]:
+        count = len(rows[0])
+        if count not in self._maps:
+            self._maps[count] = self._mapped(count)
+        (buffer, evaluate), arrays, _ = self._maps[count]
+        given = [np.ascontiguousarray(array, dtype=float).reshape(-1) for array in rows]
+        for i, array in enumerate(given):
+            buffer.set_arg(i, array.data)
+        evaluate()
+        return [np.array(array) for array in arrays]
+
+    def _mapped(self, count: int) -> Any:
+        """Map the function to `count` points, on as many threads as are worth starting at every call."""
+        f = self.function
+        threads = min(os.cpu_count() or 1, count * f.n_instructions() // THREAD_WORTH)
+        mapped = f.map(count, *(("thread", threads) if threads > 1 else ()))
+        buffer, evaluate = mapped.buffer()
+        arrays = [np.empty((count, f.nnz_out(i))) for i in range(f.n_out())]
+        for i, array in enumerate(arrays):
+            buffer.set_res(i, array.reshape(-1).data)
+        return (buffer, evaluate), arrays, mapped

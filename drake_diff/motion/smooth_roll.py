@@ -60,7 +60,7 @@ def _make(model: Model) -> SmoothRoll | None:
     if model.contract.contact.collision_pairs or model.num_constraints or model.coupling is not None:
         return None
     smooth = analytic_of(model)
-    if isinstance(smooth, Refusal) or smooth.coordinates.free or smooth.form.pd:
+    if isinstance(smooth, Refusal) or smooth.coordinates.free or smooth.form.pd or smooth.body_forces:
         return None
     if model.nq != model.nv or not np.array_equal(smooth.positions, np.arange(model.nv)):
         return None

@@ -4,7 +4,6 @@ A function is traced to a CasADi expression if possible, and otherwise called po
 of costs are positive semidefinite, because negative eigenvalues are set to 0.
 """
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,7 +18,7 @@ from drake_diff._base.values import Refusal
 from drake_diff.exceptions import GradientError
 from drake_diff.mechanics.casadi_tree import agrees
 from drake_diff.mechanics.clearance import OfShapes
-from drake_diff.mechanics.symbol import Symbol, symbols
+from drake_diff.mechanics.symbol import Mapped, Symbol, symbols
 from drake_diff.optimize.problem.constraint import Constraint, short
 from drake_diff.optimize.problem.cost import (
     QuadraticCost,
@@ -36,7 +35,6 @@ from drake_diff.optimize.problem.obstacles import ClearanceConstraint
 from drake_diff.optimize.problem.problem import Problem
 
 SAME_VALUES = 1e-10  # relative to the largest value at a knot; the same operations may be rounded in another order
-THREAD_WORTH = 500_000  # instructions of 1 to 5 ns; starting a thread takes 50 us
 DIFFERENCE = 1e-5  # step of differences, relative to max(1, |z|), of exact Jacobians that are accurate to 1e-12
 Values = Callable[[Array], Array]  # points (K, w) -> (K, m)
 Linearize = Callable[[Array], tuple[Array, Array]]  # -> (K, m), (K, m, w)
@@ -60,36 +58,6 @@ def trace(f: Callable[[Any, Any], Any], nx: int, probe: Array, wanted: Array) ->
     if not agrees(function, probe, wanted, SAME_VALUES):
         return Refusal("its symbolic form gives other values")
     return function
-
-
-class Mapped:
-    """A CasADi function mapped over points: it takes rows (K, .) and returns the nonzeros (K, .) of every output."""
-
-    def __init__(self, function: Any):
-        self.function = function
-        self._maps: dict[int, Any] = {}
-
-    def __call__(self, *rows: Array) -> list[Array]:
-        count = len(rows[0])
-        if count not in self._maps:
-            self._maps[count] = self._mapped(count)
-        (buffer, evaluate), arrays, _ = self._maps[count]
-        given = [np.ascontiguousarray(array, dtype=float).reshape(-1) for array in rows]
-        for i, array in enumerate(given):
-            buffer.set_arg(i, array.data)
-        evaluate()
-        return [np.array(array) for array in arrays]
-
-    def _mapped(self, count: int) -> Any:
-        """Map the function to `count` points, on as many threads as are worth starting at every call."""
-        f = self.function
-        threads = min(os.cpu_count() or 1, count * f.n_instructions() // THREAD_WORTH)
-        mapped = f.map(count, *(("thread", threads) if threads > 1 else ()))
-        buffer, evaluate = mapped.buffer()
-        arrays = [np.empty((count, f.nnz_out(i))) for i in range(f.n_out())]
-        for i, array in enumerate(arrays):
-            buffer.set_res(i, array.reshape(-1).data)
-        return (buffer, evaluate), arrays, mapped
 
 
 class PointFunction:

@@ -166,7 +166,7 @@ def _law() -> Any:
     """Build the force (3,) on the sphere and its Jacobian; z is the relative v' of the sphere, the normal and phi."""
     import casadi as ca
 
-    from drake_diff.optimize.knots import Mapped
+    from drake_diff.mechanics.symbol import Mapped
 
     z, constants = ca.SX.sym("z", 7), ca.SX.sym("constants", 6)
     velocity, normal, phi = z[:3], z[3:6], z[6]

@@ -30,7 +30,7 @@ from drake_diff.optimize.program import Iteration, Limits, Report
 from drake_diff.optimize.run import Run, closest_to, is_kept_apart, kept_apart
 from drake_diff.optimize.solution import PLANS, Search, Solution, Status, distinct
 from drake_diff.optimize.transcription.task import MAP, SCHEMES, OptimalControl, default_scheme
-from drake_diff.optimize.verification import advice, limits_of, not_in_steps, overlaps
+from drake_diff.optimize.verification import advice, limits_of, near, not_in_steps, overlaps
 
 COMPILED = 0.5  # [s] a longer compilation is reported
 DEFAULTS = Options()
@@ -391,14 +391,15 @@ def _in_steps(task: _Task, asked: Attempt, plan: Solution, chain: list[dict[str,
     refined: list[Solution] = []
     first = asked.by("shooting", "the collocated plan in the model's own steps")
     nearest = "the motion in the model's own steps that is nearest to the collocated plan"
-    near = replace(first, reason=nearest, closest=True, max_iterations=5 * REFINING)
-    for attempt in (replace(first, max_iterations=REFINING), near):
+    closest = replace(first, reason=nearest, closest=True, max_iterations=5 * REFINING)
+    attempts = [replace(a, max_iterations=REFINING) for a in (first, asked.by("ilqr", f"{first.reason}, by iLQR"))]
+    for attempt in [*(a for a in attempts if _is_possible(problem, a)), closest]:
         try:
             make = task.prepare(attempt, plan)
         except DrakeDiffError as error:
             chain.append({**attempt.told(False), "ended": f"not possible: {error}"})
             continue
-        refined.append(make())
+        refined.append(near(plan, make()) if attempt.closest else make())
         chain.append({**attempt.told(False), "ended": refined[-1].status.value})
         task.report.say(f"shooting ({attempt.reason}): {refined[-1].status.value}")
         if refined[-1].status in ENDED:
@@ -612,19 +613,19 @@ def _check_attempt(problem: Problem | PhasedProblem, attempt: Attempt) -> str:
         _check_motion(attempt)
     if method == "collocation":
         return _check_collocation(problem, attempt)
-    takes = 'method="collocation" takes it'
+    takes = 'method="collocation" supports it'
     if attempt.options.solver == "snopt":
-        raise InputError("solver", got='"snopt"', expected=f'none for method="{method}": scheme="drake" takes it')
+        raise InputError("solver", got='"snopt"', expected=f'another one for method="{method}", or scheme="drake"')
     if not problem.has_model:
-        expected = f'a model for method="{method}"; method="collocation" takes both'
+        expected = f'a model for method="{method}"; method="collocation" supports plain dynamics'
         raise InputError("problem", got="plain dynamics", expected=expected)
     if problem.horizon is not None and not problem.model.can_rebuild:
         raise InputError(
-            "horizon", got="given", expected=f"no horizon with a diagram, as its steps have a fixed length: {takes}"
+            "horizon", got="given", expected=f"no horizon, as the steps of a diagram have a fixed length; {takes}"
         )
     _check_timed_cost(problem)
     if problem.rate_limits and problem.horizon is not None and problem.horizon[0] < problem.horizon[1]:
-        expected = f'a horizon that is given for method="{method}": {takes}'
+        expected = f'a given horizon for method="{method}"; {takes}'
         raise InputError("couplings", got=f"{problem.rate_limits[0]!r} and a free horizon", expected=expected)
     if method == "ilqr":
         check_problem(problem)
@@ -634,17 +635,17 @@ def _check_attempt(problem: Problem | PhasedProblem, attempt: Attempt) -> str:
 def _check_motion(attempt: Attempt) -> None:
     """Raise InputError for options that do not support motion in continuous time."""
     if attempt.method == "collocation":
-        expected = 'method="ilqr" or "shooting" for motion="continuous": collocation leaves contact out'
+        expected = 'method="ilqr" or "shooting" for motion="continuous", as collocation ignores contact'
         raise InputError("method", got='"collocation"', expected=expected)
     if attempt.options.continuation is not None:
-        expected = 'no continuation for motion="continuous"; use restarts to try other first guesses'
+        expected = 'no continuation for motion="continuous"; use restarts to try other initial guesses'
         raise InputError("continuation", got="given", expected=expected)
 
 
 def _check_collocation(problem: Problem, attempt: Attempt) -> str:
     scheme = _check_scheme(problem, attempt)
     if attempt.options.solver == "snopt" and scheme != "drake":
-        raise InputError("solver", got='"snopt"', expected=f'"ipopt" for scheme="{scheme}"; scheme="drake" takes both')
+        raise InputError("solver", got='"snopt"', expected=f'"ipopt" for scheme="{scheme}", or scheme="drake"')
     if problem.trajectory_cost is not None:
         raise InputError("trajectory_cost", got="given", expected='method="shooting"')
     if not problem.optimizes_controls:
@@ -665,7 +666,7 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
         }
         for name, value in left_out.items():
             if value:
-                raise InputError(name, got="given", expected='none for solver="snopt": solver="ipopt" takes it')
+                raise InputError(name, got="given", expected='no value for solver="snopt"; solver="ipopt" supports it')
     return scheme
 
 
@@ -685,7 +686,7 @@ def _check_scheme(problem: Problem | PhasedProblem, attempt: Attempt) -> str:
     if scheme not in SCHEMES:
         raise UnknownNameError("scheme", got=scheme, known=[name for name in SCHEMES if name != MAP])
     if (scheme == MAP) != problem.is_map:
-        expected = f"{MAP!r}, as the system is a DiscreteMap" if problem.is_map else "a scheme for motion in time"
+        expected = f"{MAP!r}, as the system is a DiscreteMap" if problem.is_map else f"a scheme other than {MAP!r}"
         raise InputError("scheme", got=repr(scheme), expected=expected)
     if problem.is_map and attempt.options.refine:
         raise InputError("refine", got=True, expected="False or None, as a DiscreteMap has no intervals to split")
@@ -696,7 +697,7 @@ def _check_timed_cost(problem: Problem) -> None:
     if isinstance(problem.running_cost, TimedCost) and problem.horizon and problem.horizon[0] < problem.horizon[1]:
         raise InputError(
             "running_cost",
-            got="one that changes in time",
+            got="a cost that changes in time",
             expected="a running_cost that is constant in time, as the horizon is free",
         )
 

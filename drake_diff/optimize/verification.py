@@ -24,6 +24,7 @@ SHORTER = "take a smaller time step"
 _ALIKE = ("ITERATION_LIMIT", "TIME_LIMIT", "INFEASIBLE", "INTERRUPTED", "DIVERGED", "NO_GRADIENT", "FAILED")
 # The solver stopped before it met its own tolerance, and independent measures decide whether the plan is a solution.
 NEAR = "a motion near the collocated optimum, but not an optimum in these steps"
+DEARER = 0.25  # of a plan's cost; motions near plans of the task benchmark cost up to 15 % more in coarse steps
 STOPPED = (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.NO_GRADIENT, Outcome.FAILED)
 ON_A_BOUND = 1e-6  # relative distance of a horizon from its bound, below which it counts as on the bound
 STATIONARY = 1e-6  # fraction of the terms of the Lagrangian's gradient; the remaining gain is about its square
@@ -144,6 +145,15 @@ def _by_our_measures(draft: Solution, result: NlpResult) -> tuple[Outcome, tuple
         return result.outcome if goes_on else Outcome.INACCURATE, ()
     sentence = f"what was asked is kept, and the Lagrangian's gradient is {ratio:.1g} of its terms"
     return Outcome.SOLVED, (f"by our own measures, where the solver says {result.message!r}: {sentence}",)
+
+
+def near(plan: Solution, motion: Solution) -> Solution:
+    """Return the `motion` in steps near a collocated `plan`, not verified if it costs over DEARER more."""
+    scale = max(abs(plan.cost), plan.problem.least_cost(plan.xs[0], plan.time_step))
+    if not motion.success or motion.cost - plan.cost <= DEARER * scale:
+        return motion
+    text = f"its cost {motion.cost:.4g} exceeds the collocated plan's cost {plan.cost:.4g} by over {DEARER:.0%}"
+    return ended(motion, Status.CONVERGED_NOT_VERIFIED, text, *motion.notes)
 
 
 def not_in_steps(plan: Solution, refined: Solution) -> Solution:

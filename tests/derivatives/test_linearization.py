@@ -24,6 +24,7 @@ from drake_diff.derivatives.refine_step import refine_steps
 from drake_diff.derivatives.smooth_step import SmoothStep
 from drake_diff.exceptions import GradientError, InputError, ModelError, ModelWarning, SimulationError, UnknownNameError
 from drake_diff.mechanics.tree import ForwardDynamics
+from drake_diff.model.inputs import BodyForce
 from drake_diff.model.parameters import applied, select
 
 pytestmark = pytest.mark.solve
@@ -151,6 +152,56 @@ def test_inputs_at_their_effort_limits_have_no_effect():
     assert np.all(np.abs(B[0, :, 1:]).max(axis=0) > 0)
 
 
+ROTORS = [BodyForce(f"rotor_{i}", "body", p, moment_ratio=0.02 * (-1) ** i) for i, p in enumerate(np.eye(3))]
+JETS = [
+    BodyForce("jet", "upper", (0.1, -0.2, 0.3), (1, 2, -2), moment_ratio=0.7),
+    BodyForce("fan", "lower", (0, 0.1, 0), (0, 0, -3), moment_ratio=-0.2),
+]
+FLYING = {"quadrotor.urdf": ROTORS, "double_pendulum.urdf": JETS, "sphere_on_ground.sdf": [BodyForce("up", "ball")]}
+
+
+def test_a_hovering_bodys_thrust_has_its_closed_form():
+    """A thrust f along the body's z axis, turned by a small angle about y, accelerates the body by f / m along x."""
+    model = dd.load_model(MODELS / "quadrotor.urdf", time_step=0.01, body_forces=[BodyForce("lift", "body")])
+    mass, x = float(model.plant.CalcTotalMass(model.double.context)), model.default_state
+    A, B, _ = equal(model, x[None], [[mass * G]])
+    assert A[0, 10, 2] == pytest.approx(0.01 * 2 * G, rel=1e-9)  # d vx / d qy, as the angle is 2 qy
+    assert B[0, 12, 0] == pytest.approx(0.01 / mass, rel=1e-9)
+
+
+@each_row("name", list(FLYING))
+def test_steps_under_body_forces_are_linearized_at_once(name):
+    model, random = dd.load_model(MODELS / name, time_step=0.01, body_forces=FLYING[name]), np.random.default_rng(3)
+    xs = np.array([random_state(model, random) for _ in range(4)])
+    if name.startswith("sphere"):
+        xs[:, 6] = 3.0  # above the ground
+    us = random.uniform(-20, 20, (4, model.nu))
+    equal(model, xs, us)
+    equal(model, xs[:1], us[:1], method="implicit", expected=("implicit",))
+
+
+def test_a_body_force_in_contact_or_at_a_joint_limit_is_left_to_autodiff():
+    """No force acts in the first steps, so that a comparison with AutoDiffXd at these steps alone finds no error."""
+    model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.01, body_forces=FLYING["sphere_on_ground.sdf"])
+    x = model.default_state
+    x[6] = 0.0999
+    equal(model, np.array([x] * 6), np.array([[0.0]] * 4 + [[5.0]] * 2), expected=("autodiff",))
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_body_force_with_a_wrong_column_or_slope_is_caught(which):
+    model = dd.load_model(MODELS / "quadrotor.urdf", time_step=0.01, body_forces=ROTORS)
+    analytic = build_analytic(model)
+
+    def doctored(q):
+        found = analytic.body_forces(q)
+        found[which] = found[which] * (1 + 1e-6)
+        return found
+
+    assert certified(model, analytic) is analytic
+    assert isinstance(certified(model, replace(analytic, body_forces=doctored)), Refusal)
+
+
 # ---- steps that are not smooth, and the methods used for them --------------------------------------------------------
 
 
@@ -269,7 +320,7 @@ def test_other_parameters_are_never_answered_by_the_models_own(load):
 def test_derivatives_by_parameters_keep_their_source(load):
     d = dd.differentiate_step(load("pendulum.urdf"), [0.7, -1.2], [0.3], parameters=("hinge.damping",))
     assert d.method in ("implicit", "autodiff")
-    assert "not analytic: derivatives by parameters other than those of contact are requested" in d.reason
+    assert "not analytic: derivatives with respect to parameters other than those of contact are requested" in d.reason
     assert d.C.shape == (2, 1)
 
 

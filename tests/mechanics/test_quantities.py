@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.tree import FixedOffsetFrame, JacobianWrtVariable, SpatialInertia
 
 import drake_diff as dd
-from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.exceptions import InputError, ShapeError, UnknownNameError
 
 
 def differences(function, x, step=1e-6):
@@ -100,6 +100,19 @@ def _rodrigues(r):
 
 def _last_body(model):
     return max(model.plant.GetFloatingBaseBodies())
+
+
+@each_row("make", [ur5, craft])
+def test_places_and_rotations_at_many_states_in_one_call_equal_drakes(make):
+    model, random = make(), np.random.default_rng(2)
+    xs = np.array([random_state(model, random) for _ in range(6)])
+    body = "tool0" if make is ur5 else model.plant.get_body(_last_body(model)).name()
+    goal = RollPitchYaw(random.standard_normal(3)).ToRotationMatrix().matrix()
+    place = dd.quantities.frame_position(model, body, [0.1, -0.2, 0.3])
+    for function in (place, dd.quantities.frame_rotation_error(model, body, goal)):
+        assert function(xs) == pytest.approx(np.array([function(x) for x in xs]), abs=1e-13)
+        with pytest.raises(ShapeError, match=rf"x: expected shape \(6, {model.nx}\)"):
+            function(xs[:, 1:])
 
 
 def two_arms():

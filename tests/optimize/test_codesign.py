@@ -235,7 +235,8 @@ def test_a_diagram_has_one_length_of_a_step():
     problem = dd.Problem(block(), x0=[0, 0], x_goal=[1, 0], num_steps=5, horizon=(0.5, 1.0), running_cost=EFFORT)
     for method in ("shooting", "ilqr"):
         with pytest.raises(
-            InputError, match=r"no horizon with a diagram, as its steps have a fixed length: method=.collocation. takes"
+            InputError,
+            match=r"no horizon, as the steps of a diagram have a fixed length; method=.collocation. supports",
         ):
             dd.solve(problem, method=method)
 
@@ -280,7 +281,7 @@ def test_a_column_of_a_parameter_that_is_wrong_is_refused(wrong, monkeypatch):
 def test_what_collocation_cannot_move_is_named():
     model = dd.load_model(MODELS / "sphere_on_ground.sdf", time_step=0.01)
     name = next(p.name for p in dd.list_parameters(model) if p.name.endswith(".friction"))
-    with pytest.raises(InputError, match=rf"parameters: expected a parameter of motion without contact.*{name}"):
+    with pytest.raises(InputError, match=rf"parameters: expected a parameter that does not belong to contact.*{name}"):
         dd.optimize.plant_dynamics(model, (name,))
     asked = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 5, "optimize": BOTH}
     with pytest.raises(dd.exceptions.ModelError, match="PD-controlled"):
@@ -414,6 +415,7 @@ def test_parameters_are_near_a_plan_where_the_nearest_motion_in_steps_is_searche
     assert [without.cost_of_parameters(np.array([d])) for d in (0.0, 0.1)] == [0, pytest.approx(0.01 * 0.6)]
     monkeypatch.setattr(solve, "REFINING", 1)
     stepped = dd.solve(problem)
-    assert [link["ended"] for link in stepped.options["chain"]] == ["converged", "iteration_limit", "converged"]
+    ended = [link["ended"] for link in stepped.options["chain"]]
+    assert ended == ["converged", "iteration_limit", "iteration_limit", "converged"]  # iLQR too ends at its limit
     assert stepped.parameters[0] == pytest.approx(mass, rel=0.02)
     assert stepped.scheme == "step"

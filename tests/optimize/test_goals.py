@@ -22,6 +22,7 @@ from pydrake.multibody.tree import (
     UnitInertia,
 )
 from pydrake.systems.framework import DiagramBuilder
+from scipy.spatial.transform import Rotation
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, ShapeError, UnknownNameError
@@ -84,7 +85,7 @@ KINDS = {
         ("velocity", {"angular_velocity": [0, 0]}, ShapeError, "angular_velocity"),
         ("joint", {"values": {}}, InputError, "a value for each name"),
         ("joint", {"values": {"a": np.nan}}, InputError, "JointGoal a"),
-        ("mass", {"position": [None] * 3}, InputError, "a position"),
+        ("mass", {"position": [None] * 3}, InputError, "at least one number"),
         ("level", {"axis": [0, 0, 0]}, InputError, "a direction"),
         ("level", {"tolerance": -1}, InputError, "above 0"),
     ],
@@ -114,7 +115,7 @@ def test_an_unknown_name_lists_those_that_exist(arm, goal, words):
     "goals, words",
     [
         (dd.Constraint(lambda x: x[0], upper=1), "a goal such as FrameGoal"),
-        (dd.FrameGoal("lower", [0.1, 0.2, -0.5]), "entry 1 is 0 wherever"),  # the arm swings in x and z
+        (dd.FrameGoal("lower", [0.1, 0.2, -0.5]), "entry 1, which is 0 in every"),  # the arm swings in x and z
         (dd.FrameGoal("lower", [0.1, 0, -0.5], knots=21), "from -21 to 20"),
         (dd.KeepLevel("upper", tolerance=0.2), "upper level is 0.3 rad off"),  # x0 leans by 0.3 rad
         (dd.JointGoal({"elbow": 1.0, "elbow_q": 1.0}), "both are the same coordinate"),
@@ -202,6 +203,26 @@ def test_a_weight_makes_a_goal_a_cost(arm):
     assert found.options["derivatives"] == wanted.options["derivatives"] == "symbolic, exact Hessian"
     assert found.cost == pytest.approx(wanted.cost, rel=1e-8)
     np.testing.assert_allclose(found.xs, wanted.xs, atol=1e-6)  # two runs of IPOPT to 1e-8
+
+
+def test_a_cost_of_goals_at_many_states_is_the_sum_of_its_values():
+    lift = dd.model.BodyForce("lift", "body")
+    model = dd.load_model(MODELS / "quadrotor.urdf", time_step=0.02, body_forces=[lift])
+    goals = [
+        dd.FrameGoal("body", position=[1, None, 2], rotation=[0.6, 0, 0.8, 0], weight=3.0, knots=None),
+        dd.JointGoal({model.state_names[8]: 0.5}, weight=2.0, knots=None),
+    ]
+    cost = dd.QuadraticCost(Q=np.eye(model.nx))
+    problem = dd.Problem(model, x0=model.default_state, num_steps=5, goals=goals, running_cost=cost)
+    xs, running = np.random.default_rng(1).standard_normal((6, model.nx)), problem.total_running_cost
+    us = np.zeros((5, 1))
+    assert running.takes_rows
+    relative = Rotation.from_quat(xs[:5, [1, 2, 3, 0]]) * Rotation.from_quat([0, 0.8, 0, 0.6]).inv()
+    turned = 2 * np.sin(relative.magnitude() / 2)
+    off = (xs[:5, 4] - 1) ** 2 + (xs[:5, 6] - 2) ** 2 + turned**2
+    wanted = np.sum(xs[:5] ** 2) + 3 * np.sum(off) + 2 * np.sum((xs[:5, 8] - 0.5) ** 2)
+    assert problem.objective(xs, us) == pytest.approx(0.02 * wanted, rel=1e-12)
+    assert running(xs[0], us[0]) == pytest.approx(running(xs, us)[0], rel=1e-12)
 
 
 def test_a_level_link_stays_level_and_a_free_one_does_not(arm):

@@ -18,6 +18,7 @@ from drake_diff.optimize import Options
 from drake_diff.optimize.program import NlpResult, Outcome
 from drake_diff.optimize.run import Run
 from drake_diff.optimize.solution import Status
+from drake_diff.optimize.verification import near
 
 pytestmark = pytest.mark.solve
 
@@ -40,6 +41,7 @@ def pendulum(load, **problem):
     return dd.Problem(load("pendulum.urdf", time_step=0.02), **fields)
 
 
+QUADRATIC = dd.QuadraticCost(R=[[1.0]])
 SOFT = {
     "running_cost": dd.QuadraticCost(Q=np.diag([0.1, 0.01]), R=[[0.1]], x_ref=[np.pi, 0]),
     "final_cost": dd.QuadraticCost(Q=np.diag([50, 5]), x_ref=[np.pi, 0]),
@@ -67,6 +69,19 @@ def test_where_the_optimum_in_steps_is_far_a_motion_in_them_near_the_collocated_
         assert "not an optimum in these steps" in " ".join(solution.notes)
         replayed = dd.rollout(solution.problem.model, solution.xs[0], solution.us).xs
         assert np.max(np.abs(replayed - solution.xs)) < 1e-6  # required of the README's cart-pole
+
+
+@each_row("factor, verified", [(1.2, True), (1.3, False)])
+def test_a_motion_in_steps_near_a_plan_is_not_verified_at_a_much_higher_cost(load, factor, verified):
+    problem = dd.Problem(
+        load("pendulum.urdf", time_step=0.01), x0=[0, 0], x_goal=[0.5, 0], num_steps=40, running_cost=QUADRATIC
+    )
+    plan, motion = (dd.solve(problem, method=method) for method in ("collocation", "shooting"))
+    assert near(plan, motion) is motion
+    dearer = dataclasses.replace(problem, running_cost=dd.QuadraticCost(R=factor * QUADRATIC.R))
+    found = near(plan, dataclasses.replace(motion, problem=dearer))
+    assert found.success == verified
+    assert (f"exceeds the collocated plan's cost {plan.cost:.4g} by over 25%" in found.message) != verified
 
 
 @pytest.mark.parametrize("method", ["shooting", "ilqr"])
@@ -200,9 +215,9 @@ def test_collocation_through_a_ball_between_two_knots_is_not_verified():
     [
         ({"method": "magic"}, "method: expected one of auto, collocation, ilqr, shooting, got 'magic'"),
         ({"solver": "magic"}, "solver: expected one of ipopt, snopt, got 'magic'"),
-        ({"method": "ilqr", "solver": "snopt"}, "solver: expected none for method"),
-        ({"method": "ilqr", "mesh_rounds": 2}, "mesh_rounds: expected none for method"),
-        ({"method": "collocation", "sweeps": 2}, "sweeps: expected none for .* of method=.shooting"),
+        ({"method": "ilqr", "solver": "snopt"}, "solver: expected (no value|another one) for method"),
+        ({"method": "ilqr", "mesh_rounds": 2}, "mesh_rounds: expected no value for method"),
+        ({"method": "collocation", "sweeps": 2}, "sweeps: expected no value for .* of method=.shooting"),
         ({"method": "shooting", "guess_iterations": 2}, "guess_iterations: .* of method=.auto"),
         ({"max_iterations": 0}, "max_iterations"),
         ({"time_limit": -1.0}, "time_limit"),

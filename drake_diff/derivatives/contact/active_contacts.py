@@ -300,7 +300,7 @@ class AllPairs:
             names = " and a ".join(type(shape).__name__ for shape in self.others.shapes[pair - count])
             bodies = " and ".join(body.name() for body in self.others.bodies[pair - count])
             for state in touch.state[which[~known]]:
-                unknown[int(state)] = f"where Drake finds a {names} to touch, of {bodies}, jumps or has no derivative"
+                unknown[int(state)] = f"Drake's contact point of a {names}, of {bodies}, jumps or has no derivative"
             placed.to_one_side.update(touch.state[which[sided]].tolist())
         return unknown
 

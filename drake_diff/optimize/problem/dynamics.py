@@ -48,7 +48,7 @@ class Pointwise:
             raise InputError(subject, got=type(f).__name__, expected=ORDINARY)
         self.subject, self.f, self.nx, self.shape = subject, f, nx, shape
         self.rows = int(np.prod(shape))
-        self.takes_columns = False
+        self.takes_rows = self.takes_columns = False
         with np.errstate(all="ignore"):
             single = self.values(probe)
             carried_values, slopes = self.linearize(probe)
@@ -56,8 +56,11 @@ class Pointwise:
         largest = SAME_VALUES * float(np.max(np.nan_to_num([np.abs(single), terms], posinf=0.0), initial=0.0))
         if not np.allclose(carried_values, single, rtol=0, atol=largest, equal_nan=True):
             i = np.unravel_index(int(np.nanargmax(np.abs(carried_values - single))), single.shape)
-            got = f"{carried_values[i]:.6g} with derivatives and {single[i]:.6g} with plain numbers"
+            got = f"{carried_values[i]:.6g} with AutoDiffXd and {single[i]:.6g} with floats"
             raise GradientError(f"{subject} is {got} at the same x and u: write it as {ORDINARY}")
+        if getattr(f, "takes_rows", False):  # forward kinematics are compared with Drake's
+            self.takes_rows = True
+            self.takes_rows = bool(np.allclose(self.values(probe), single, rtol=SAME_VALUES, atol=0.0))
         try:
             self.takes_columns = True
             together, _ = self.linearize(probe)
@@ -67,6 +70,8 @@ class Pointwise:
 
     def values(self, knots: Array) -> Array:
         """Return the values (K, r) at `knots` (K, nx + nu)."""
+        if self.takes_rows:
+            return np.asarray(self.f(knots[:, : self.nx], knots[:, self.nx :]), dtype=float).reshape(-1, self.rows)
         if self.takes_columns:
             return np.asarray(self._call(knots.T, len(knots)), dtype=float).reshape(self.rows, -1).T
         return np.array([np.asarray(self._call(k), dtype=float).reshape(self.rows) for k in knots])
@@ -377,7 +382,7 @@ def plant_dynamics(model: Model, parameters: Any = ()) -> Dynamics:
     vector = select(model, parameters)
     for parameter in vector.parameters:
         if parameter.kind in CONTACT_KINDS:
-            expected = "a parameter of motion without contact, as collocation leaves contact out"
+            expected = "a parameter that does not belong to contact, which collocation ignores"
             raise InputError("parameters", got=parameter.name, expected=expected)
     return Dynamics(
         PlantKnots(model, vector),
@@ -526,7 +531,7 @@ def bounds_of(system: Model | Dynamics, given: Any) -> Any:
             if value is not None:
                 bound = array_with_gaps(f"bounds of {name}", value, ())
                 if np.isnan(bound):
-                    raise InputError(f"bounds of {name}", got=repr(pair)[:80], expected="numbers, None for no bound")
+                    raise InputError(f"bounds of {name}", got=repr(pair)[:80], expected="numbers, or None for no bound")
                 sides[f"{kind}_{side}"][index] = bound
     return Bounds(**sides)
 

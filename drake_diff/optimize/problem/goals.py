@@ -11,7 +11,8 @@ because steps of another length lead to slightly different states.
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass, fields, replace
-from typing import Any
+from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from drake_diff.mechanics.quantities import (
 )
 from drake_diff.model.model import Model
 from drake_diff.optimize.problem.constraint import Constraint, Described
+from drake_diff.optimize.problem.cost import ConstantCost, QuadraticCost
 from drake_diff.optimize.problem.dynamics import coordinates
 
 LAST = (-1,)
@@ -78,17 +80,24 @@ class GoalConstraint(Constraint):
     def whole(self) -> bool:
         return self.knots is None or self.dwells
 
-    @property
+    @cached_property
     def wanted(self) -> Array:
         """The middle of the bounds (m,), or NaN for a row with at most one bound."""
         both = np.isfinite(self.lower) & np.isfinite(self.upper)
         return np.where(both, np.where(both, self.lower, 0.0) / 2 + np.where(both, self.upper, 0.0) / 2, np.nan)
 
     def residuals(self, x: Any) -> Any:
-        """Return the residuals at x (nx,), of floats, AutoDiffXd or symbols, of the rows with a wanted value."""
+        """Return the residuals at x (nx,), of floats, AutoDiffXd or symbols, of the rows with a wanted value.
+
+        If `takes_rows`, the result is (K, .) at the rows x (K, nx) of floats.
+        """
         if self.measured is not None:
             return self.measured(x)
-        return (np.asarray(self.function(x)) - self.wanted)[~np.isnan(self.wanted)]
+        return (np.asarray(self.function(x)) - self.wanted)[..., ~np.isnan(self.wanted)]
+
+    @property
+    def takes_rows(self) -> bool:
+        return self.measured is None and getattr(self.function, "takes_rows", False)
 
     def miss(self, x: Array) -> float:
         """Return the deviation of x (nx,) from the goal, or inf if it is not a number.
@@ -358,7 +367,7 @@ class CenterOfMassGoal(Goal):
 
     def _check(self) -> None:
         if self.position == FREE:
-            raise InputError("CenterOfMassGoal", got="nothing but free entries", expected="a position")
+            raise InputError("CenterOfMassGoal", got="only free entries", expected="at least one number")
 
     def targets(self, model: Model) -> Iterator[Target]:
         yield Target(center_of_mass(model), self.position, self.tolerance, "m", "centre of mass")
@@ -466,7 +475,7 @@ class Dwell(Goal):
         if not -count - 1 <= self.end <= count:
             raise InputError("Dwell.end", got=self.end, expected=f"a whole number from {-count - 1} to {count}")
         if horizon is not None and horizon[0] < horizon[1]:
-            expected = "a horizon that is given; a PhasedProblem has a phase for a stay"
+            expected = "a given horizon; with a free horizon, the stay can be a phase of a PhasedProblem"
             raise InputError("Dwell", got="a free horizon", expected=expected)
         last, h = self.end % (count + 1), problem.start_horizon / count
         first = last - math.ceil(self.seconds / h - ROUNDED)
@@ -495,9 +504,10 @@ class _Entries:
     """A function x (nx,) -> the selected entries."""
 
     which: tuple[int, ...]
+    takes_rows: ClassVar = True
 
     def __call__(self, x: Any) -> Any:
-        return np.asarray(x)[list(self.which)]
+        return np.asarray(x)[..., list(self.which)]
 
 
 @dataclass(frozen=True)
@@ -514,17 +524,25 @@ class _Squared:
 
 @dataclass(frozen=True, eq=False)
 class WithGoals:
-    """A cost plus the weighted squares of goals' residuals, of x (nx,) and, as a running cost, of u (nu,)."""
+    """A cost plus the weighted squares of goals' residuals, of x (nx,) and, as a running cost, of u (nu,).
+
+    If `takes_rows`, it also returns the costs (K,) at K rows of floats.
+    """
 
     own: Any  # the user's cost, or None
     goals: tuple[tuple[float, GoalConstraint], ...]
 
     def __call__(self, x: Any, *u: Any) -> Any:
-        total = 0.0 * x[0] if self.own is None else self.own(x, *u)
+        total = 0.0 * x[..., 0] if self.own is None else self.own(x, *u)
         for weight, goal in self.goals:
             off = goal.residuals(x)
-            total = total + weight * (off @ off)
+            total = total + weight * (off * off).sum(axis=-1)
         return total
+
+    @cached_property
+    def takes_rows(self) -> bool:
+        known = self.own is None or isinstance(self.own, (QuadraticCost, ConstantCost))
+        return known and all(goal.takes_rows for _, goal in self.goals)
 
 
 def _target_marks(label: str, position: Any, tolerance: float) -> tuple[Mark, ...]:

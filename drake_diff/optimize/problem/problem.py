@@ -270,7 +270,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
     def model(self) -> Model:
         """The model. Raises ModelError for plain dynamics."""
         if not isinstance(self.system, Model):
-            raise ModelError("this problem is one of plain dynamics: it has no model")
+            raise ModelError("the problem has plain dynamics and no model")
         return self.system
 
     @cached_property
@@ -624,8 +624,8 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         if running is not None:
             before = xs[: len(inputs)]
             quadratic = quadratic_along(running, h * np.arange(float(len(inputs))))
-            if quadratic is not None:
-                rates = quadratic(before, inputs)
+            if quadratic is not None or getattr(running, "takes_rows", False):
+                rates = (quadratic or running)(before, inputs)
             else:
                 along = enumerate(zip(before, inputs, strict=True))
                 rates = np.array([float(cost_at(running, k * h)(x, u)) for k, (x, u) in along])
@@ -664,7 +664,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         if mask.shape != (self.nx,):
             raise ShapeError("initial_state_mask", got=mask.shape, expected=(self.nx,))
         if mask.dtype != bool or mask.any() != free:
-            expected = "booleans, of which some are True" if free else 'none, without "initial_state" in optimize'
+            expected = "booleans, of which some are True" if free else 'no True without "initial_state" in optimize'
             raise InputError("initial_state_mask", got=f"{mask.tolist()}", expected=expected)
         return mask
 
@@ -699,7 +699,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
                 raise InputError(
                     f"{subject}, {self.state_names[i]}",
                     got=tolerance[i],
-                    expected="no tolerance of an entry without a goal",
+                    expected="no tolerance, as the entry has no goal",
                 )
         return tolerance
 
@@ -707,7 +707,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         given = {} if self.waypoints is None else self.waypoints
         if not isinstance(given, Mapping):
             raise InputError("waypoints", got=f"{given!r:.80}", expected="a mapping from knots to states")
-        subject = "knots of waypoints (the last state's is x_goal)"
+        subject = "knots of waypoints (the last state has x_goal)"
         knots = {count(subject, k, 1, self.num_steps - 1): state for k, state in given.items()}
         states, before = dict[int, Array](), self.x0
         for k, state in sorted(knots.items()):
@@ -723,7 +723,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return last
 
     def _check_constraints(self) -> tuple[Constraint, ...]:
-        where = "; couplings= takes it" if isinstance(self.constraints, Couples) else ""
+        where = "; pass a coupling as couplings=" if isinstance(self.constraints, Couples) else ""
         given = several("constraints", self.constraints, Constraint, f"a Constraint or several{where}")
         return tuple(constraint.resolved(self.x0, np.zeros(self.nu)) for constraint in given)
 
@@ -733,7 +733,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         taken = {c.label for c in self.constraints}
         for c in couplings:
             if c.label in taken:
-                raise InputError("couplings", got=f"two of name {c.label}", expected="a name of its own for each")
+                raise InputError("couplings", got=f"two named {c.label}", expected="a different name for each")
             taken.add(c.label)
             if isinstance(c, RateLimit):
                 c.entries(self.system)
@@ -786,9 +786,9 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             fixed = self._fixed_values(constraint)
             apart = np.maximum(constraint.lower - fixed, fixed - constraint.upper)
             for i in np.flatnonzero(apart > NO_SLOPE)[:1]:
-                got = f"{constraint.wanted[i]:.6g}, but its entry {i} is {fixed[i]:.6g} wherever {self.name} goes"
+                got = f"{constraint.wanted[i]:.6g} for entry {i}, which is {fixed[i]:.6g} in every state of {self.name}"
                 raise InputError(
-                    f"goal {constraint.label}", got=got, expected="a target of an entry that a joint can change"
+                    f"goal {constraint.label}", got=got, expected="targets of entries that a joint can change"
                 )
 
     def _fixed_values(self, constraint: GoalConstraint) -> Array:
