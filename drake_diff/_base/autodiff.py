@@ -146,7 +146,7 @@ def gradient_of(f: Callable[[Any], Any], z: Array) -> tuple[float, Array]:
         value, derivatives = result[0].value(), result[0].derivatives()
         gradient[active] = derivatives if len(derivatives) else 0.0
     if not (np.isfinite(value) and np.all(np.isfinite(gradient))):
-        raise GradientError(f"the loss or its gradient is not finite, as that of a norm at zero: value {value}")
+        raise GradientError(f"the loss or its gradient is not finite, like the gradient of a norm at 0: loss {value}")
     return value, gradient
 
 

@@ -249,7 +249,7 @@ def read_plain(path: Path, most: int = MOST_FILE, *, links: bool = False) -> byt
         size = os.fstat(file.fileno()).st_size
         data = file.read(size + 1)  # Python allocates the requested size
     if len(data) != size:
-        raise ArtifactError(f"{path}: it was changed while it was read")
+        raise ArtifactError(f"{path}: the file changed while it was read")
     return data
 
 
@@ -297,7 +297,7 @@ def json_of(data: bytes) -> Any:
     try:
         document = json.loads(data.decode("utf-8"), parse_constant=_refuse, parse_float=_finite)
     except RecursionError as error:
-        raise ValueError(f"expected at most {DEEPEST} lists and objects inside one another") from error
+        raise ValueError(f"expected at most {DEEPEST} levels of nested lists and objects") from error
     level = [document]
     for _ in range(DEEPEST):
         inner: list[Any] = []
@@ -308,11 +308,11 @@ def json_of(data: bytes) -> Any:
             elif isinstance(value, list):
                 inner += value
             elif isinstance(value, str) and SURROGATE.search(value):
-                raise ValueError("a text is not valid Unicode: it has half of a surrogate pair")
+                raise ValueError("a string is not valid Unicode: it contains an unpaired surrogate")
         if not inner:
             return document
         level = inner
-    raise ValueError(f"expected at most {DEEPEST} lists and objects inside one another")
+    raise ValueError(f"expected at most {DEEPEST} levels of nested lists and objects")
 
 
 def _refuse(constant: str) -> None:
@@ -338,20 +338,20 @@ def arrays_of(path: Path, most: int = MOST_ARRAYS) -> dict[str, Array]:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = archive.infolist()
             if len({m.filename for m in members}) < len(members):
-                raise ValueError(f"expected each array once, got {len(members)}")
+                raise ValueError(f"expected distinct names of arrays, got duplicates in {len(members)}")
             whole = sum(member.file_size for member in members)
             if whole > most:
-                raise ValueError(f"expected at most {most} bytes, unpacked, got {whole}")
+                raise ValueError(f"expected at most {most} bytes after decompression, got {whole}")
             return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
     except ArtifactError:
         raise
     except Exception as error:  # zipfile and NumPy raise many errors for invalid files
-        raise ArtifactError(f"{path} is no file of arrays: {type(error).__name__}: {error}") from error
+        raise ArtifactError(f"{path} is not a NumPy .npz file: {type(error).__name__}: {error}") from error
 
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Array:
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # the others unpack without a limit
-        raise ValueError(f"{member.filename}: its compression method is not one of NumPy's")
+        raise ValueError(f"{member.filename}: expected a stored or deflated array, got another compression method")
     with archive.open(member) as packed:
         data = packed.read(member.file_size + 1)  # read() alone would unpack more than the index declares
     file = io.BytesIO(data)
@@ -361,9 +361,9 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Array:
         raise ValueError(f"{member.filename}: expected a header of version 1.0 or 2.0, got {version}")
     shape, by_columns, dtype = read(file)
     if dtype != np.dtype("<f8"):
-        raise ValueError(f"{member.filename}: expected numbers of 64 bits, got {dtype}")
+        raise ValueError(f"{member.filename}: expected 64-bit floating-point numbers, got {dtype}")
     count = len(data) - file.tell()
     if any(n < 0 for n in shape) or 8 * math.prod(shape) != count:
-        raise ValueError(f"{member.filename}: {count} bytes are not the numbers of an array of shape {shape}")
+        raise ValueError(f"{member.filename}: {count} bytes do not match an array of shape {shape}")
     numbers = np.frombuffer(data, dtype="<f8", offset=file.tell())
     return frozen(numbers.reshape(shape, order="F" if by_columns else "C"))

@@ -88,11 +88,11 @@ def _outcome(folder: Path, status: int, request: Mapping[str, Any]) -> CallOutco
         killed = ", or the machine ran out of memory" if -status == signal.SIGKILL else ""
         return CallOutcome(error=f"it exceeded its time limit of {request['seconds']:g} s{killed}", is_limit=True)
     if -status == signal.SIGXFSZ:
-        return CallOutcome(error=f"its answer has more than {LARGEST_ANSWER} bytes")
+        return CallOutcome(error=f"its result has more than {LARGEST_ANSWER} bytes")
     if status < 0:
         name = signal.Signals(-status).name + _last_line((folder / OUTPUT).read_bytes())
-        return CallOutcome(error=f"the model cannot be read or run: the process that did so ended by {name}")
-    return CallOutcome(error=f"its process ended with status {status} and gave no answer")
+        return CallOutcome(error=f"the model cannot be read or run: the child process was ended by {name}")
+    return CallOutcome(error=f"the child process ended with status {status} and without a result")
 
 
 def serve() -> None:

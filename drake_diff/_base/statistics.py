@@ -30,7 +30,7 @@ def success_rate(successes: int, trials: int) -> Rate:
         raise InputError(
             "successes",
             got=f"{successes} of {trials}",
-            expected="from 0 to all of the trials, of which there is at least one",
+            expected="a number from 0 to the number of trials, which is at least 1",
         )
     p, n, z = successes / trials, trials, NORMAL_95
     middle, half = p + z * z / (2 * n), z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))

@@ -31,7 +31,7 @@ def _print_version(asked: bool) -> None:
         typer.echo(f"drake-diff {version('drake-diff')}")
         typer.echo(f"Steps are differentiated by compiled functions (Numba {version('numba')})")
     except PackageNotFoundError as error:
-        raise MissingDependencyError("drake-diff runs from a folder and is not installed: pip install -e .") from error
+        raise MissingDependencyError("drake-diff has no version, as it is not installed: pip install -e .") from error
     raise typer.Exit
 
 
@@ -102,7 +102,7 @@ def _status_of_app() -> Any:
         print(f"drake-diff: {type(error).__name__}: {words}", file=sys.stderr)
         return MISSING if isinstance(error, MissingDependencyError) else USAGE
     except MemoryError:
-        text = "drake-diff: MemoryError: the command needs more memory than is free, or than its limit allows"
+        text = "drake-diff: MemoryError: the command needs more memory than is free or than its limit allows"
         print(text, file=sys.stderr)
         return USAGE
     except Exception:

@@ -63,7 +63,7 @@ def certify(
         int, typer.Option(help="Number of states to sample, every second one in contact where possible.")
     ] = 20,
     seed: Seed = 0,
-    parameters: Annotated[str | None, names_option("Parameters to differentiate by as well", "none")] = None,
+    parameters: Annotated[str | None, names_option("Parameters of additional derivatives", "none")] = None,
     method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "auto",
     out: Annotated[Path | None, out_option("artifacts/certify_<model>")] = None,
 ) -> None:
@@ -104,7 +104,7 @@ def compare(
         str | None, names_option("Engines to compare, such as mujoco or drake:lagged", "all installed")
     ] = None,
     recording: Annotated[
-        list[Path] | None, typer.Option(help="A recorded motion to repeat: CSV, MCAP or a ROS 2 bag.")
+        list[Path] | None, typer.Option(help="A recorded motion to compare with Drake: CSV, MCAP or a ROS 2 bag.")
     ] = None,
     num_steps: Annotated[
         int | None, typer.Option(min=1, help="Length of the motion in steps.", show_default="one second")
@@ -161,14 +161,14 @@ def identify(
         str,
         typer.Option(
             metavar="PART|NAME",
-            help="The part at the end of each recording, or the recording, to predict and not to fit.",
+            help="Fraction at the end of each recording, or name of a recording, to predict instead of fit.",
         ),
     ] = "0.2",
     motion: Annotated[str, typer.Option(help="auto, continuous, steps or impacts")] = "auto",
     prior: Annotated[list[str] | None, repeated("PARAMETER=MEAN,DEVIATION", "Prior of a parameter")] = None,
     bounds: Annotated[list[str] | None, repeated("PARAMETER=LOWER,UPPER", "Bounds of a parameter")] = None,
     sensor: Annotated[
-        list[str] | None, repeated("LABEL=BODY:X,Y,Z[,R,P,Y]", "Where a sensor sits on a body [m, rad]")
+        list[str] | None, repeated("LABEL=BODY:X,Y,Z[,R,P,Y]", "Pose of a sensor in the frame of its body [m, rad]")
     ] = None,
     out: Annotated[Path | None, out_option("artifacts/identify_<model>")] = None,
 ) -> None:
@@ -220,7 +220,7 @@ def excite(
     x0: Annotated[
         str | None,
         typer.Option(
-            metavar="NUMBERS", show_default="the model's", help="The initial state, at rest, with commas between."
+            metavar="NUMBERS", show_default="the model's", help="Initial state at rest: numbers separated by commas."
         ),
     ] = None,
     noise: Annotated[
@@ -229,7 +229,7 @@ def excite(
     limit: Annotated[list[str] | None, repeated("NAME=MOST|LOWER,UPPER", "Limits of a state or an input")] = None,
     harmonics: Annotated[int, typer.Option(help="Number of frequencies in the input signals.")] = 4,
     max_iterations: Annotated[
-        int, typer.Option(min=0, help="Iterations of the search; 0 takes the best of the random motions.")
+        int, typer.Option(min=0, help="Iterations of the search; 0 selects the best random motion.")
     ] = 20,
     seed: Seed = 0,
     out: Annotated[Path | None, typer.Option(dir_okay=False, help="CSV file to write, with motion and inputs.")] = None,
@@ -248,7 +248,7 @@ def excite(
     names: Any = "all" if parameters is None else names_in(parameters)
     limits = numbers_in("--limit", limit or (), "NAME=MOST or NAME=LOWER,UPPER", counts=(1, 2))
     asked: dict[str, Any] = {
-        "x0": None if x0 is None else floats_in("--x0", x0, "numbers with commas between"),
+        "x0": None if x0 is None else floats_in("--x0", x0, "numbers separated by commas"),
         "noise": _deviations(noise),
         "limits": {name: ends if len(ends) > 1 else ends[0] for name, ends in limits.items()} or None,
         "harmonics": harmonics,

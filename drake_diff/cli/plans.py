@@ -34,7 +34,7 @@ EXAMPLE = "panda"  # the robot of `drake-diff plan` without arguments
 
 Goals = Annotated[
     list[str] | None,
-    typer.Option(metavar="NAME=NUMBERS", help="hand=0.4,0,0.5 for a frame or body, in metres, elbow=1.0 for a joint."),
+    typer.Option(metavar="NAME=NUMBERS", help="hand=0.4,0,0.5 [m] for a frame or body, elbow=1.0 for a joint."),
 ]
 
 Obstacles = Annotated[
@@ -65,7 +65,7 @@ def plan(
 
     The default goal is a random state that the robot can reach. Exit status 0 only if the plan is verified.
     """
-    expected = "NAME=x,y,z of a frame, or NAME=number of a joint: numbers with commas between"
+    expected = "NAME=x,y,z for a frame, or NAME=number for a joint"
     numbers = numbers_in("--goal", goal or (), expected, counts=range(1, 100))
     goals = {name: list(values) for name, values in numbers.items()}
     shapes, folders = [_shape(words) for words in avoid or ()], packages_in(packages)
@@ -110,7 +110,7 @@ def _shape(words: str) -> tuple[str, list[float]]:
     expected = "sphere:x,y,z,radius or box:x,y,z,length,width,height"
     if not colon or kind not in NUMBERS:
         raise InputError("--avoid", got=repr(words), expected=expected)
-    numbers = floats_in("--avoid", values, f"numbers with commas between: {expected}")
+    numbers = floats_in("--avoid", values, f"numbers separated by commas: {expected}")
     if len(numbers) != NUMBERS[kind]:
         raise InputError("--avoid", got=repr(words), expected=f"{NUMBERS[kind]} numbers: {expected}")
     return kind, numbers
@@ -124,7 +124,7 @@ def add_commands(app: typer.Typer) -> None:
 
 def robustness(
     run: RunDirectory,
-    trials: Annotated[int, typer.Option(help="How many trials at each level.")] = 100,
+    trials: Annotated[int, typer.Option(help="Number of trials at each level.")] = 100,
     perturbations: Annotated[str | None, names_option("Perturbations", "all that apply to the model")] = None,
     controller: Annotated[str, typer.Option(help="tvlqr, mpc or open_loop")] = "tvlqr",
     seed: Seed = 0,
@@ -169,7 +169,7 @@ def panel(
     file: Annotated[
         Path, typer.Argument(metavar="FILE", help="A TOML file that names a function, axes and the number of seeds.")
     ],
-    workers: Annotated[int | None, typer.Option(help="How many processes.", show_default="one for each core")] = None,
+    workers: Annotated[int | None, typer.Option(help="Number of processes.", show_default="one for each core")] = None,
     engine: Annotated[str, typer.Option(help="local, or ray for a cluster")] = "local",
     address: Annotated[
         str | None, typer.Option(help="HOST:PORT of a running Ray cluster.", show_default="start one here")
@@ -192,7 +192,7 @@ def panel(
 
             results = run_panel(file, out=directory, workers=workers, engine=engine, address=address, progress=count)
     except KeyboardInterrupt:
-        show(f"interrupted: finished trials are in {directory}; the same command goes on from there")
+        show(f"interrupted: finished trials are in {directory}; the same command continues with the others")
         raise typer.Exit(INTERRUPTED) from None
     cells = results.summary["cells"]
     axes, names = (list(dict.fromkeys(name for cell in cells for name in cell[key])) for key in ("cell", "numbers"))
@@ -209,5 +209,5 @@ def panel(
         rows.append(words)
     show_table([*axes, "trials", "errors", *judgement, *names], rows, wrap=console().is_terminal)
     show(f"{results.summary['trials']} trials, {results.errors} errors")
-    show(f"wrote {directory}: record.json, table.csv, summary.json, panel.html, a record of each trial in trials")
+    show(f"wrote {directory}: record.json, table.csv, summary.json, panel.html, and a record of each trial in trials")
     conclude(not results.errors)

@@ -45,7 +45,7 @@ def run(
     script: Annotated[Path, typer.Argument(metavar="SCRIPT", help="A Python file with a function problem().")],
     out: Annotated[Path | None, out_option("artifacts/<script>")] = None,
     cross_check: Annotated[
-        bool, typer.Option("--cross-check", help="Replay the plan in continuous time and in MuJoCo too.")
+        bool, typer.Option("--cross-check", help="Also replay the plan in continuous time and in MuJoCo.")
     ] = False,
     view: Annotated[
         bool, typer.Option("--view", help="Show the search in a browser on this machine, and its plan until Ctrl-C.")
@@ -97,7 +97,7 @@ def _run_into(directory: Path, script: Path, cross_check: bool, options: dict[st
     except KeyboardInterrupt:
         if folder is not None:
             raise
-        show(f"interrupted before {directory} was opened: nothing is written")
+        show(f"interrupted before {directory} was created: no file is written")
         raise typer.Exit(INTERRUPTED) from None
 
 
@@ -192,7 +192,7 @@ def _show_phases(record: Any) -> None:
     show_table(columns, [(p.name, p.status, p.cost, p.duration) for p in record.phases.phases])
     for link in record.phases.links:
         errors = [float("inf") if error is None else error for error in link.errors]
-        show(f"link {link.before} to {link.after}: missed by {max(errors):.3g}, tolerance {link.tolerance:g}")
+        show(f"link {link.before} to {link.after}: error {max(errors):.3g}, tolerance {link.tolerance:g}")
     show(f"the chain of all phases: {plain(record.phases.chain.told)}")
 
 
@@ -200,11 +200,11 @@ def _loaded(script: Path) -> ModuleType:
     """Import the script as a module; its `if __name__ == "__main__"` part does not run."""
     spec = importlib.util.spec_from_file_location("drake_diff_script", script)
     if spec is None or spec.loader is None:
-        raise InputError("SCRIPT", got=str(script), expected="a Python file, its name ending in .py")
+        raise InputError("SCRIPT", got=str(script), expected="a Python file, whose name ends in .py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     if not callable(getattr(module, "problem", None)):
-        raise InputError("SCRIPT", got=f"{script} without it", expected="a function problem() that returns a Problem")
+        raise InputError("SCRIPT", got=str(script), expected="a file with a function problem() that returns a Problem")
     return module
 
 
@@ -270,7 +270,7 @@ def list_all(
 
 
 def recover_run(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="The directory NAME.partial-... that a run left.")],
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="The directory NAME.partial-... of an unfinished run.")],
     out: Annotated[Path | None, out_option("<NAME>")] = None,
 ) -> None:
     """Complete a run that was killed, interrupted or stopped by a full disk: measure the plan in RUN, write the rest.

@@ -24,13 +24,13 @@ GREEN, RED = ("pass", "holds", "agree"), ("fail", "broken", "error", "damaged")
 
 RunDirectory = Annotated[Path, typer.Argument(metavar="RUN", help="A run directory.")]
 ModelFolder = Annotated[
-    Path | None, typer.Option("--models", help="A folder from which meshes and models that RUN names may be read.")
+    Path | None, typer.Option("--models", help="Folder from which the models and meshes of RUN may be read.")
 ]
 WithoutMeshes = Annotated[
     bool,
     typer.Option("--without-meshes", help="Do not copy the meshes into the run directory; verify then needs --models."),
 ]
-Seed = Annotated[int, typer.Option(min=0, help="The same seed gives the same draws.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
 
 
 def out_option(default: str) -> Any:
@@ -40,7 +40,7 @@ def out_option(default: str) -> Any:
 
 def names_option(what: str, otherwise: str) -> Any:
     """Return an option for names separated by commas; see `names_in`."""
-    return typer.Option(metavar="NAMES", show_default=otherwise, help=f"{what}, with commas between.")
+    return typer.Option(metavar="NAMES", show_default=otherwise, help=f"{what}, separated by commas.")
 
 
 def repeated(metavar: str, what: str) -> Any:
@@ -88,7 +88,7 @@ def _load(
     contact_approximation: Annotated[str, typer.Option(help="sap, similar or lagged")] = "sap",
     contact_geometry: Annotated[
         str | None,
-        typer.Option(help="Contact geometry where Drake refuses pairs: corner_spheres, hydroelastic or differences"),
+        typer.Option(help="Treatment of shape pairs without derivatives: corner_spheres, hydroelastic or differences"),
     ] = None,
     actuators: Annotated[
         str | None,
@@ -113,7 +113,7 @@ def _load(
     gravity: Annotated[
         str | None, typer.Option(metavar="X,Y,Z", show_default="0,0,-9.81", help="Gravity in m/s^2.")
     ] = None,
-    contact: Annotated[bool, typer.Option(help="Whether anything collides.")] = True,
+    contact: Annotated[bool, typer.Option(help="Whether to simulate contact.")] = True,
 ) -> Any:
     # Invalid input is rejected before Drake is loaded.
     options: dict[str, Any] = {
@@ -154,7 +154,7 @@ def survived(file: Path, options: Mapping[str, Any]) -> None:
 
     crash = crash_of(read)
     if crash:
-        message = f"ModelError: {file}: the model cannot be read: the process that tried to ended by {crash}"
+        message = f"ModelError: {file}: the model cannot be read: the process that read it ended by {crash}"
         console(stderr=True).print(plain(f"drake-diff: {message}"), soft_wrap=True)
         raise typer.Exit(1)
 

@@ -125,10 +125,10 @@ def excite(
     positive_float("period", period)
     positive_int("harmonics", harmonics)
     if round(duration / period) < 2 * LEAST:
-        raise InputError("duration", got=f"{duration} s", expected=f"{2 * LEAST} periods of {period} s, or more")
+        raise InputError("duration", got=f"{duration} s", expected=f"at least {2 * LEAST} periods of {period} s")
     tree = tree_for_identification(model)
     if isinstance(tree, Refusal):
-        raise ModelError(f"{model.name} has no motion in continuous time here: {tree}")
+        raise ModelError(f"{model.name}: motion in continuous time is not supported: {tree}")
     unknowns, chart = choose_unknowns(model, tree, parameters), Chart(coordinates_of(model))
     if noise is None:
         names = tangent_space(model).names[: model.nv]
@@ -142,7 +142,7 @@ def _first(model: Model, x0: Any) -> Array:
     if x0 is not None:
         x = np.array(model.finite_state("x0", x0))
         if np.any(x[model.nq :] != 0):
-            raise InputError("x0", got="a moving state", expected="one at rest")
+            raise InputError("x0", got="a nonzero velocity", expected="a state at rest")
         return x
     x = np.array(model.default_state)
     lower, upper = model.position_limits
@@ -239,7 +239,7 @@ class _Design:
         q0, nq = self.x0[: self.model.nq], self.model.nq
         for name, q, a, b in zip(self.model.position_names, q0, low, high, strict=False):
             if not a < q < b:
-                raise InputError(f"{name} of x0", got=q, expected=f"{a:g} to {b:g}, its limits")
+                raise InputError(f"{name} of x0", got=q, expected=f"a value within its limits, {a:g} to {b:g}")
         return q0, (high[:nq] - low[:nq]) / 2
 
     def basis(self, times: Array) -> tuple[Array, Array, Array]:
@@ -345,7 +345,7 @@ class _Design:
         cut = Fit(self.model, self.law, self.chart, self.unknowns, growth_cuts(fit, z, starts), self.noise)
         point = cut.at(z, self.starts(cut))
         if point is None:
-            raise ModelError(f"{self.model.name} has no motion under the planned inputs")
+            raise ModelError(f"{self.model.name}: the motion under the planned inputs is not finite")
         R = cut.reduce(point).R
         return R, unidentifiable(self.unknowns, z, known_of(self.unknowns, z, R).open)
 
@@ -360,7 +360,7 @@ class _Design:
         random = np.random.default_rng(seed).standard_normal((RANDOM, size)) / np.sqrt(2 * self.harmonics)
         starts = [c for c in map(self.within, random) if c is not None]
         if not starts:
-            raise ModelError(f"{self.model.name}: no random motion from x0 keeps the limits and avoids contact")
+            raise ModelError(f"{self.model.name}: no random motion from x0 is within the limits and avoids contact")
         Rs = self.informed(*self.planned(self.rough, np.array(starts), self.few)[:2], self.few)
         norms = np.median([np.linalg.norm(R, axis=0) for R in Rs], axis=0)
         widths = self.unknowns.widths
@@ -372,7 +372,7 @@ class _Design:
             (motion for motion in map(self.feasible, (starts[i] for i in order[len(order) // 2 :])) if motion), None
         )
         if best is None or middle is None:
-            raise ModelError(f"{self.model.name}: no motion from x0 was found that keeps the limits at every sample")
+            raise ModelError(f"{self.model.name}: no motion from x0 was found within the limits at every sample")
         R, open_ = self.identifiability(*best)
         R_random, _ = self.identifiability(*middle)
         R_rest, _ = self.identifiability(*self.simulated(np.zeros(size)))
@@ -517,13 +517,13 @@ def base_parameters(model: Model, bodies: Sequence[str] | None = None) -> tuple[
     """
     tree = tree_for_identification(model)
     if isinstance(tree, Refusal):
-        raise ModelError(f"{model.name} has no motion in continuous time here: {tree}")
+        raise ModelError(f"{model.name}: motion in continuous time is not supported: {tree}")
     carried = [body for body in tree.bodies if tree.placed[body][0] >= 0]
     known = [body for body in carried if tree.bodies[body].mass > 0]
     wanted = known if bodies is None else list(bodies)
     for body in wanted:
         if body not in known:
-            raise UnknownNameError("body with a mass that moves", got=body, known=known)
+            raise UnknownNameError("moving body with a mass", got=body, known=known)
     wanted.sort(key=lambda body: tree.placed[body][0])
     effects, names, units, values = [], [], [], []
     of_links = _effects(model, tree, len(wanted))

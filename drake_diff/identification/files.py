@@ -44,7 +44,7 @@ from drake_diff.runs.reproduce import contract_as, model_as
 REPORT = "report.html"
 MADE = (TRACE, REPORT)  # the files that are regenerated, together with the record
 OF_RECORDINGS = (
-    "inputs, model and recordings: they define the task, and only who made a recording knows if a robot moved so; "
+    "inputs, model and recordings: they define the task, and no check can tell whether the robot moved as recorded; "
     "recordings[...].sha256 is the hash of the file that was read"
 )
 MOST_PLOTS = 12  # plots of coordinates
@@ -89,9 +89,7 @@ def write_identification(identification: Identification, folder: Path, *, meshes
 def _check_file(name: str, path: Path, sha256: str, stored: Path) -> None:
     subject = f"recording {name}"
     if path.resolve().is_relative_to(stored):
-        raise InputError(
-            subject, got=f"{path}, which is in the directory to be written", expected="a path outside of it"
-        )
+        raise InputError(subject, got=str(path), expected=f"a path outside the output directory {stored}")
     if not path.exists() or hash_of(path) != sha256:
         raise ArtifactError(f"{subject}: {path} has changed since it was read")
     if (size := sum(file.stat().st_size for file in _files(path))) > LARGEST:
@@ -280,7 +278,7 @@ def reproduce(folder: Path, record: FitRecord, models: Path | None) -> Reproduce
         write_made(Path(location), again, made)
         contents = {name: (Path(location) / name).read_bytes() for name in MADE}
     lacking = (name for name in MADE if name not in record.files)
-    problems = tuple(f"{name}: the file is missing, and every fit is written with it" for name in lacking)
+    problems = tuple(f"{name}: the file is missing, although each fit has it" for name in lacking)
     stored = [name for name in record.files if any(name.startswith(r.path) for r in record.recordings)]
     written = (carried, *stored, *MADE)
     return Reproduced(
@@ -311,11 +309,11 @@ def _stored(folder: Path, record: FitRecord, i: int, model: Any) -> tuple[Record
     stored = record.recordings[i]
     name, path = ARRAYS if stored.file is None else stored.file, folder / stored.path
     if stored.path != f"{RECORDINGS}/{i}/{name}" or Path(name).name != name or name in ("", "..", "."):
-        raise ArtifactError(f"{record.FILE}: recording {stored.name} is not where drake_diff keeps it")
+        raise ArtifactError(f"{record.FILE}: the path of recording {stored.name} is not the one that drake_diff writes")
     if stored.file is None:
         return read_arrays(path, stored.name, stored.version, stored.facts), None
     if not path.exists() or hash_of(path) != stored.sha256:
-        raise ArtifactError(f"{stored.path}: it is not the recording that {record.FILE} describes")
+        raise ArtifactError(f"{stored.path}: the recording does not match its hash in {record.FILE}")
     read = read_recording(path, model, gaps=True)
     return replace(read, name=stored.name, version=stored.version, facts=dict(stored.facts)), (path, stored.sha256)
 

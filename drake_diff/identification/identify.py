@@ -123,11 +123,11 @@ def identify(
     tree = tree_for_identification(model)
     why = str(tree) if isinstance(tree, Refusal) else what_acts(model, chart, pieces)
     if motion == "continuous" and isinstance(tree, Refusal):
-        raise ModelError(f"{model.name} has no motion in continuous time here: {why}")
+        raise ModelError(f"{model.name}: motion in continuous time is not supported: {why}")
     continuous = motion == "continuous" or (motion == "auto" and not why)
     own_tree = tree if continuous and not isinstance(tree, Refusal) else None
     if columns and own_tree is None:
-        raise ModelError(f"{model.name}: sensors need motion in continuous time, and {why or 'steps are fitted'}")
+        raise ModelError(f"{model.name}: sensors need motion in continuous time, but {why or 'steps are fitted'}")
     outputs = choose_sensors(model, own_tree, columns, sensors)
     unknowns = choose_unknowns(model, own_tree, parameters, priors, bounds, columns)
     stated = given_noise(model, chart, noise, columns)
@@ -135,7 +135,7 @@ def identify(
     problem = Problem(model, chart, unknowns, pieces, stated, scatter, outputs)
     if motion == "impacts":
         if priors or bounds:
-            raise InputError("priors and bounds", got="some", expected='none with motion="impacts"')
+            raise InputError("priors and bounds", got="given", expected='no priors and no bounds with motion="impacts"')
         result = fit_through_impacts(model, pieces, parameters, problem.first_noise)
     else:
         law: Law = (
@@ -271,7 +271,7 @@ class Problem:
     def shortened(self, fit: Fit, pieces: Sequence[Excerpt], noise: Array) -> Fit:
         law = fit.shorter
         if law is None or np.max(fit.segments.hs) < SHORTEST:
-            raise ModelError(f"{self.model.name}: its motion is too stiff for {fit.law.words}")
+            raise ModelError(f"{self.model.name}: the motion is too stiff for {fit.law.words}")
         return self.fit(law, pieces, noise)
 
     def weighted(self, fit: Fit, z: Array, starts: Array, most: int) -> tuple[Fit, Solved]:

@@ -273,7 +273,7 @@ class ImpactSearch:
         self.chart, self.pieces = Chart(coordinates_of(model)), list(pieces)
         for piece in self.pieces:
             if np.any(np.isnan(piece.ys)):
-                raise InputError(f"recording {piece.name}", got="NaN", expected="every position and velocity measured")
+                raise InputError(f"recording {piece.name}", got="NaN", expected="measured positions and velocities")
         chosen = choose_unknowns(model, None, names)
         self.law: DiscreteMotion = discrete_motion(model, chosen, self.pieces)
         of_lengths = (Unknown(name, "m", np.array([value]), 0.0, value) for name, value in self.lengths.items())
@@ -462,7 +462,7 @@ def identify_contact(
     """
     if isinstance(model, Model) == bool(lengths):
         got = "a model" if lengths else "a function"
-        expected = "a function that makes a model of `lengths`" if lengths else "a model, or `lengths` too"
+        expected = "a function that makes a model from `lengths`" if lengths else "a model, or a function and `lengths`"
         raise InputError("model", got=got, expected=expected)
     begin = {name: positive_float(name, value) for name, value in (lengths or {}).items()}
     first_model, build = (model, None) if isinstance(model, Model) else (model(**begin), model)

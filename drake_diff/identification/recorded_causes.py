@@ -32,10 +32,10 @@ from drake_diff.runs.reproduce import contract_as, model_as
 SAME_VALUE = 2e-3  # tolerance in units of half the interval (see above)
 SAME_DIGIT = 1.01  # tolerance in units of the last digit in a text: a number between two may be rounded to either
 ENDED = "The search was ended after"  # in a cause's sentence: its search reached the processor time limit
-LOST = "its cause was not looked for again: its recording is not in the directory"
+LOST = "the search for its cause was not repeated: its recording is not in the directory"
 WRITTEN = (TRACE, REPLAY, PAGE)
 NEVER = (  # the parts that are not checked
-    "model and recordings: they define the task, and only who made a recording knows if a robot moved so",
+    "model and recordings: they define the task, and no check can tell whether the robot moved as recorded",
     "all but the recordings, plots, scenes and frames: the engines were not run again",
 )
 
@@ -48,7 +48,7 @@ def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Re
     """
     pages = made_of_record(folder, record)
     functions = [(e.engine, e.function.name) for e in record.engines if e.function is not None]
-    unchecked = [f"{e}: a user's function ({name}), whose code the record does not hold" for e, name in functions]
+    unchecked = [f"{e}: a user's function ({name}), whose code is not in the record" for e, name in functions]
     if not record.recordings:
         unchecked += [f"{e.engine}: {LOST}" for e in record.engines if e.cause is not None]
         return replace(pages, unchecked=tuple(unchecked))
@@ -63,14 +63,14 @@ def reproduce(folder: Path, record: ComparisonRecord, models: Path | None) -> Re
         rows = [e for e in record.engines if not e.jacobians]
         names = [[e.engine for e in engines] for engines in (rows, compared.engines)]
         if names[0] != names[1]:
-            problems.append(f"{record.FILE}: its recordings are {names[0]}, compared again {names[1]}")
+            problems.append(f"{record.FILE}: its recordings are {names[0]}, but the repeated comparison has {names[1]}")
             return Reproduced({}, {}, problems=tuple(problems), written=written)
         problems += _odd_files(folder, record, compared.recordings)
         uses = () if record.data is None else record.data.judged_on
         motion = next((use.sha256 for use in uses if use.name == MOTION), None)
         is_same_motion = motion == hash_of_arrays(compared.x0, compared.us)
         if not is_same_motion:
-            unchecked.append("engines[...].final_gap of recordings: the motion began in another state")
+            unchecked.append("engines[...].final_gap of recordings: the motion starts from another state")
         fields, engines = _of_the_model(record, model), list[dict[str, Any]]()
         for row, now, recording in zip(rows, compared.engines, compared.recordings, strict=True):
             cause = None
@@ -98,10 +98,10 @@ def _odd_recordings(record: ComparisonRecord) -> Iterator[str]:
     names = [r.name for r in record.recordings]
     for i, r in enumerate(record.recordings):
         if r.path != place_of(i) or r.path not in record.files:
-            yield f"{record.FILE}: recording {r.name} is not where drake_diff keeps it"
+            yield f"{record.FILE}: the path of recording {r.name} is not the one that drake_diff writes"
     for e in record.engines:
         if e.cause is not None and (e.jacobians or names.count(e.engine) != 1):
-            yield f"{record.FILE}: {e.engine} has a cause, but is not exactly one recording in the directory"
+            yield f"{record.FILE}: {e.engine} has a cause, but does not name exactly one recording in the directory"
 
 
 def _of_the_model(record: ComparisonRecord, model: Model) -> dict[str, Any]:
@@ -125,13 +125,13 @@ def _odd_files(folder: Path, record: ComparisonRecord, given: Sequence[Recording
     for i, recording in zip(places, given, strict=True):
         stored = next(r for r in record.recordings if r.name == recording.name)
         if len(recording.times) != stored.samples:
-            yield f"{stored.path}: {len(recording.times)} samples, and {record.FILE} says {stored.samples}"
+            yield f"{stored.path}: {len(recording.times)} samples, but {record.FILE} has {stored.samples}"
         times = recording.times - recording.times[0]
         if (recording.name, hash_of_arrays(times, recording.xs, recording.us)) not in used:
-            yield f"{stored.path}: it is not the recording that {record.FILE} says was compared"
+            yield f"{stored.path}: the recording differs from the compared one in {record.FILE}"
         motion = log.arrays(f"/{slug(i, recording.name)}/state")
         if not np.array_equal(np.hstack([motion["q"], motion["v"]]), recording.xs):
-            yield f"{TRACE}: the motion of {recording.name} is not that in {stored.path}"
+            yield f"{TRACE}: the motion of {recording.name} differs from {stored.path}"
 
 
 def as_recorded(name: str, recorded: CauseEvidence, repeated: CauseEvidence) -> tuple[CauseEvidence, list[str]]:
@@ -143,7 +143,7 @@ def as_recorded(name: str, recorded: CauseEvidence, repeated: CauseEvidence) -> 
         return recorded, []
     if ENDED in recorded.sentence or ENDED in repeated.sentence:
         why = "a search that reached its limit of processor time is not reproducible"
-        return recorded, [f"{name}: recorded {recorded.sentence!r}, again {repeated.sentence!r}: {why}"]
+        return recorded, [f"{name}: recorded {recorded.sentence!r}, recomputed {repeated.sentence!r}: {why}"]
     return repeated, []
 
 

@@ -145,7 +145,7 @@ def read_pieces(
     """
     given = [recordings] if isinstance(recordings, (Recording, str, Path)) else list(recordings)
     if not given:
-        raise InputError("recordings", got="none", expected="one or more of dd.Recording, or their files")
+        raise InputError("recordings", got="none", expected="at least one Recording or file of a recording")
     logs = [r if isinstance(r, Recording) else read_recording(r, model, gaps=True) for r in given]
     names = [r.name for r in logs]
     if isinstance(held_out, str):
@@ -155,7 +155,7 @@ def read_pieces(
             raise InputError("held_out", got=held_out, expected="one of several recordings, as the others are fitted")
     elif not 0 <= held_out <= 0.8:
         raise InputError(
-            "held_out", got=held_out, expected="a part of the samples from 0 to 0.8, or a recording's name"
+            "held_out", got=held_out, expected="a fraction of the samples from 0 to 0.8, or the name of a recording"
         )
     pieces = []
     for i, r in enumerate(logs):
@@ -209,7 +209,7 @@ def _checked(recording: Recording, model: Model, columns: Sequence[str]) -> Exce
     if np.any(np.diff(times) <= 0):
         k = int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1
         raise InputError(
-            f"{subject}: time of sample {k}", got=f"{times[k]} s", expected="a time after that of the sample before"
+            f"{subject}: time of sample {k}", got=f"{times[k]} s", expected="a time after the previous sample"
         )
     ys = np.array(array_with_gaps(f"{subject}: xs", recording.xs, (len(times), model.nx)))
     us = finite_array(f"{subject}: us", recording.us, (len(times) - 1, model.nu))
@@ -218,7 +218,7 @@ def _checked(recording: Recording, model: Model, columns: Sequence[str]) -> Exce
     check_sizes(f"{subject}: us", us, model.input_names)
     if times[-1] - times[0] > MOST_STEPS * model.time_step:
         k = int(np.argmax(np.diff(times)))
-        got = f"{times[-1] - times[0]:.6g} s, of which {times[k + 1] - times[k]:.6g} s from sample {k} to {k + 1}"
+        got = f"{times[-1] - times[0]:.6g} s, with {times[k + 1] - times[k]:.6g} s between samples {k} and {k + 1}"
         raise InputError(f"{subject}: times", got=got, expected=f"at most {MOST_STEPS} steps of {model.time_step:g} s")
     for start in tangent_space(model).quaternions:
         turn = ys[:, start : start + 4]
@@ -226,7 +226,8 @@ def _checked(recording: Recording, model: Model, columns: Sequence[str]) -> Exce
         norms = np.linalg.norm(turn, axis=1)
         if np.any(np.abs(norms - 1) > 0.1):
             k = int(np.argmax(np.abs(norms - 1) > 0.1))
-            raise InputError(f"{subject}: norm of {model.state_names[start]}... at {k}", got=norms[k], expected="1")
+            got, name = norms[k], model.state_names[start]
+            raise InputError(f"{subject}: norm of the quaternion {name}... in sample {k}", got=got, expected="1")
         turn /= norms[:, None]
         seen = np.flatnonzero(np.isfinite(norms))
         signs = np.sign(np.sum(turn[seen[1:]] * turn[seen[:-1]], axis=1))

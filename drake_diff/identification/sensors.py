@@ -62,7 +62,7 @@ def choose_sensors(
     wanted = dict.fromkeys(sensor_of(column) for column in columns)
     if wanted and (tree is None or tree.coupling is not None):
         why = "mimic joints are reduced" if tree is not None else "the model's steps are fitted"
-        raise ModelError(f"{model.name}: sensors need motion in continuous time, and {why}")
+        raise ModelError(f"{model.name}: sensors need motion in continuous time, but {why}")
     for name in mounted:
         if name not in {label for label, _ in wanted}:
             raise UnknownNameError("sensor with columns", got=name, known=[s for s, _ in wanted])

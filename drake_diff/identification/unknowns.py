@@ -250,7 +250,7 @@ def choose_unknowns(
         unit, value, lower = known[name]
         why = _why_not(model, tree, name, value)
         if why is not None:
-            raise InputError(name, got=why, expected="a quantity that can be estimated here")
+            raise InputError(name, got=why, expected="a quantity that can be estimated")
         low, high = _bounds_of(name, (bounds or {}).get(name), lower)
         start = np.array(value, dtype=float)
         prior = _prior_of(name, priors[name], len(start)) if priors and name in priors else None
@@ -275,7 +275,7 @@ def _bounds_of(name: str, given: Any, lower: float) -> tuple[float, float]:
     except (TypeError, ValueError) as error:
         raise InputError(subject, got=given, expected="a lower and an upper number") from error
     if name.endswith(f".{INERTIA}"):
-        raise InputError(subject, got=given, expected="a prior instead, as an inertia takes no bounds")
+        raise InputError(subject, got=given, expected="a prior in place of bounds, which an inertia does not support")
     if not max(low, lower) < high:
         raise InputError(
             subject, got=given, expected=f"a lower bound below the upper bound, and an upper bound above {lower:g}"
@@ -285,8 +285,8 @@ def _bounds_of(name: str, given: Any, lower: float) -> tuple[float, float]:
 
 def _prior_of(name: str, given: Any, count: int) -> tuple[Array, Array]:
     """Return mean and standard deviation (count,) of a prior."""
-    above = ", the mean above 0" if name.endswith(f".{MASS}") else ""
-    expected = f"a mean and a standard deviation above 0, of 1 or {count} numbers each{above}"
+    above = " and a mean above 0" if name.endswith(f".{MASS}") else ""
+    expected = f"a mean and a standard deviation of 1 or {count} numbers each, with a deviation above 0{above}"
     try:
         mean, deviation = (np.array(np.broadcast_to(np.asarray(values, dtype=float), count)) for values in given)
     except (TypeError, ValueError) as error:

@@ -35,11 +35,11 @@ ROUNDING = 1e-13  # relative to m c^2: rounding of a zero inertia that was shift
 OVERLAY = ".dmd.yaml"
 KINDS = (".urdf", ".sdf", OVERLAY)
 NO_ROOM = {
-    COULOMB: "Drake has no Coulomb friction of joints",
-    STRENGTH: "model files have no scale factor of inputs",
-    BIAS: "it is a property of the recording",
-    DELAY: "model files have no delay of inputs",
-    "gravity": "it is an option of load_model",
+    COULOMB: "Coulomb friction, which joints in Drake do not have",
+    STRENGTH: "a scale factor of an input, which model files do not have",
+    BIAS: "a property of the recording",
+    DELAY: "a delay of an input, which model files do not have",
+    "gravity": "an option of load_model",
 }
 
 
@@ -88,7 +88,7 @@ def write_model(identification: Identification, path: str | Path) -> Path:
             f"{OVERLAY} file that adds such files"
         )
     if not path.name.endswith(kind):
-        raise InputError("path", got=str(path), expected=f"a {kind} file, as the model's own")
+        raise InputError("path", got=str(path), expected=f"a {kind} file, like the model's file")
     if kind == OVERLAY:
         texts = _overlay(identification, asked, source, path)
     else:
@@ -126,15 +126,15 @@ def _overlay(e: Identification, asked: Request, source: Path, path: Path) -> dic
         label = name.rsplit(".", 1)[0]
         places = [uri for uri, names in has.items() if label in names]
         if len(places) != 1:
-            got = f"{len(places)} URDF or SDF files that {source.name} itself adds have {label}"
-            raise InputError(name, got=got, expected="exactly one such file")
+            expected = f"exactly one URDF or SDF file with {label} among those that {source.name} itself adds"
+            raise InputError(name, got=f"{len(places)} files", expected=expected)
         by_file.setdefault(places[0], {})[name] = value
     texts = {}
     for uri, values in by_file.items():
         beside = path.with_name(f"{path.name.removesuffix(OVERLAY)}_{files[uri].name}").resolve()
         if beside in texts:
             raise InputError(
-                source.name, got=f"two robot files called {files[uri].name}", expected="names of their own"
+                source.name, got=f"two robot files called {files[uri].name}", expected="different file names"
             )
         texts[beside] = _Corrected(e, asked, files[uri], values).text()
         text = _pointed(text, uri, f"file://{beside}", source)
@@ -175,7 +175,7 @@ class _Corrected:
             quantity = name.rsplit(".", 1)[1]
             if quantity not in (IN_SDF if self.is_sdf else IN_URDF):
                 kind = "SDF" if self.is_sdf else "URDF"
-                why = NO_ROOM.get(quantity, f"{kind} has no place for it that Drake reads and drake_diff writes")
+                why = NO_ROOM.get(quantity, f"a quantity that cannot be written to {kind}")
                 raise InputError(name, got=why, expected=f"a quantity of a {kind} file; identify without it")
 
     def text(self) -> str:
@@ -202,8 +202,8 @@ class _Corrected:
         named = [element for element in self.xml.root.iter(*tags) if element.get("name") == label]
         elements = [element for element in named if element.tag != "joint" or element.get("type")]
         if len(elements) != 1:
-            where = f"the file has {len(elements)} elements {' or '.join(tags)} of this name"
-            raise InputError(label, got=where, expected="one, in the model's own file and not in one that it includes")
+            expected = f"one element {' or '.join(tags)} of this name in the model's file, without included files"
+            raise InputError(label, got=f"{len(elements)} elements", expected=expected)
         return elements[0]
 
     def _comment_on(self, label: str, quantities: Iterable[str]) -> str:
@@ -279,7 +279,7 @@ class _Corrected:
             transmissions = (a for t in self.xml.root.iter("transmission") for a in t.findall("actuator"))
             actuators = [actuator for actuator in transmissions if actuator.get("name") == label]
             if len(actuators) != 1:
-                got = f"{len(actuators)} transmissions in the file that have this actuator"
+                got = f"{len(actuators)} transmissions with this actuator"
                 raise InputError(f"{label}.{next(iter(values))}", got=got, expected="exactly one transmission")
             element = actuators[0]
         self.xml.before(element, comment)
@@ -332,7 +332,7 @@ def _check(e: Identification, model: Model, path: Path) -> None:
             if p.name not in new:
                 raise UnknownNameError(f"{path.name}: parameter", got=p.name, known=new)
             if not np.allclose(new[p.name], wanted, rtol=0, atol=SAME * size):
-                raise InputError(f"{path.name}: {p.name}", got=new[p.name], expected=f"{wanted}, which was found")
+                raise InputError(f"{path.name}: {p.name}", got=new[p.name], expected=f"{wanted}, as estimated")
 
 
 def _comment(words: str) -> str:

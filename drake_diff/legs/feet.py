@@ -90,8 +90,8 @@ class Legs:
         """
         quaternions = tangent_space(model).quaternions
         if len(quaternions) != 1 or model.coupling is not None:
-            got = f"{len(quaternions)} floating bodies" if model.coupling is None else "joints that follow"
-            raise InputError("ContactSchedule: the model", got=got, expected="one floating base, and no joints reduced")
+            got = f"{len(quaternions)} floating bodies" if model.coupling is None else "reduced mimic joints"
+            raise InputError("ContactSchedule: model", got=got, expected="one floating base, no reduced mimic joints")
         set_state(model.double, np.concatenate([q, np.zeros(model.nv)]))
         plant, known, feet = model.double.plant, [str(body.name()) for body in bodies(model.plant)], list[Foot]()
         shapes = _shapes(model)
@@ -101,9 +101,9 @@ class Legs:
             body = plant.GetBodyByName(name)
             foot = _foot(model, shapes, body, (int(b.index()) for b in plant.GetBodiesWeldedTo(body)))
             if foot is None:
-                expected = 'spheres or boxes, which meshes="spheres" and contact_geometry="corner_spheres" make'
+                expected = 'a sphere or a box; see meshes="spheres" and contact_geometry="corner_spheres"'
                 got = "no such shape"
-                raise InputError(f"ContactSchedule: shapes of foot {name}", got=got, expected=f"{expected} of others")
+                raise InputError(f"ContactSchedule: shapes of foot {name}", got=got, expected=expected)
             feet.append(foot)
         return cls(model, feet, *model.position_limits)
 
@@ -288,7 +288,7 @@ def find_feet(model: Model, q: Array) -> tuple[Foot, ...] | Refusal:
     candidates = _limbs(model, shapes)
     if len(candidates) < FEWEST:
         return Refusal(
-            f"{len(candidates) or 'none'} of its limbs {'ends' if len(candidates) == 1 else 'end'} in a shape"
+            f"{len(candidates) or 'none'} of its limbs {'ends' if len(candidates) == 1 else 'end'} in a sphere or a box"
         )
     heights = np.array([_lowest(model, limb) for limb in candidates])
     ground = float(np.min(heights))
@@ -301,7 +301,7 @@ def find_feet(model: Model, q: Array) -> tuple[Foot, ...] | Refusal:
     tall = float(plant.CalcCenterOfMassPositionInWorld(context)[2]) - ground
     lower = [b.name() for b in moving if b.EvalPoseInWorld(context).translation()[2] < ground - LEVEL * tall]
     if lower:
-        return Refusal(f"{lower[0]} is below all that could touch the ground, and has no shape")
+        return Refusal(f"{lower[0]} is below the feet and has no collision shape")
     legs = [limb for limb, height in zip(candidates, heights, strict=True) if height - ground <= LEVEL * tall]
     drawn = sum(_travel(model, q, limb) >= TRAVEL * tall for limb in legs)
     if drawn < max(FEWEST, len(legs)):

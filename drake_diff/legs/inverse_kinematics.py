@@ -72,7 +72,7 @@ def inverse_kinematics(
     try:
         AddMultibodyPlantConstraints(plant, every, program, context)
     except RuntimeError as error:
-        raise ModelError(f"no inverse kinematics of {model.name}: {error}") from error
+        raise ModelError(f"inverse kinematics does not support {model.name}: {error}") from error
     q = every if coupling is None else every[coupling.own_q]
     program.AddBoundingBoxConstraint(lower, upper, q)
     for target in targets:

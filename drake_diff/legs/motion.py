@@ -317,7 +317,7 @@ class _Program:
             self.program.AddBoundingBoxConstraint(0.0, 0.0, self.forces)
         result = ClarabelSolver().Solve(self.program)
         if not result.is_success():
-            return Refusal("no forces of its feet within friction move its centre of mass to the required end")
+            return Refusal("no contact forces within the friction cones move the centre of mass to its required end")
         forces = np.zeros((*self.stands.shape, 3))
         forces[self.stands] = self.weight * np.asarray(result.GetSolution(self.forces))[: len(self.carries)]
         return np.asarray(result.GetSolution(self.at)), forces

@@ -133,7 +133,7 @@ def standing_posture(legs: Legs, file: Array) -> Stance | Refusal:
         cost = float(np.sum((legs.apart(posture, wanted) / unit) ** 2) + np.sum((off_place / near) ** 2))
         off = float(np.max(off_place[:, 2])) - tolerance[2]
         if off > FEET_STAY:
-            why = Refusal(f"its feet miss the ground by {off:.2g} m")
+            why = Refusal(f"the feet cannot reach the ground: distance {off:.2g} m")
         elif cost < least:
             stance = hold(legs, posture)
             if isinstance(stance, Refusal):
@@ -186,7 +186,7 @@ def hold(legs: Legs, q: Array, needed: Array | None = None) -> Stance | Refusal:
     program.AddQuadraticCost(2 * np.eye(model.nu), np.zeros(model.nu), u)
     result = ClarabelSolver().Solve(program)
     if not result.is_success():
-        return Refusal("no forces of its feet within friction and of its motors within their limits balance it")
+        return Refusal("no contact forces within the friction cones and motor efforts within their limits balance it")
     forces = share * np.asarray(result.GetSolution(f)).reshape(-1, 3)
     still = np.zeros(model.nv)
     u_hold = model.commands(np.append(q, still), still, scale * np.asarray(result.GetSolution(u)))
@@ -218,7 +218,7 @@ def standing(legs: Legs, posture: Array) -> Rest:
         legs, _level(legs, posture), none, np.array([base, base + 1, base + 5]), np.array([TURN, TURN, HEIGHT])
     )
     if isinstance(rest, Refusal):
-        expected = "a posture that rests on all feet of the schedule alone, the centre of mass over them"
+        expected = "a posture at rest on exactly the feet of the schedule, with the centre of mass above them"
         raise InputError("ContactSchedule.standing: joints", got=str(rest), expected=expected)
     return rest
 
@@ -267,7 +267,7 @@ def at_rest(legs: Legs, q: Array, u: Array, freed: Indices, unit: Array) -> Rest
             x, u, x_next, off = there, inputs, after, left
         fault = _fault(legs, x, u, off)
     except (SimulationError, GradientError) as error:
-        return Refusal(f"its standing cannot be stepped: {error}")
+        return Refusal(f"Drake cannot take a step from its standing posture: {error}")
     return Refusal(fault) if fault else Rest(x, u)
 
 
@@ -282,16 +282,16 @@ def _fault(legs: Legs, x: Array, u: Array, off: float) -> str:
     model = legs.model
     for entry, value in zip(model.contract.inputs, u, strict=True):
         if not entry.lower <= value <= entry.upper:
-            return f"more than {abs(entry.upper if value > 0 else entry.lower):.3g} of {entry.name}"
+            return f"{entry.name} exceeds its limit of {abs(entry.upper if value > 0 else entry.lower):.3g}"
     advance(model.double, x, u)
     touching = {contact.body_a for contact in contacts_of_the_step(model)}
     for foot, height in zip(legs.feet, legs.heights(), strict=True):
         if not touching & set(foot.bodies):
-            return f"{foot.name} {1e3 * height:.3g} mm over the ground"
+            return f"foot {foot.name} is {1e3 * height:.3g} mm above the ground"
     if off >= AT_REST:
-        return f"{off:.2g} rad/s or m/s after a step"
+        return f"the speed is {off:.2g} rad/s or m/s after a step"
     others = touching.difference(*(foot.bodies for foot in legs.feet))
-    return f"{min(others)} touches too" if others else ""
+    return f"{min(others)} is in contact and is not a foot" if others else ""
 
 
 def with_soft_feet(model: Model, feet: int) -> Model:
@@ -376,7 +376,7 @@ def _shift_to(
     q = inverse_kinematics(legs.model, q0, targets, wish, lower, upper)
     off = max(miss(legs.model, targets), -float(np.min(legs.on_lowest(q).points_in(q)[:, 2])))
     if off > FEET_STAY:
-        return Refusal(f"its feet would have to move by {off:.2g} m")
+        return Refusal(f"the feet would have to move by {off:.2g} m")
     stance = hold(legs, q)
     end = stance if isinstance(stance, Refusal) else settled(legs, stance)
     if isinstance(end, Refusal):
@@ -391,7 +391,7 @@ def _shift_to(
         away, speed = float(np.max(np.abs(legs.apart(x[:nq], end.x[:nq])))), float(np.max(np.abs(x[nq:])))
         if away <= ARRIVED and speed <= SLOW_ENOUGH:
             return shift
-        why = Refusal(f"it ends {away:.2g} rad or m from its rest posture, with {speed:.2g} rad/s or m/s")
+        why = Refusal(f"it ends {away:.2g} rad or m from its rest posture, at a speed of {speed:.2g} rad/s or m/s")
     return why
 
 
@@ -420,7 +420,7 @@ def _between(legs: Legs, start: Rest, end: Rest, duration: float) -> Shift | Ref
         set_state(model.double, xs[k])
         stance = hold(legs, qs[k], model.double.inverse_dynamics(change / h) + model.double.damping() * change)
         if isinstance(stance, Refusal):
-            return Refusal(f"on the way {stance.reason}")
+            return Refusal(f"along the motion, {stance.reason}")
         us.append(stance.u)
     made = np.array(us[:-1] + [us[-1]] * holding)
     s = np.concatenate([s[:-1], np.ones(holding)])[:, None]
@@ -441,7 +441,7 @@ def _regulated(legs: Legs, xs: Array, us: Array) -> Shift | Refusal:
             inputs.append(np.clip(policy(states[-1], k * model.time_step), lower, upper))
             states.append(np.array(advance(model.double, states[-1], inputs[-1])))
     except (SimulationError, GradientError) as error:
-        return Refusal(f"the motion cannot be stepped: {error}")
+        return Refusal(f"Drake cannot take the steps of the motion: {error}")
     terms = [*model.contract.positions, *model.contract.velocities]
     low, high = np.array([t.lower for t in terms]), np.array([t.upper for t in terms])
     beyond = (low < high) & np.any((np.array(states) < low) | (np.array(states) > high), axis=0)

@@ -165,7 +165,7 @@ def parse_mcap(data: bytes, name: str) -> McapLog:
     except MemoryError:
         raise
     except Exception as error:  # a damaged file causes many kinds of errors in the reader
-        raise ArtifactError(f"{name} is no whole MCAP file of this project: {type(error).__name__}: {error}") from error
+        raise ArtifactError(f"{name} is not an MCAP file of drake_diff: {type(error).__name__}: {error}") from error
     return log
 
 
@@ -202,24 +202,24 @@ def records(data: bytes) -> Iterator[tuple[int, bytes]]:
         yield opcode, body
         if opcode == FOOTER_OPCODE:
             return
-    raise ValueError("it was cut short")
+    raise ValueError("the file is truncated")
 
 
 def _unpacked_size(body: bytes, most: int) -> int:
     """Return the declared unpacked size of a chunk; raise ValueError if it exceeds `most` or is wrong."""
     chunk = kinds.Chunk.read(ReadDataStream(BytesIO(body)))
     if chunk.uncompressed_size > most:
-        raise ValueError(f"it unpacks to {chunk.uncompressed_size} bytes, but at most {most} are read")
+        raise ValueError(f"a chunk unpacks to {chunk.uncompressed_size} bytes, but at most {most} more are read")
     if chunk.compression == "zstd":
         packed = zstandard.frame_content_size(chunk.data)
         if packed not in (-1, chunk.uncompressed_size):  # -1: not declared by the frame, and no more is unpacked
-            raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes unpacks to {packed}")
+            raise ValueError(f"a chunk declares {chunk.uncompressed_size} bytes, but unpacks to {packed}")
     else:
         result: Any = chunk.data
         if chunk.compression == "lz4":  # frames need not declare a size: unpack one byte more than the declared size
             result = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=chunk.uncompressed_size + 1)
         if len(result) != chunk.uncompressed_size:
-            raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes has {len(result)}")
+            raise ValueError(f"a chunk declares {chunk.uncompressed_size} bytes, but has {len(result)}")
     return int(chunk.uncompressed_size)
 
 
@@ -231,17 +231,17 @@ def _check_crcs(data: bytes) -> int:
     The format permits files without them and the reader does not check them, but our files always have them.
     """
     if len(data) < len(MAGIC) + FOOTER.size or not data.endswith(MAGIC):
-        raise ValueError("it does not end as an MCAP file does: it was cut short")
+        raise ValueError("the magic bytes at the end of an MCAP file are missing: it is truncated")
     footer = len(data) - len(MAGIC) - FOOTER.size
     opcode, length, summary_start, _, summary_crc = FOOTER.unpack_from(data, footer)
     data_end = summary_start - DATA_END.size
     if (opcode, length) != (FOOTER_OPCODE, FOOTER.size - 9) or not 0 <= data_end <= footer:
-        raise ValueError("its footer is damaged")
+        raise ValueError("the footer is damaged")
     end_opcode, end_length, data_crc = DATA_END.unpack_from(data, data_end)
     if (end_opcode, end_length) != (DATA_END_OPCODE, DATA_END.size - 9) or zlib.crc32(data[:data_end]) != data_crc:
-        raise ValueError("the checksum of its data does not match")
+        raise ValueError("the checksum of the data section does not match")
     if zlib.crc32(data[summary_start : len(data) - len(MAGIC) - 4]) != summary_crc:
-        raise ValueError("the checksum of its summary does not match")
+        raise ValueError("the checksum of the summary does not match")
     return int(summary_start)
 
 
@@ -256,7 +256,7 @@ def _collect(data: bytes, summary_start: int, log: McapLog) -> None:
     for messages in log.messages.values():
         messages.sort(key=itemgetter(0))
     if reading.counted != reading.declared:
-        raise ValueError(f"it holds {reading.counted} messages, its statistics say {reading.declared}")
+        raise ValueError(f"the file has {reading.counted} messages, but its statistics declare {reading.declared}")
 
 
 class _Reading:
@@ -271,7 +271,7 @@ class _Reading:
     def message(self, body: bytes) -> None:
         number, _, time, _ = MESSAGE.unpack_from(body)
         if self.counted >= self.declared:
-            raise ValueError(f"it holds more messages than its statistics say, {self.declared}")
+            raise ValueError(f"the file has more messages than its statistics declare, {self.declared}")
         if self.counted % BETWEEN_LOOKS == 0:
             check_memory()
         self.counted += 1
@@ -299,7 +299,7 @@ class _Reading:
         """Return the list for the messages of a channel, and the decoder of a message."""
         topic, log = channel.topic, self.log
         if len(self.channels) >= MOST_CHANNELS:
-            raise ValueError(f"it has more than {MOST_CHANNELS} channels")
+            raise ValueError(f"the file has more than {MOST_CHANNELS} channels")
         if channel.schema_id not in self.schemas:
             raise ValueError(f"channel {topic} has the unknown schema {channel.schema_id}")
         decode: Any = self.decoders.decoder_for(channel.message_encoding, self.schemas[channel.schema_id])
@@ -353,7 +353,7 @@ def _unpacked(data: bytes) -> Iterator[tuple[int, bytes]]:
             opcode, length = RECORD.unpack_from(inner, position)
             position += RECORD.size + length
             if position > size or not opcode:
-                raise ValueError("a record in a chunk is cut short, or has the opcode 0")
+                raise ValueError("a record in a chunk is truncated, or has the opcode 0")
             yield opcode, inner[position - length : position]
 
 
@@ -370,9 +370,9 @@ def _declared(data: bytes, position: int) -> int:
             }
             for what, (count, limit) in most.items():
                 if count > limit:
-                    raise ValueError(f"it says that it holds {count} {what}: at most {limit} are read")
+                    raise ValueError(f"the statistics declare {count} {what}, but at most {limit} are read")
             return int(result.message_count)
-    raise ValueError("it has no statistics: it was cut short")
+    raise ValueError("the file has no statistics: it is truncated")
 
 
 def _column(field: Any, values: list[Any], width: int) -> Any:

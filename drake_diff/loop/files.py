@@ -80,7 +80,7 @@ COUPLED = 1e-5  # fraction of the largest number of all columns: rounding spread
 PARTS = ("xs", "us", "observations", "estimates", "applied")  # rows that the parts of a loop compute from earlier rows
 RAISED: Mapping[str, Label] = {"sensor": "perception_error", "estimator": "state_error", "controller": "control_error"}
 DEADLINES = (
-    "/deadlines: latencies of the controller cannot be reproduced; all values that follow from them were made again"
+    "/deadlines: latencies of the controller cannot be reproduced; all values that follow from them were recomputed"
 )
 HERE = "along the run"
 
@@ -146,7 +146,7 @@ def _asked(run: ClosedLoop, folder: Path) -> PlanRecord:
 
 def _section(record: PlanRecord) -> ClosedLoopSection:
     if record.closed_loop is None:
-        raise ArtifactError(f"{record.FILE}: it is not of a closed loop")
+        raise ArtifactError(f"{record.FILE}: expected the record of a closed loop")
     return record.closed_loop
 
 
@@ -610,11 +610,11 @@ def _rows_of(log: McapLog, section: ClosedLoopSection, model: Model) -> LoopRows
         latencies = log.arrays("/deadlines")["latency"]
         statuses = tuple(message.message for _, message in log.messages["/controller/status"])
     except (LookupError, ValueError, InputError) as error:
-        raise ArtifactError(f"{TRACE}: its channels do not fit together: {error}") from error
+        raise ArtifactError(f"{TRACE}: the channels contradict each other: {error}") from error
     shapes = [np.shape(rows) for rows in (xs[1:], us, estimates, commands, applied, latencies, statuses)]
     wanted = [(len(us), nx), (len(us), nu), (steps, nx), (steps, nu), (steps, nu), (steps,), (steps,)]
     if shapes != wanted:
-        raise ArtifactError(f"{TRACE}: its channels do not fit together: shapes {shapes}, expected {wanted}")
+        raise ArtifactError(f"{TRACE}: the channels contradict each other: shapes {shapes}, expected {wanted}")
     ended = {name: getattr(section, name) for name in ("ended", "failed_part", "controller_error")}
     return LoopRows(xs, us, observations, estimates, commands, applied, statuses, latencies, **ended)
 
@@ -629,12 +629,12 @@ def _compared(rows: LoopRows, again: ClosedLoop, mpc: MPC, followed: _Followed) 
         _relative_difference(followed.arrays[name], made)
         for name, made in zip(("xs", "us"), mpc.reference, strict=True)
     )
-    odd = [f"{PLAN}: the plan of MPC from the recorded guess differs by {plan:.2g} of the largest number"]
+    odd = [f"{PLAN}: MPC from the recorded guess gives another plan: difference {plan:.2g} of the largest number"]
     odd = odd if plan > RELATIVE else []
     commands = _relative_difference(rows.commands, again.commands)
     if exact:
         return odd, []
-    doubts = [f"the commands of MPC, run again, differ by {commands:.2g} of the largest command"]
+    doubts = [f"the recomputed commands of MPC differ by {commands:.2g} of the largest command"]
     return [], odd + (doubts if commands > RELATIVE or rows.controller_status != again.controller_status else [])
 
 
@@ -646,7 +646,7 @@ def reproduce(folder: Path, record: PlanRecord, models: Path | None) -> Reproduc
     section, log = _section(record), read_mcap(folder / TRACE, links=False)
     problems, undecided = list[str](), list[str]()
     if log.attachments.get(record.FILE) != reproducible(read_fields(folder / record.FILE)).encode():
-        problems.append(f"{TRACE}: the record that it carries is not {record.FILE}")
+        problems.append(f"{TRACE}: the attached record differs from {record.FILE}")
     with ExitStack() as stack:
         model = stack.enter_context(rebuilt(folder, record, models))
         rows = _rows_of(log, section, model)
@@ -673,7 +673,7 @@ def reproduce(folder: Path, record: PlanRecord, models: Path | None) -> Reproduc
                 again = replace(again, commands=rows.commands, controller_status=rows.controller_status)
         times = latency_times([rows.latencies], section.loop.latency_budget_s)
         odd = [name for name, value in times.items() if getattr(record.wall_clock, name) != value]
-        problems += [f"{record.FILE}: wall_clock.{name} is not that of /deadlines" for name in odd]
+        problems += [f"{record.FILE}: wall_clock.{name} differs from the value of /deadlines" for name in odd]
         asked = record.model_copy(update={"contract": contract_of(model), "model": model_input(model)})
         made = as_given(_judged(asked, rows, again, followed), record)
         with TemporaryDirectory() as location:
@@ -685,9 +685,7 @@ def reproduce(folder: Path, record: PlanRecord, models: Path | None) -> Reproduc
             _write_files(target, again, made, followed, files)
             written = {path.name: path.read_bytes() for path in target.iterdir()}
     made_by = {"commands": section.loop.controller, "estimates": section.loop.estimator}
-    data = [
-        f"{name}: used as recorded, as {made_by.get(name, 'their source')} is not executed" for name in section.given
-    ]
+    data = [f"{name}: not recomputed, as {made_by.get(name, 'their source')} is not executed" for name in section.given]
     unchecked = (DEADLINES, *data)
     fields = made.model_dump(mode="json")
     return Reproduced(

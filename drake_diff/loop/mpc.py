@@ -304,7 +304,7 @@ class MPC:
             stretch = stretch if stretch.rolls else stretch.along(motion.xs)
             outcome = take_step(stretch, motion, damping * unit if damping else None)
             if isinstance(outcome, Refusal):
-                raise InputError("plan", got=outcome.reason, expected="a plan near which a minimum is found")
+                raise InputError("plan", got=outcome.reason, expected="a plan from which a minimum is found")
             step, motion = outcome, outcome.motion
             is_near = i >= PLENTY and not step.whole and step.promised <= NEAR * (1 + abs(step.merit))
             if damping <= DAMPED and (step.is_reached or not step.size or is_near):
@@ -319,10 +319,10 @@ class MPC:
             step = step if isinstance(outcome, Refusal) else outcome
         apart = float(np.max(np.abs(motion.gaps) / ranges))
         if apart > GAP or step.given_way is not None:
-            got = f"steps with gaps of {apart:.2g} of a range" if apart > GAP else self._status_of(step, 0)
+            got = f"gaps between steps of {apart:.2g} of a state's range" if apart > GAP else self._status_of(step, 0)
             raise InputError("plan", got=got, expected="a plan near a motion that satisfies the problem")
         if step.tails is None:
-            raise InputError("running_cost", got="no positive curvature by the inputs", expected="one with a minimum")
+            raise InputError("running_cost", got="no positive curvature in the inputs", expected="a strict minimum")
         rolling.tails = step.tails
         self._first_step = step
         return motion
@@ -333,7 +333,7 @@ def _check(problem: Problem) -> None:
     if not isinstance(problem, Problem):
         raise InputError("problem", got=type(problem).__name__, expected="a Problem")
     if not problem.has_model:
-        raise InputError("system", got="plain dynamics", expected="a Model: MPC steps its plant")
+        raise InputError("system", got="plain dynamics", expected="a Model, whose plant MPC simulates")
     if not problem.optimizes_controls or not problem.initial_state_is_given or problem.optimizes_parameters:
         raise InputError("optimize", got=list(problem.optimize), expected='("controls",) for MPC')
     given = {
@@ -345,7 +345,7 @@ def _check(problem: Problem) -> None:
         "parameter_cost": problem.parameter_cost is not None,
     }
     for subject in (name for name, is_given in given.items() if is_given):
-        raise InputError(subject, got="given", expected="a problem without it, as MPC does not support it")
+        raise InputError(subject, got="given", expected=f"no {subject}, as MPC does not support it")
 
 
 def _staying(problem: Problem, xs: Array, us: Array) -> Staying | None:
@@ -360,7 +360,7 @@ def _staying(problem: Problem, xs: Array, us: Array) -> Staying | None:
     goal, u = _fixed_point(problem, xs[-1], us[-1])
     if np.any(u < bounds.u_lower) or np.any(u > bounds.u_upper):
         raise InputError(
-            "x_goal", got=f"a state held by u = {u}", expected="a fixed point of inputs within their bounds"
+            "x_goal", got=f"a fixed point with u = {u}", expected="a fixed point with inputs within their bounds"
         )
     for constraint in at_end:
         if constraint.miss(goal) > constraint.tolerance:
@@ -417,7 +417,7 @@ def _first_plan(problem: Problem, plan: Any) -> tuple[Array, Array]:
 def _sampled(problem: Problem, solution: Solution) -> tuple[Array, Array]:
     """Sample a solution at the problem's steps. If its horizon is shorter, its last values are repeated."""
     if len(solution.xs[0]) != problem.nx:
-        raise InputError("plan", got=f"a Solution of {len(solution.xs[0])} states", expected=f"one of {problem.nx}")
+        raise InputError("plan", got=f"a Solution with {len(solution.xs[0])} states", expected=f"{problem.nx} states")
     h = problem.time_step
     if solution.problem.num_steps == problem.num_steps and np.isclose(solution.time_step, h, rtol=1e-9, atol=0.0):
         return solution.plan.sample(1)

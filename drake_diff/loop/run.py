@@ -376,10 +376,10 @@ class ClosedLoop(LoopRows, ShowsItsRepr):
         lines = [
             f"closed loop of {self.model.name} under {name_of(self.controller)}",
             f"  {len(self.times)} steps of the controller, {len(self.us)} of the plant",
-            f"  controller: ok in {ok} steps, otherwise in {len(self.times) - ok}; {len(self.events)} events",
+            f"  controller: ok in {ok} of {len(self.times)} steps; {len(self.events)} events",
             f"  last state: {np.array2string(self.xs[-1], precision=4, threshold=20)}",
         ]
-        return "\n".join(lines + ([f"  broke off {self.ended}"] if self.ended else []))
+        return "\n".join(lines + ([f"  ended early {self.ended}"] if self.ended else []))
 
 
 def name_of(component: Any) -> str:

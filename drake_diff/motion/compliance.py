@@ -39,7 +39,7 @@ def read_material(inspector: Any, pairs: Sequence[tuple[Any, Any]], law: str) ->
         missing = [name for name in ("friction", "stiffness", DAMPING[law]) if values[name] is None]
         if missing:
             raise ModelError(
-                f"{inspector.GetName(geometry)} sets no {missing[0]}, without which contact has no law of motion"
+                f"{inspector.GetName(geometry)} has no {missing[0]}, which the contact law in continuous time requires"
             )
         sides.append([values[name] or 0.0 for name in QUANTITIES])
     return combine(np.array(sides, dtype=float).reshape(len(pairs), 2, 4))

@@ -73,7 +73,7 @@ class RolloutGradient(ShowsItsRepr):
             f"  {', '.join(sizes[:6])}{', ...' if len(sizes) > 6 else ''}\n"
             f"  |d loss / d x_k| from {first:.3g} at the start to {last:.3g} at the end, a factor of "
             f"{self.growth_rate:.3g} a step"
-            + (f"\n  undefined by {', '.join(column.column for column in self.undefined)}" if self.undefined else "")
+            + (f"\n  no slope for {', '.join(column.column for column in self.undefined)}" if self.undefined else "")
         )
 
     @property
@@ -206,8 +206,8 @@ def _in_continuous_time(
         more = f", and {len(undefined) - NAMED} more" if len(undefined) > NAMED else ""
         named = "; ".join(str(column) for column in undefined[:NAMED])
         warnings.warn(
-            f"the loss has no slope in {len(undefined)} of its columns, the derivative there is that of a point alone: "
-            f"{named}{more}",
+            f"the loss has no slope with respect to {len(undefined)} variables, whose derivatives are valid at the "
+            f"point only: {named}{more}",
             GradientWarning,
             stacklevel=3,
         )

@@ -90,7 +90,7 @@ def differentiate_loss(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, 
     except Exception:  # not supported by autograd, or an error in the loss, which AutoDiffXd then reports
         return *_by_autodiff(loss, xs, us), AUTODIFF
     if not (np.isfinite(value) and np.all(np.isfinite(by_xs)) and np.all(np.isfinite(by_us))):
-        raise GradientError(f"the loss or its gradient is not finite, as that of a norm at zero: value {value}")
+        raise GradientError(f"the loss or its gradient is not finite, like the gradient of a norm at 0: loss {value}")
     return value, by_xs, by_us, AUTOGRAD
 
 

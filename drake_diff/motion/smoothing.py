@@ -219,7 +219,7 @@ def smooth(
     x = finite_array("x", x, ("n",))
     moved = _moved(noise, len(x))
     if jacobian is None and (method != "zeroth" or not moved.all()):
-        why = 'a function (n,) -> (m, n): only method="zeroth" with noise on all coordinates needs none'
+        why = 'a function (n,) -> (m, n): it is optional only for method="zeroth" with noise on all coordinates'
         raise InputError("jacobian", got=None, expected=why)
     if positive_int("samples", samples) < 2:
         raise InputError("samples", got=samples, expected="at least 2, as one sample has no variance")
@@ -340,7 +340,7 @@ def _moved(noise: Noise, size: int) -> Flags:
         raise InputError("noise", got=repr(noise)[:80], expected="a Gaussian or a Barrier")
     scale = np.asarray(noise.sigma if isinstance(noise, Gaussian) else noise.c)
     if scale.ndim and scale.shape != (size,):
-        raise ShapeError(f"the numbers of {type(noise).__name__}", got=scale.shape, expected=(size,))
+        raise ShapeError(f"the scale of {type(noise).__name__}", got=scale.shape, expected=(size,))
     return np.array(np.broadcast_to(scale > 0, (size,)))
 
 
@@ -389,7 +389,7 @@ def _moments(
     centre = _evaluate("f", f, x.copy(), ("m",))
     rows, size = len(centre), len(x)
     if not (rows and size):
-        raise InputError("x and f(x)", got=f"{size} and {rows} entries", expected="at least one of each")
+        raise InputError("x and f(x)", got=f"{size} and {rows} entries", expected="at least one entry each")
     slope = _evaluate("jacobian", jacobian, x.copy(), (rows, size)) if jacobian and corrects else None
     mean, squares, low, high = np.zeros(()), np.zeros(()), np.array(np.inf), np.array(-np.inf)
     for n, w in enumerate(noise.sample(np.random.default_rng(seed), (samples, size)), start=1):

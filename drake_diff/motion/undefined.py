@@ -121,9 +121,9 @@ class Undefined(ShowsItsRepr):
             if error <= KNOWN * abs(value):
                 return self._smooth(width, samples, random)
         raise GradientError(
-            f"the smoothed slope by {self.column} is not significant with {samples} samples: at the largest width, "
-            f"{SMOOTHED[-1] * line.unit:g}, it is {value:.3g} with a standard error of about {error:.2g}; take more "
-            "samples"
+            f"the smoothed slope with respect to {self.column} is not significant with {samples} samples: at the "
+            f"largest width, {SMOOTHED[-1] * line.unit:g}, it is {value:.3g} with a standard error of {error:.2g}: "
+            "use more samples"
         )
 
     def _smooth(self, width: float, samples: int, random: np.random.Generator) -> Smoothed:
@@ -316,7 +316,7 @@ class _Judge:
                 reason = self._reason(line, slopes_by_width, SMOOTH)
                 reason = UNSETTLED if line.touches else reason
         except SimulationError as error:
-            reason = f"the motion near this one fails: {error}"
+            reason = f"a perturbed motion fails: {error}"
         if not reason:
             return None
         widths, slopes = tuple(w * line.unit for w in slopes_by_width), tuple(slopes_by_width.values())

@@ -72,7 +72,7 @@ class RelaxedOptions:
 
 
 SOFT, RELAXED = SoftOptions(), RelaxedOptions()
-FORMS = 'None, "auto", "relaxed" or SoftContacts, one a stage'
+FORMS = 'None, "auto", "relaxed" or a SoftContact for each stage'
 Stages = tuple[SoftContact, ...] | RelaxedPlant
 
 
@@ -173,7 +173,7 @@ class _Stages:
             with until_set(self.interrupted):
                 self._relax(xs, plant, followed)
         except TimeIsUpError:
-            self._say("the true plant follows no more relaxed stages")
+            self._say("the remaining relaxed stages are skipped")
         if followed:
             _, self.xs, self.us = min(followed, key=lambda start: start[0])
         else:
@@ -253,7 +253,7 @@ def default_schedule(problem: Problem) -> tuple[SoftContact, ...]:
     set_state(model.double, problem.x0)
     mass = min((1 / pair.mobility for pair in separations(model.double) if pair.mobility > 0), default=math.inf)
     if not math.isfinite(mass):
-        raise InputError("x0", got="no collision pair that can approach", expected="a state with such a pair")
+        raise InputError("x0", got="no such pair", expected="a state in which a collision pair can approach")
     reach = max(*distances(model.double).values(), thinnest_geometry(model)[0] / 2)
     duration, stiffest = problem.num_steps * model.time_step, SOFT.largest_stiffness * mass / model.time_step**2
     stages: list[SoftContact] = []
@@ -275,7 +275,7 @@ def read_relaxed_plant(problem: Problem) -> RelaxedPlant:
         raise InputError("continuation", got=f"'relaxed': {plant.reason}", expected="another model, or 'auto'")
     if not plant.pairs.ids:
         raise InputError(
-            "continuation", got="'relaxed': no sphere has a collision pair", expected="a model with such a pair"
+            "continuation", got="'relaxed'", expected="'auto', as no sphere of the model has a collision pair"
         )
     return plant
 

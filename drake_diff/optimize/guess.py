@@ -30,7 +30,7 @@ NOISE = 1e-3  # noise on a stationary guess, as a fraction of the input limits, 
 WANDER = (1.0, 0.3)  # deviation of a random guess from the straight line, as a fraction of max(1, distance to the goal)
 WAVES = 4
 LONGER = 3.0  # largest factor between a random horizon and the first horizon, in both directions
-FORMS = "None, (xs, us), two of Drake's trajectories (state, input) or a Solution"
+FORMS = "None, (xs, us), two Drake trajectories (state, input) or a Solution"
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,14 +149,14 @@ def sampled(problem: Problem, method: str, given: Any) -> Any:
     for name, signal, rows in zip(("state", "input"), given, (problem.nx, problem.nu), strict=True):
         if not isinstance(signal, Trajectory):
             raise InputError(
-                f"initial_guess {name}", got=type(signal).__name__, expected="a trajectory of Drake, like the other"
+                f"initial_guess {name}", got=type(signal).__name__, expected="a Drake trajectory, like the other entry"
             )
         if (signal.rows(), signal.cols()) != (rows, 1):
             raise ShapeError(f"initial_guess {name}", got=(signal.rows(), signal.cols()), expected=(rows, 1))
     state, held = given
     start, end = state.start_time(), state.end_time()
     if not (np.isfinite(end - start) and end > start):
-        raise InputError("initial_guess state", got=f"from {start:g} to {end:g} s", expected="a beginning and an end")
+        raise InputError("initial_guess state", got=f"from {start:g} to {end:g} s", expected="a duration in (0, inf)")
     knots = np.linspace(start, end, problem.num_steps + 1)
     if method == "collocation" or problem.horizon:  # collocation takes a free horizon
         return _values("state", state, knots), _values("input", held, knots), end - start

@@ -36,7 +36,7 @@ class LiveSearch:
         if not isinstance(problem, Problem) or not problem.has_model:
             kind = "plain dynamics" if isinstance(problem, Problem) else type(problem).__name__
             raise InputError(
-                "view", got=f"True, with {kind}", expected="a Problem of a model, which has bodies to draw"
+                "view", got=f"True, with {kind}", expected="a Problem with a model, whose bodies are drawn"
             )
         self.problem, self.tell = problem, tell
         self.page: LivePage | None = None
@@ -71,7 +71,7 @@ class LiveSearch:
             report.say(text)
 
         def plan(plan: Any) -> None:
-            self._update_page(state="measuring", line="a search has ended, and its plan is measured")
+            self._update_page(state="measuring", line="the search has ended, and its plan is being measured")
             if report.plan is not None:
                 report.plan(plan)
 

@@ -117,7 +117,7 @@ class Options:
             methods = TAKEN_BY.get(name, (method,))
             if value is not False and method not in ("auto", *methods):
                 taken = " and ".join(f'method="{other}"' for other in methods)
-                expected = f'none for method="{method}": it is an option of {taken}'
+                expected = f'no value for method="{method}", as it is an option of {taken}'
                 raise InputError(name, got=f"{value!r:.80}", expected=expected)
 
     def of_method(self, method: str) -> "Options":

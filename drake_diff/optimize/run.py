@@ -448,7 +448,7 @@ class Run:
             if not lacking or result.outcome not in (Outcome.SOLVED, Outcome.INACCURATE, Outcome.ITERATION_LIMIT):
                 break
             if self.report is not None:
-                self.report.say(f"{in_words(lacking, 'm')} too near to an obstacle within a step: {parts} parts")
+                self.report.say(f"{in_words(lacking, 'm')} too near to an obstacle in a step: {parts} parts per step")
             last = self._values_of(result, values)
             more = swept(self.problem.kept, problem.design.time_step(last), parts)
             wider = dataclasses.replace(problem, constraints=(*problem.constraints, *more))

@@ -128,11 +128,11 @@ def sensitivity(solution: Solution, by: Any = "x0", *, certified: bool = True) -
         raise InputError("solution", got=type(solution).__name__, expected="a Solution")
     if not solution.success:
         raise InputError(
-            "solution", got=solution.status.value, expected="a successful solution; its message says why it is not"
+            "solution", got=solution.status.value, expected="a successful solution; solution.message states the failure"
         )
     if solution.scheme == "drake":
         raise InputError(
-            "solution", got='scheme="drake"', expected="one by hermite_simpson, trapezoid, iLQR or shooting"
+            "solution", got='scheme="drake"', expected="a solution by hermite_simpson, trapezoid, iLQR or shooting"
         )
     change = _change(solution, by)
     plan = _plan(solution)
@@ -178,7 +178,7 @@ class _Plan:
 def _plan(solution: Solution) -> _Plan:
     motion, problem = solution.transcribed, solution.problem
     if problem.motion != STEPS:
-        raise ModelError('a plan with motion="continuous" has no second derivatives here: motion="steps" has them')
+        raise ModelError('motion="continuous" has no second derivatives for sensitivities: use motion="steps"')
     if motion is not None:
         scheme, mesh = solution.scheme, motion.mesh
 
@@ -213,7 +213,7 @@ def _held(plan: _Plan) -> HeldPlan:
     if held.left > WEAK:
         raise GradientError(
             f"the plan has no derivative: it is not a stationary point of its problem, as {held.left:.2g} of the "
-            "cost's slope remains; it ends at a kink, as where a contact begins, or short of its optimum"
+            "cost's gradient remains; the search ended at a kink, as where a contact begins, or before its optimum"
         )
     return held
 
@@ -240,7 +240,7 @@ def _change(solution: Solution, by: Any) -> Change:
         raise InputError("by", got=repr(by), expected='"x0" or "goal", as a horizon sets the length of the steps')
     chosen = {p.name for p in problem.parameters.parameters} & {p.name for p in vector.parameters}
     if chosen and problem.optimizes_parameters:
-        raise InputError("by", got=sorted(chosen), expected="parameters that the plan does not choose itself")
+        raise InputError("by", got=sorted(chosen), expected="parameters that are not optimized")
     return Change(vector.names, np.array(vector.values), None, parameters=by)
 
 
@@ -272,7 +272,8 @@ def _differences(plan: _Plan, held: HeldPlan, change: Change, response: Held) ->
             sides = _distance(left, right, least)
         apart.append(off)
         if off > SAME and sides > TWO_SIDED * SAME:
-            corners.append(f"the one-sided derivatives by {change.columns[i]} differ by {sides:.2g} of their size")
+            name = change.columns[i]
+            corners.append(f"the one-sided derivatives with respect to {name} differ by {sides:.2g} of their size")
     return np.array(apart), corners
 
 

@@ -201,7 +201,7 @@ def page_again(path: Path, template: str, *, record: Mapping[str, Any], view: st
     try:
         return _page(template, record, json_of(match[0].encode() if match else b""), view, facts).encode()
     except (ArithmeticError, LookupError, TemplateError, TypeError, ValueError) as error:
-        raise ArtifactError(f"{path.name}: no such page: {type(error).__name__}: {error}") from error
+        raise ArtifactError(f"{path.name}: the data of the page is invalid: {type(error).__name__}: {error}") from error
 
 
 def content_policy(page: str) -> str:

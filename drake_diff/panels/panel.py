@@ -314,7 +314,7 @@ def run_panel(
     if engine not in ENGINES:
         raise UnknownNameError("engine", got=engine, known=ENGINES)
     if address is not None and engine != "ray":
-        raise InputError("address", got=address, expected='none for engine="local"; engine="ray" takes it')
+        raise InputError("address", got=address, expected='no address for engine="local", or engine="ray"')
     panel = load_panel(path)
     trials = expand(panel)
     function = TrialFunction(panel.evaluate, str(path.resolve().parent))

@@ -76,10 +76,10 @@ class Panel(BaseModel):
         if not self.axes and not self.cells:
             raise ValueError("expected at least one axis or one of [[cells]], got neither")
         for name in {*self.axes, *(name for cell in self.cells for name in cell)} & {*self.fixed, *OURS}:
-            why = "it is in [fixed], or drake_diff gives it to each trial"
+            why = "it is in [fixed], or drake_diff sets it for each trial"
             raise ValueError(f"axes and cells: {name} cannot be used: {why}")
         for name in self.fixed.keys() & set(OURS):
-            raise ValueError(f"fixed: {name} cannot be used: drake_diff gives it to each trial")
+            raise ValueError(f"fixed: {name} cannot be used: drake_diff sets it for each trial")
         return self
 
     @property
@@ -177,7 +177,7 @@ class Finished:
     def _read(self, path: Path) -> Row:
         trial, problems = _read_trial(path)
         if trial.conditions != self.conditions:
-            problems = (*problems, "it belongs to another panel; remove it")
+            problems = (*problems, "the trial belongs to another panel; remove its record")
         if problems:
             raise ArtifactError(f"{path}: {problems[0]}")
         return trial.result
@@ -203,13 +203,13 @@ def _check_same_panel(directory: Path, conditions: Mapping[str, Any]) -> None:
         record = load_record(directory)
     if not isinstance(record, ComparisonRecord) or record.panel is None:
         expected = "a new or empty directory, or the directory of an unfinished panel"
-        raise InputError("out", got=f"{directory}, which holds {next(directory.iterdir()).name!r}", expected=expected)
+        raise InputError("out", got=f"{directory} with {next(directory.iterdir()).name!r}", expected=expected)
     old = record.panel.conditions
     for key in sorted({*old, *conditions}):
         if old.get(key) != conditions.get(key):
             differs = f"{key}: expected {conditions.get(key)}, got {old.get(key)}"
             advice = "choose another directory, or remove this one to start over"
-            raise ArtifactError(f"{directory} is of another panel: {differs}; {advice}")
+            raise ArtifactError(f"{directory} belongs to another panel: {differs}; {advice}")
 
 
 def _read_trial(path: Path) -> tuple[TrialSection, tuple[str, ...]]:
@@ -219,7 +219,7 @@ def _read_trial(path: Path) -> tuple[TrialSection, tuple[str, ...]]:
     if trial is None:
         raise ArtifactError(f"{path}: expected the record of a trial")
     if not problems and not _follows(path, record, trial):
-        problems = (f"{path.name}: it is not what the panel writes of these inputs and this result",)
+        problems = (f"{path.name}: it differs from the record that the panel writes for these inputs and this result",)
     return trial, problems
 
 
@@ -417,7 +417,7 @@ def _odd_trial(path: Path) -> Iterator[str]:
     row, record = _read_table(panel / TABLE).get(trial.id, {}), load_record(panel)
     conditions = record.panel.conditions if isinstance(record, ComparisonRecord) and record.panel is not None else {}
     if trial.conditions != conditions or any(row.get(name) != _text(value) for name, value in trial.result.items()):
-        yield f"{path.name}: its result or its panel is not that of {TABLE}"
+        yield f"{path.name}: its result or its panel differs from {TABLE}"
 
 
 def _odd_panel(folder: Path, record: ComparisonRecord, again: Path) -> list[str]:
@@ -437,7 +437,7 @@ def _odd_panel(folder: Path, record: ComparisonRecord, again: Path) -> list[str]
     trials, rows = [], {}
     for name in table:
         item, problems = _read_trial(folder / TRIALS / f"{name}.json")
-        result += [*problems, *([f"{name}.json: it is of another panel"] if item.conditions != panel else [])]
+        result += [*problems, *([f"{name}.json: from another panel"] if item.conditions != panel else [])]
         trials.append(PanelTrial(ordered.get(canonical(item.cell), item.cell), item.inputs))
         rows[name] = item.result
     if result:
@@ -446,11 +446,11 @@ def _odd_panel(folder: Path, record: ComparisonRecord, again: Path) -> list[str]
     write_ranking(again / PAGE, made.summary, record)
     files = _read_table(again / TABLE), read_fields(again / SUMMARY)
     for name, old, new in zip((TABLE, SUMMARY), (table, summary), files, strict=True):
-        result += [f"{name}: it does not come out of {TRIALS} again"] * (old != new)
+        result += [f"{name}: it differs from the file recomputed from {TRIALS}"] * (old != new)
     begun = record.panel.model_copy(update={"trials": len(trials)})
     ended = ended_record(record.model_copy(update={"panel": begun}), made, 0.0)
     wrong = [name for name in STATED if getattr(ended, name) != getattr(record, name)]
-    return [*result, *(f"{record.FILE}: {name} is not what the table says" for name in wrong)]
+    return [*result, *(f"{record.FILE}: {name} differs from the value recomputed from the table" for name in wrong)]
 
 
 def _read_table(path: Path) -> dict[str, dict[str, str]]:

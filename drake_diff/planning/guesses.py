@@ -92,7 +92,7 @@ def read_goals(model: Model, goals: Mapping[str, Any], avoid: Sequence[Obstacle]
                 raise InputError(f"goal {name}", got=numbers[0], expected=expected)
             angles[index] = float(numbers[0])
         else:
-            expected = "three numbers (the position of a frame) or one (that of a joint)"
+            expected = "three numbers (the position of a frame) or one number (the position of a joint)"
             raise InputError(f"goal {name}", got=f"{len(numbers)} numbers", expected=expected)
     for obstacle in avoid:
         if not isinstance(obstacle, Obstacle):
@@ -131,7 +131,7 @@ class Space:
         x = np.concatenate([q, np.zeros(self.robot.model.nv)])
         worst = max(self.clear, key=lambda c: float(c.lacking(x[None])[0]), default=None)
         is_near = worst is not None and worst.lacking(x[None])[0] > 0
-        return str(worst.check_at(x, "that posture", 0.0)) if is_near and worst else ""
+        return str(worst.check_at(x, "the goal", 0.0)) if is_near and worst else ""
 
 
 def postures(robot: Robot, task: Goals, seed: int) -> list[Array]:
@@ -159,12 +159,12 @@ def postures(robot: Robot, task: Goals, seed: int) -> list[Array]:
             blocked = space.obstruction(q)
             candidates += [] if blocked else [q]
     if not candidates and blocked:
-        expected = f"a goal that one of {MORE_SEEDS} tried postures reaches clear of all obstacles"
-        raise InputError(f"goal {', '.join(task.frames)}", got=f"at the goal {blocked}", expected=expected)
+        expected = f"a goal that one of {MORE_SEEDS} postures reaches clear of all obstacles"
+        raise InputError(f"goal {', '.join(task.frames)}", got=blocked, expected=expected)
     if not candidates:
-        criteria = "inside all limits, without overlap and held by the motors"
+        criteria = "within all limits, without overlap and with loads that the motors can hold"
         if nearest > REACHED:
-            criteria = f"inside all limits: the nearest of {SEEDS} tries is {nearest:.3g} m away"
+            criteria = f"within all limits: the nearest of {SEEDS} postures is {nearest:.3g} m away"
         raise ModelError(f"no posture was found with {', '.join(task.frames)} at its goal, {criteria}")
     return sorted(candidates, key=lambda q: float(np.max(np.abs(q - robot.q))))[:CANDIDATES]
 
@@ -186,7 +186,7 @@ def _reach(robot: Robot, task: Goals, first: Array, fixed: Array) -> tuple[Array
 def _random_goals(space: Space, random: np.random.Generator) -> list[Array]:
     goals = [q for q in (_random_posture(space, random) for _ in range(RANDOM)) if q is not None]
     if not goals:
-        message = "no goal posture was found: no random posture is free of overlap and held by the motors"
+        message = "no goal posture was found: no random posture is free of overlap and can be held by the motors"
         raise ModelError(f"{message}: give a goal")
     return goals
 
@@ -253,12 +253,12 @@ def lines(space: Space, target: Array, seed: int) -> list[PostureLine]:
     only a search could help and OMPL is not installed.
     """
     robot = space.robot
-    straight = PostureLine("a straight line in the joints", np.array([robot.q, target]))
+    straight = PostureLine("a straight line in joint space", np.array([robot.q, target]))
     if space.is_free(straight.postures):
         return [straight]
     random = np.random.default_rng([seed, 3])
     can_search, candidates = find_spec("ompl") is not None, []
-    bent = "a bent line" if can_search else "a bent line (no search: ompl is not installed)"
+    bent = "a curve in joint space" if can_search else "a curve in joint space (no search: ompl is not installed)"
     for i in range(BENDS):
         pull = WIDTH * (i + 1) / BENDS * random.uniform(-1, 1, len(target)) * (robot.upper - robot.lower)
         middle = np.clip((robot.q + target) / 2 + pull, robot.lower, robot.upper)
@@ -266,7 +266,7 @@ def lines(space: Space, target: Array, seed: int) -> list[PostureLine]:
         if space.is_free(line.postures):
             candidates.append(line)
     if not (can_search or candidates):
-        raise MissingDependencyError("a path around the obstacles needs a search: pip install ompl")
+        raise MissingDependencyError("a path around the obstacles needs a search by OMPL: pip install ompl")
     searched = [_search(space, target, seed + i) for i in range(SEARCHES if can_search else 0)]
     candidates += [line for line in searched if line is not None]
     return sorted(candidates, key=lambda line: line.length)[:MOST_LINES] or [straight]
@@ -285,7 +285,7 @@ def _search(space: Space, target: Array, seed: int) -> PostureLine | None:
         knots = np.array(BsplineBasis(CUBIC, count).knots())
         even = along[-1] * np.array([np.mean(knots[i + 1 : i + CUBIC]) for i in range(count)])  # for a uniform speed
         line = PostureLine(
-            "a way around by a search", np.array([np.interp(even, along, column) for column in chain.T]).T
+            "a path found by RRT-Connect", np.array([np.interp(even, along, column) for column in chain.T]).T
         )
         if space.is_free(line.postures):
             return line
@@ -391,7 +391,7 @@ def along(robot: Robot, line: PostureLine, *, slower: float = 1.0) -> MotionGues
     t = np.linspace(0, 1, 101)
     speeds = np.abs(line.slopes(smooth(t))) * (30 * t**2 * (1 - t) ** 2)[:, None]
     duration = slower * float(np.max(speeds / speed_limits(robot.model), initial=0.0))
-    name = line.name if slower == 1 else f"{line.name} in {slower:g} times the time"
+    name = line.name if slower == 1 else f"{line.name}, {slower:g} times slower"
     duration = float(np.clip(duration, SHORTEST, LONGEST))
     guess = _timed(robot, name, line.at, duration)
     while guess.effort > OF_EFFORT and duration < LONGEST:
@@ -444,7 +444,7 @@ def _carrier(robot: Robot, name: str) -> int:
         moved[q_start + 4] += 1.0
         if np.any(locate(np.concatenate([moved, still])) != locate(np.concatenate([robot.q, still]))):
             return v_start
-    raise InputError("goals", got=name, expected=f"a frame on what flies: {', '.join(label for label, _, _ in free)}")
+    raise InputError("goals", got=name, expected=f"a frame that floats: {', '.join(label for label, _, _ in free)}")
 
 
 def _timed(robot: Robot, name: str, postures_at: Callable[[Array], Array], duration: float) -> MotionGuess:

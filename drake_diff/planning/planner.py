@@ -64,7 +64,7 @@ REACHES = ((0.5, 50), (0.25, 50), (0.1, 50), (0.1, 25), (0.1, 12))  # fractions 
 GENTLE: dict[str, Any] = {"time_step": 0.005, "meshes": "spheres", "contact_geometry": "corner_spheres"}
 GENTLE |= {"near_rigid": 0.1, "relaxation_time": 0.02}
 SMALLEST_WAY = 0.01  # [rad or m] for the coordinate with the largest motion; smaller motions are rejected
-NOTHING = "no initial guess was found that its motors can follow within its limits: give a goal of joints"
+NOTHING = "no initial guess was found that the motors can follow within the limits: give a goal for joints"
 GENTLY = ((0.25, 100), (0.1, 100))
 COMES_TO_REST = 400  # steps of GENTLE until the robot is at rest
 WIDTH, DRAWS = 0.3, 30  # of a coordinate's range, and the number of samples of another start
@@ -132,7 +132,7 @@ class Plan(ShowsItsRepr):
         return f"; optima at cost {', '.join(f'{cost:.4g}' for cost in costs)}" if len(costs) > 1 else ""
 
     def _goal(self, far: float) -> str:
-        sentences = [f"a state {far:.2g} away (rad or m), at the end of {self.solution.horizon:.3g} s"]
+        sentences = [f"a state {far:.2g} rad or m from the start, after {self.solution.horizon:.3g} s"]
         goals = getattr(self.solution.problem, "goals", ())
         sentences += [str(goal) for goal in goals]
         sentences += doubts_of(goals, self.model)
@@ -196,7 +196,7 @@ def plan(
     with warnings.catch_warnings(), ExitStack() as stack:
         warnings.simplefilter("ignore", ModelWarning)
         folders: list[Path] = []
-        weld = "the least time is sought without contact" if time else ""
+        weld = "the search for the least time excludes contact" if time else ""
         for _ in range(2):
             note("load", path.name)
             ready = load_robot(path, seed, weld, packages)
@@ -287,7 +287,7 @@ def _first_that_holds(
             except WriteError:
                 raise
             except DrakeDiffError as error:
-                tried.append(f"{attempt.name}: not possible ({error})")
+                tried.append(f"{attempt.name}: failed ({error})")
                 break
             depth = attempt.depth(solution) if solution.success else 0.0
             solutions.append(solution)
@@ -347,9 +347,9 @@ def _of_standing(robot: Robot, standing: tuple[Legs, Rest], task: Goals, seed: i
         else:
             shift = shift_to(legs, rest, task.frames, task.joints)
         if isinstance(shift, Refusal):
-            raise ModelError(f"from where it stands no other posture was found: {shift}")
+            raise ModelError(f"no other posture was found that the standing robot reaches: {shift}")
         moved = np.max(np.abs(legs.apart(shift.xs[-1][: robot.model.nq], robot.q)))
-        name = f"its feet where they are, up to {moved:.2g} rad or m to a posture that it holds"
+        name = f"a motion with fixed feet, by up to {moved:.2g} rad or m, to a posture at rest"
         yield _feasible(robot, task, MotionGuess(name, robot.model, shift.xs, shift.us, 0.0))
 
 
@@ -372,11 +372,11 @@ def _check_that_limits_bound_time(model: Model) -> None:
     fast = [v.name for v in model.contract.velocities if not v.lower < v.upper or np.isinf([v.lower, v.upper]).any()]
     strong = [u.name for u in model.contract.inputs if np.isinf([u.lower, u.upper]).any()]
     if model.inputs.commanded.any():
-        expected = "inputs that are efforts: the least time is sought by collocation, which takes no servos"
+        expected = "efforts as inputs, as collocation finds the least time and does not support servos"
         raise InputError('time="least"', got="commanded positions", expected=expected)
     if fast and strong:
-        got = f"no limit of {', '.join(fast[:4])} nor of {', '.join(strong[:4])}"
-        raise InputError('time="least"', got=got, expected="limits of every speed or of every motor in the file")
+        got = f"no speed limit of {', '.join(fast[:4])} and no effort limit of {', '.join(strong[:4])}"
+        raise InputError('time="least"', got=got, expected="limits of all speeds or of all motors in the file")
 
 
 def _guesses(space: Space, target: Array, seed: int) -> list[MotionGuess]:
@@ -409,7 +409,7 @@ def _collocated(robot: Robot, task: Goals, guess: MotionGuess, least: str | None
     options = {"method": "collocation", "time_limit": limit, "options": refined}
     name = f"{what} from {guess.name}"
     near = replace(problem, bounds=_bounds(model, guess.xs[:, : model.nq]))
-    instead = _Attempt(f"{name}, near it", robot, near, guess, options)
+    instead = _Attempt(f"{name}, near this guess", robot, near, guess, options)
     return _Attempt(name, robot, problem, guess, options, instead if guess.depth <= TOUCHING else None)
 
 
@@ -437,7 +437,7 @@ def _of_reachable(robot: Robot, task: Goals, seed: int) -> Iterator[_Attempt]:
     target = robot.q + fractions * (robot.upper - robot.lower) / 2
 
     def reach(begun: Robot, model: Model, way: float, steps: int, how: str = "") -> Iterator[MotionGuess]:
-        name = f"what controllers reach ({way:g} of the way in {steps} steps){how and f', {how}'}"
+        name = f"a state that a controller reaches ({way:g} of the way in {steps} steps){how and f', {how}'}"
         guess = by_controller(begun, model, target, steps=steps, reach=way, name=name)
         if guess is not None and _goes(guess):
             yield guess
@@ -447,12 +447,12 @@ def _of_reachable(robot: Robot, task: Goals, seed: int) -> Iterator[_Attempt]:
         if robot.apart is not None:
             space, elsewhere = Space.around(robot, task.avoid), _elsewhere(robot, random)
             for way, begun in product(REACHES, (robot, elsewhere)):
-                made = reach(begun, robot.apart, *way, "touching nothing (contact=False)")
+                made = reach(begun, robot.apart, *way, "without contact (contact=False)")
                 yield from (guess for guess in made if _touched(space, guess) <= 0)
             gentle = robot.model.changed(**GENTLE)
             rest = by_controller(robot, gentle, robot.q, steps=COMES_TO_REST, reach=0.0, name="")
             settled = robot if rest is None else replace(robot, q=rest.xs[-1][: gentle.nq])
-            how = f"from where it comes to rest, by spheres in its shapes and steps of {GENTLE['time_step']:g} s"
+            how = f"from its state of rest, with spheres in its shapes and steps of {GENTLE['time_step']:g} s"
             for way in GENTLY:
                 yield from reach(settled, gentle, *way, how)
         for way in REACHES[1:]:
@@ -476,7 +476,7 @@ def _elsewhere(robot: Robot, random: np.random.Generator) -> Robot:
 def _of_passive(robot: Robot, task: Goals) -> Iterator[_Attempt]:
     """Yield attempts of an underactuated robot to joint goals; all other joints end at their start, at rest."""
     if task.frames:
-        raise InputError("goal", got=", ".join(task.frames), expected="goals of joints: not every joint has a motor")
+        raise InputError("goal", got=", ".join(task.frames), expected="goals of joints, as not every joint has a motor")
     model = robot.model
     x0 = np.concatenate([robot.q, np.zeros(model.nv)])
     goal, budget = x0.copy(), BUDGET

@@ -134,10 +134,10 @@ def _reduce_followers(draft: _Draft) -> None:
     try:
         reduced = draft.read(mimic="reduce")
     except ModelError as error:
-        draft.repairs.append(f"joints that follow others stay in the state, as {error}")
+        draft.repairs.append(f"mimic joints stay in the state, as {error}")
         return
     if gone := draft.model.nv - reduced.nv:
-        draft.mend(f"{gone} joints that follow others left the state (mimic='reduce')", reduced, mimic="reduce")
+        draft.mend(f"{gone} mimic joints were removed from the state (mimic='reduce')", reduced, mimic="reduce")
 
 
 def _add_motors(draft: _Draft) -> None:
@@ -148,7 +148,7 @@ def _add_motors(draft: _Draft) -> None:
         driven = draft.read(actuators="all")
         if driven.nu > had:
             begin = f"only {had} joints had a motor" if had else "no joint had a motor"
-            repair = f"{begin}: all {driven.nu} that can be driven have one (actuators='all')"
+            repair = f"{begin}: motors were added, {driven.nu} in total (actuators='all')"
             draft.mend(repair, driven, actuators="all")
 
 
@@ -164,7 +164,7 @@ def _weld_base(draft: _Draft, why: Refusal) -> None:
     if welded.nv < draft.model.nv:
         plant = draft.model.plant
         names = _few(plant.get_body(b).name() for b in sorted(plant.GetFloatingBaseBodies()))
-        draft.mend(f"{names} floated: it is fixed to the world (base='weld'), as {why}", welded, base="weld")
+        draft.mend(f"the floating base {names} is fixed to the world (base='weld'), as {why}", welded, base="weld")
 
 
 def _fix_stuck(draft: _Draft) -> None:
@@ -191,7 +191,7 @@ def _fix_massless(draft: _Draft) -> None:
     if draft.options.get("mimic"):
         fixed = draft.read(mimic="fix")
         if not _why_not(fixed):
-            repair = "joints that follow others, and those that they follow, are fixed (mimic='fix')"
+            repair = "mimic joints and their leaders are fixed (mimic='fix')"
             draft.mend(f"{repair}, as Drake cannot take a step with them: {why}", fixed, mimic="fix")
             return
     mass = np.diag(model.double.mass_matrix())
@@ -201,7 +201,7 @@ def _fix_massless(draft: _Draft) -> None:
         if joint.num_velocities() == 1 and any(mass[v] <= 0 for v in model.places(joint)[1])
     ]
     if light:
-        draft.fix(light, f"{_few(light)} move nothing that has a mass or inertia")
+        draft.fix(light, f"{_few(light)} move no mass and no inertia")
 
 
 def _why_not(model: Model) -> str:
@@ -217,11 +217,11 @@ def _add_thrusters(draft: _Draft) -> None:
     if not draft.model.nu and draft.model.plant.GetFloatingBaseBodies():
         forces = thrusters(draft.model)
         names = _few(dict.fromkeys(force.body for force in forces))
-        repair = f"nothing drives {names}: six thrusters push and turn it, two along each axis (body_forces)"
+        repair = f"{names} has no actuator: six thrusters were added, two along each axis (body_forces)"
         draft.mend(repair, body_forces=forces)
     if not draft.model.nu:
-        reason = "it has no revolute or prismatic joint, and none floats"
-        raise ModelError(f"{draft.path}: nothing in it can be driven: {reason}")
+        reason = "it has no revolute or prismatic joint and no floating body"
+        raise ModelError(f"{draft.path}: no joint or body can be driven: {reason}")
 
 
 # Options for standing: all shapes are spheres, whose ground contact has derivatives; no other contact.
@@ -242,7 +242,7 @@ def _standing(read: _Draft, seed: int) -> Robot | Refusal:
         _fix_massless(draft)
         derivatives = analytic_of(draft.model)
         if draft.model.nv > MANY and isinstance(derivatives, Refusal) and draft.options.get("mimic") == "reduce":
-            what = "mimic joints and their leaders are fixed at their position"
+            what = "mimic joints and their leaders are fixed"
             draft.mend(f"{what} (mimic='fix'), for analytic derivatives", mimic="fix")
             derivatives = analytic_of(draft.model)
         model = draft.model
@@ -257,8 +257,8 @@ def _standing(read: _Draft, seed: int) -> Robot | Refusal:
         overlapping = pairs_always([np.where(is_joint, random.uniform(lower, upper), q) for _ in range(DRAWN)], shapes)
         besides = overlapping | pairs_always([q], shapes)
     except DrakeDiffError as error:
-        return Refusal(f"a model that could stand cannot be made: {error}")
-    ground = "on a ground that was added (base='free', ground=True), by spheres in its shapes"
+        return Refusal(f"a model for standing cannot be loaded: {error}")
+    ground = "on an added ground (base='free', ground=True), with contact at spheres in its shapes"
     draft.repairs.append(f"it stands on {_few(foot.name for foot in stance[0].feet)}, {ground}")
     if besides:
         pairs = _few(map(" and ".join, sorted(besides)))

@@ -69,7 +69,7 @@ class Difference:
     allowed: bool = False
 
     def __str__(self) -> str:
-        return f"{self.file}: {self.key}: recorded {shown(self.recorded)}, again {shown(self.again)}"
+        return f"{self.file}: {self.key}: recorded {shown(self.recorded)}, recomputed {shown(self.again)}"
 
 
 @dataclass

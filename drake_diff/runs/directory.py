@@ -193,11 +193,11 @@ def read_checked(path: Path) -> tuple[SealedRecord, tuple[str, ...]]:
         fields = read_fields(path)
         record = parse_record(path, fields)
         if canonical(fields).encode() != read_plain(path, MOST_TEXT):
-            problems.append(f"{path.name}: its bytes are not those that drake_diff writes for its content")
+            problems.append(f"{path.name}: its bytes differ from those that drake_diff writes for this content")
         if fields.get("schema_version") == SCHEMA_VERSION and fields != record.model_dump(mode="json"):
-            problems.append(f"{path.name}: a field is missing, or has another type than drake_diff writes")
+            problems.append(f"{path.name}: a field is missing or has another type than drake_diff writes")
         if own_sha256(fields) != fields.get("record_sha256"):
-            problems.append(f"{path.name}: its content does not match its record_sha256: something in it was changed")
+            problems.append(f"{path.name}: its content does not match its record_sha256: the file was changed")
     except RecursionError as error:
         raise ArtifactError(f"{path.name}: nested too deep") from error
     if record.subject != "trial":
@@ -210,23 +210,23 @@ def _damage_of_files(path_of_record: Path, record: SealedRecord) -> Iterator[str
     paths, read, lister = files_in(path_of_record.parent), 0, path_of_record.name
     paths.pop(lister, None)
     for name in sorted(record.files.keys() - paths.keys()):
-        yield f"{name}: missing, {lister} lists it"
+        yield f"{name}: the file is listed in {lister} but missing"
     for name, path in sorted(paths.items()):
         described = record.files.get(name)
         if not path.is_file(follow_symlinks=False):
-            yield f"{name}: a link, or not a plain file"
+            yield f"{name}: a link, or not a regular file"
         elif described is None:
-            yield f"{name}: {lister} does not list it"
+            yield f"{name}: the file is not listed in {lister}"
         else:
             size, result = path.stat(follow_symlinks=False).st_size, ""
             if size == described.bytes:  # a file of another size is not read
                 read += size
                 if read > MOST_READ:
-                    yield f"{name}: it and the files before it have more than {MOST_READ} bytes"
+                    yield f"{name}: the files up to this one have more than {MOST_READ} bytes"
                     return
                 size, result = sha256_of(Path(path.path))
             if described != FileEvidence(path=name, bytes=size, sha256=result):
-                yield f"{name}: its {size} bytes are not those that {lister} describes"
+                yield f"{name}: the content ({size} bytes) differs from the one listed in {lister}"
 
 
 PARTIAL = re.compile(r"(?P<name>.+)\.(partial|replaced)-\d+-[0-9a-f]{8}")
@@ -257,9 +257,9 @@ def written_whole(directory: str | Path) -> Iterator[Path]:
             with suppress(OSError):
                 partial.rmdir()  # succeeds only if nothing was written
             if partial.is_dir() and isinstance(error, WriteError):
-                raise _with_files_in(f"{error}; what was written is in {partial}", partial) from error
+                raise _with_files_in(f"{error}; the files written so far are in {partial}", partial) from error
             if partial.is_dir():
-                error.add_note(f"what was written is in {partial}")
+                error.add_note(f"the files written so far are in {partial}")
             raise
         _clear(old, target)
 
@@ -292,9 +292,9 @@ def check_place(target: Path) -> None:
             raise InputError("directory", got=got, expected="a directory that can be replaced, such as one below it")
         other = next(_others(target), None)
         if other is not None:
-            raise InputError("directory", got=f"{target}, which holds {other.name!r}", expected=EXPECTED)
+            raise InputError("directory", got=f"{target}, which contains {other.name!r}", expected=EXPECTED)
     elif os.path.lexists(target):
-        raise InputError("directory", got=f"{target}, which is no directory", expected=EXPECTED)
+        raise InputError("directory", got=f"{target}, which is not a directory", expected=EXPECTED)
 
 
 def move_into_place(partial: Path, target: Path) -> None:
@@ -343,7 +343,7 @@ def _clear(old: Path | None, target: Path) -> None:
             old = replaced
             remove_folder(replaced)
     except WriteError as error:
-        left = "" if old is None else f", and the one before in {old}"
+        left = "" if old is None else f", and the replaced run is in {old}"
         raise _with_files_in(f"{error}; the run is in {target}{left}", target) from error
 
 

@@ -107,9 +107,9 @@ class Metric(Fields):
         ):
             raise ValueError(f'metric {self.name}: expected a tolerance, or "info" as direction and verdict')
         if self.verdict == "pass" and not self.keeps(self.value):
-            raise ValueError(f'metric {self.name}: "pass", but {self.value} does not keep {self.tolerance}')
+            raise ValueError(f'metric {self.name}: "pass", but {self.value} violates the tolerance {self.tolerance}')
         if self.verdict == "fail" and self.keeps(self.value):
-            raise ValueError(f'metric {self.name}: "fail", but {self.value} keeps {self.tolerance}')
+            raise ValueError(f'metric {self.name}: "fail", but {self.value} satisfies the tolerance {self.tolerance}')
         return self
 
     def keeps(self, value: float | None) -> bool:
@@ -229,7 +229,7 @@ class DataBoundary(Fields):
         new = [use.name for use in self.judged_on if use.name not in names and use.sha256 not in hashes]
         wrong = [name for name in self.held_out if name not in new]
         if wrong:
-            raise ValueError(f"held out: {', '.join(wrong)}, which the run saw, or was not judged on")
+            raise ValueError(f"held_out: {', '.join(wrong)} is in `seen`, or is not in `judged_on`")
         return self
 
 

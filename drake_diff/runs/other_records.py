@@ -98,7 +98,7 @@ class FitRecord(SealedRecord):
             0,
             len(self.estimates),
         ):
-            raise ValueError("expected a correlation of each estimate with each")
+            raise ValueError("expected a correlation for each pair of estimates")
         return self
 
     def facts(self) -> dict[str, str]:
@@ -275,7 +275,7 @@ class ComparisonRecord(SealedRecord):
     def _passes_only_what_holds(self) -> "ComparisonRecord":
         if self.trial is not None:
             if (self.verdict, self.sentence) != judged(self.trial.result):
-                raise ValueError(f'a verdict "{self.verdict}, {self.sentence}" that is not what its result says')
+                raise ValueError(f'a verdict "{self.verdict}, {self.sentence}" that contradicts its result')
         elif self.panel is not None:
             if self.verdict == "pass" and self.panel.errors != 0:
                 raise ValueError(f'a verdict "pass" with {self.panel.errors} errors')

@@ -97,7 +97,7 @@ def rows_of(plan: dict[str, Array]) -> tuple[Iteration, ...]:
     """Return the iterations in the plan of a partial run; raise ArtifactError if their table is malformed."""
     rows = plan.get(ROWS, np.zeros((0, len(COLUMNS))))
     if rows.shape[1:] != (len(COLUMNS),) or not np.isfinite(rows[:, 0]).all():
-        raise ArtifactError(f"{PLAN}: {ROWS} is no table of iterations: its shape is {rows.shape}")
+        raise ArtifactError(f"{PLAN}: {ROWS} is not a table of iterations: its shape is {rows.shape}")
     return tuple(Iteration(int(row[0]), *map(float, row[1:])) for row in rows)
 
 
@@ -119,7 +119,7 @@ def rebuilt(folder: Path, record: SealedRecord, models: Path | None) -> Iterator
     """
     given = record.model
     if given.file is None or given.options is None:
-        raise ModelError("the system is a user's own diagram or function, which no artifact can hold")
+        raise ModelError("the system is a user's diagram or function, which cannot be stored in an artifact")
     name, data = given.file.path, b""
     if name in record.files:
         data = read_plain(folder / name)
@@ -131,7 +131,7 @@ def rebuilt(folder: Path, record: SealedRecord, models: Path | None) -> Iterator
         yield _load(*_source_if_unchanged(record, lacking, models))
         return
     if sha256(data).hexdigest() != given.file.sha256:
-        raise ArtifactError(f"{TRACE}: the model file {name} in it is not the one that the record describes")
+        raise ArtifactError(f"{TRACE}: the attached model file {name} does not match its hash in the record")
     if Path(name).name != name or not name.endswith(FORMATS):
         raise ArtifactError(f"record.json: {name!r} is not the name of a model file")
     hashes = {file.path: file.sha256 for file in given.named}
@@ -153,7 +153,7 @@ def _is_here(folder: Path, file: FileEvidence) -> bool:
 def _place_of(folder: Path, sha: str) -> Path | None:
     """Return the path of the file with this hash, or None; for a phase it may be in the parent directory."""
     if not re.fullmatch("[0-9a-f]{64}", sha):
-        raise ArtifactError(f"record.json: {sha!r} is no hash of a file")
+        raise ArtifactError(f"record.json: {sha!r} is not the hash of a file")
     return next((p for f in (folder, folder.parent) if os.path.lexists(p := f / BUNDLE / sha)), None)
 
 
@@ -161,7 +161,7 @@ def _bundled(folder: Path, sha: str) -> bytes:
     path = _place_of(folder, sha)
     data = b"" if path is None else read_plain(path, MOST_BUNDLED)
     if sha256(data).hexdigest() != sha:
-        raise ArtifactError(f"{BUNDLE}/{sha}: it is not the file that the record describes")
+        raise ArtifactError(f"{BUNDLE}/{sha}: the file does not match its hash in the record")
     return data
 
 
@@ -172,21 +172,21 @@ def _source_if_unchanged(record: SealedRecord, lacking: list[str], models: Path 
     if location is None:  # before version 4.1, whose options contain the packages
         location = record.model_dump()["contract"].get("source")
     if models is None:
-        what = f"{lacking[0]}{f' and {len(lacking) - 1} more' * (len(lacking) > 1)}, which the artifact does not hold"
-        raise ModelError(
-            f"the model needs {what}: models=FOLDER, or --models, lets them be read below a folder that you give"
+        what = (
+            f"{lacking[0]}{f' and {len(lacking) - 1} more' * (len(lacking) > 1)}, which the artifact does not contain"
         )
-    source = _below(models, str(location), "the model's file")
+        raise ModelError(f"the model needs {what}: pass the folder with these files as models=FOLDER or --models")
+    source = _below(models, str(location), "the model file")
     if given.file is None or not (source.name.endswith(FORMATS) and source.is_file()):
-        raise ModelError(f"the model's file {source} is gone, and the artifact has no copy that could be used")
+        raise ModelError(f"the model file {source} does not exist, and the artifact has no usable copy")
     if file_evidence(source, given.file.path) != given.file:
-        raise ModelError(f"the model's file {source} is not what it was")
+        raise ModelError(f"the model file {source} has changed since the run")
     folders = folders if isinstance(folders, dict) else {}
     packages = {n: str(_below(models, str(folder), "the package's folder")) for n, folder in folders.items()}
     now = evidence_of(source, packages)
     changed = [file.path for file in given.named if file.sha256 is not None and file not in now]
     if changed:
-        raise ModelError(f"the model names {changed[0]}, which is not what it was")
+        raise ModelError(f"the model names {changed[0]}, which has changed since the run")
     return source, {**options, "packages": packages or None}
 
 
@@ -194,7 +194,7 @@ def _below(models: Path, location: str, what: str) -> Path:
     """Resolve a recorded path, relative to `models` if it exists there; raise ModelError if it is outside `models`."""
     path = models / location if (models / location).exists() else Path(location)
     if not path.resolve().is_relative_to(models.resolve()):
-        raise ModelError(f"{what} {path} is not below {models}, the folder of models that was given")
+        raise ModelError(f"{what} {path} is not in {models}, the folder given by models= or --models")
     return path
 
 
@@ -214,7 +214,7 @@ def resolve(record: PlanRecord, model: Model, plan: dict[str, Array]) -> Solutio
     """
     solver = record.solver
     if solver is None:
-        raise ArtifactError("record.json: it has no solver")
+        raise ArtifactError("record.json: the record has no solver")
     _check_shapes(record, model, plan)
     with _refusing_a_problem():
         return Solution(
@@ -352,4 +352,4 @@ def _refusing_a_problem() -> Iterator[None]:
         raise
     except (DrakeDiffError, ValueError, KeyError, TypeError, AttributeError) as error:
         message = f"{type(error).__name__}: {error}"
-        raise ArtifactError(f"record.json: its problem cannot be rebuilt: {message}") from error
+        raise ArtifactError(f"record.json: the problem cannot be rebuilt: {message}") from error

@@ -115,7 +115,7 @@ def _run_again(folder: Path, record: PlanRecord, models: Path | None) -> Reprodu
         ways = [(s.method, s.scheme, s.solver) for s in (solution, recorded)]
         if apart == np.inf or ways[0] != ways[1]:
             was, now = (f"{s.method} ({s.scheme}, {s.solver}) in {len(s.us)} intervals" for s in (recorded, solution))
-            return _without_the_search(recorded, folder, records, (f"recorded by {was}, this version takes {now}",))
+            return _without_the_search(recorded, folder, records, (f"recorded by {was}, this version uses {now}",))
         return _written(_with_plan(solution, recorded), folder, records, apart)
 
 
@@ -145,11 +145,11 @@ def odd_trace(folder: Path, plan: Mapping[str, Any], record: PlanRecord) -> Iter
     """Yield the contradictions between the trace and record.json or plan.npz."""
     trace = read_trace(folder / TRACE)
     if trace.attachments.get(record.FILE) != reproducible(read_fields(folder / record.FILE)).encode():
-        yield f"{TRACE}: the record that it carries is not {record.FILE}"
+        yield f"{TRACE}: the attached record differs from {record.FILE}"
     inputs = np.vstack([plan["us"], plan["u_final"]]) if "u_final" in plan else plan["us"]
     for topic, recorded, planned in (("state", trace.planned_xs, plan["xs"]), ("input", trace.planned_us, inputs)):
         if not np.array_equal(recorded, planned, equal_nan=True):
-            yield f"{TRACE}: /planned/{topic} is not what {PLAN} has"
+            yield f"{TRACE}: /planned/{topic} differs from {PLAN}"
 
 
 def why_not_repeated(record: PlanRecord, records: Iterable[PlanRecord]) -> tuple[str, ...]:
@@ -159,10 +159,10 @@ def why_not_repeated(record: PlanRecord, records: Iterable[PlanRecord]) -> tuple
     reasons += [f"constraint {name} is a user's function" for _, constraints in functions for name in constraints]
     if search_of(record) is None:
         recovered = record.sentence.endswith(RECOVERED)
-        reasons.append(OF_RECOVERED if recovered else "the record does not say what solve was called with")
+        reasons.append(OF_RECOVERED if recovered else "the record does not have the arguments of solve")
     reasons += [f"the reset {name} is a user's function" for name in _unknown_resets(record)]
     if record.phases is not None and record.phases.initial_guess is not None:
-        reasons.append("it began from a guess that the directory does not have")
+        reasons.append("the search began from an initial guess that is not in the directory")
     status = None if record.solver is None else Status(record.solver.status)
     return (*reasons, *([NOT_REPEATED[status]] if status in NOT_REPEATED else []))
 
@@ -246,7 +246,7 @@ def _but_for_simulators(again: PlanRecord, record: PlanRecord) -> tuple[PlanReco
         if here != there:
             others = [r for r in again.replays if r not in sides[0]]
             again = again.model_copy(update={"replays": [*others, *sides[1]]})
-            where = "was not installed where the record was made" if there else "is not installed here"
+            where = "was not installed where the record was made" if there else "is not installed on this machine"
             unchecked.append(f"replays in {name}, which {where}")
     return again, tuple(unchecked)
 
@@ -349,7 +349,7 @@ def odd_metrics(record: PlanRecord, plan: dict[str, Array]) -> Iterator[str]:
         if (recorded is None) != (again is None) or abs((recorded or 0.0) - (again or 0.0)) > ROUNDED * max(
             1.0, again or 0.0
         ):
-            yield f"{record.FILE}: metrics[{name}] is {recorded}, and the plan's is {again}"
+            yield f"{record.FILE}: metrics[{name}] is {recorded}, but the plan gives {again}"
     inputs = [plan[name].reshape(-1, plan["us"].shape[1]) for name in ("us", "us_mid", "u_final") if name in plan]
     us, later = np.vstack(inputs), xs[1:] if np.all(np.isfinite(start)) else xs
     beyond = [numbers("u_lower", -np.inf) - us, us - numbers("u_upper", np.inf)]
@@ -357,28 +357,28 @@ def odd_metrics(record: PlanRecord, plan: dict[str, Array]) -> Iterator[str]:
     least = max(float(np.max(excess, initial=0.0)) for excess in beyond)
     recorded = metrics.get("bound violation")
     if recorded is not None and not recorded >= least - ROUNDED:  # the plan does not contain the midpoint states
-        yield f"{record.FILE}: metrics[bound violation] is {recorded}, and the plan's is at least {least:.6g}"
+        yield f"{record.FILE}: metrics[bound violation] is {recorded}, but the plan gives at least {least:.6g}"
 
 
 def _odd_phases(section: PhasesSection, records: Sequence[PlanRecord], plans: Sequence[Array]) -> Iterator[str]:
     """Yield contradictions between the record of all phases, those of its phases, and their plans, without dynamics."""
     file, count, links = PlanRecord.FILE, len(records), [(link.before, link.after) for link in section.links]
     if links not in ([(i, i + 1) for i in range(count - 1)], [(i, (i + 1) % count) for i in range(count)]):
-        yield f"{file}: its links are {links}, which is no chain of {count} phases"
+        yield f"{file}: phases.links is {links}, which is not a chain of {count} phases"
         return
     for phase, inner in zip(section.phases, records, strict=True):
         metrics = {metric.name: metric.value for metric in inner.metrics}
         expected = (inner.solver and inner.solver.status, metrics.get("cost"), metrics.get("horizon"))
         if (phase.status, phase.cost, phase.duration) != expected:
-            yield f"{file}: {phase.name} has status, cost and duration {expected} in {phase.directory}"
+            yield f"{file}: status, cost and duration of {phase.name} differ from {expected} in {phase.directory}"
     total, duration = (sum(getattr(p, name) or 0.0 for p in section.phases) for name in ("cost", "duration"))
     lower, upper = section.horizon_s or (0.0, np.finfo(float).max)
     converged = all(phase.status == "converged" for phase in section.phases)
     slack = FEASIBILITY_TOLERANCE * duration
     if converged and not lower - slack <= duration <= upper + slack:
-        yield f"{file}: phases.horizon_s is {section.horizon_s}, and the phases take {duration!r} s"
+        yield f"{file}: phases.horizon_s is {section.horizon_s}, but the phases take {duration!r} s"
     if section.cost is not None and not is_near(section.cost, total, ROUNDED, ROUNDED):
-        yield f"{file}: phases.cost is {section.cost!r}, and the phases cost {total!r}"
+        yield f"{file}: phases.cost is {section.cost!r}, but the phases cost {total!r}"
     for i, link in enumerate(section.links):
         before, after = plans[link.before][-1], plans[link.after][0]
         if not link.reset or "impact" in link.reset:
@@ -388,4 +388,4 @@ def _odd_phases(section: PhasesSection, records: Sequence[PlanRecord], plans: Se
         recorded = np.array([np.nan if error is None else error for error in link.errors])
         errors = np.abs(after - reset @ before)
         if not np.allclose(recorded, errors, rtol=ROUNDED, atol=ROUNDED, equal_nan=True):
-            yield f"{file}: phases.links[{i}].errors is {link.errors}, and the plan's are {errors.tolist()}"
+            yield f"{file}: phases.links[{i}].errors is {link.errors}, but the plans give {errors.tolist()}"

@@ -382,13 +382,13 @@ def recover(directory: str | Path, out: str | Path | None = None) -> SealedRecor
     folder = Path(directory).resolve()
     if not folder.is_dir() or not is_partial(folder):
         beside = sorted(p.name for p in folder.parent.glob(f"{folder.name}.*") if p.is_dir() and is_partial(p))
-        got = f"{folder}" + (f", beside which are {', '.join(beside)}" if beside else "")
+        got = f"{folder}" + (f", next to {', '.join(beside)}" if beside else "")
         raise InputError("RUN", got=got, expected="a directory NAME.partial-... that a run left")
     inner = folder.with_name(name_of(folder))
     target = inner if out is None else Path(out).resolve()
     with nullcontext() if target == inner else writing(inner):
         if is_taken(target):
-            expected = "a new or empty directory, as recover replaces no run; set it by --out"
+            expected = "a new or empty directory, as recover does not replace a run; choose one by --out"
             raise InputError("OUT", got=str(target), expected=expected)
         record = load_record(folder)
         if record.state == "complete" and files_below(folder, record.FILE) == record.files:
@@ -401,7 +401,7 @@ def recover(directory: str | Path, out: str | Path | None = None) -> SealedRecor
             or record.solver is None
             or not (folder / PLAN).is_file()
         ):
-            raise ArtifactError(f"{folder}: there is no plan of a solve in it: run it again; {record.sentence}")
+            raise ArtifactError(f"{folder}: no plan of a solve to recover: repeat the run; {record.sentence}")
         made = _measured(folder, record, target)
         remove_folder(folder)
     return made
@@ -412,9 +412,7 @@ def _measured(folder: Path, record: PlanRecord, target: Path) -> PlanRecord:
     costs, constraints = unknown_functions(record)
     if costs or constraints:
         names = ", ".join((*costs, *constraints))
-        content = (
-            f"{names}: a user's function, which no directory holds; start the script again from the plan in {PLAN}"
-        )
+        content = f"{names}: a user's function, which cannot be stored; run the script again, from the plan in {PLAN}"
         raise ArtifactError(f"{folder}: {content}")
     plan = read_plan(folder / PLAN, partial=True)
     with rebuilt(folder, record, ANYWHERE) as model, written_whole(target) as whole:

@@ -234,7 +234,7 @@ def read_trace(path: str | Path) -> Trace:
     try:
         return _trace(log)
     except (LookupError, ValueError) as error:
-        raise ArtifactError(f"{path}: its channels do not fit together: {error}") from error
+        raise ArtifactError(f"{path}: the channels contradict each other: {error}") from error
 
 
 def _trace(log: McapLog) -> Trace:
@@ -280,7 +280,7 @@ def export_ros2(run: str | Path, out: str | Path) -> dict[str, int]:
     if missing:
         raise ArtifactError(f"{source}: no channel {', '.join(sorted(missing))}")
     if out.exists() or not out.parent.is_dir():
-        raise InputError("OUT", got=str(out), expected="a new directory in an existing one")
+        raise InputError("OUT", got=str(out), expected="a new directory in an existing directory")
     store = get_typestore(Stores.ROS2_HUMBLE)
     with Writer(out, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as bag:
         bag.set_custom_data("written_by", "drake_diff")

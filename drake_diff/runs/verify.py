@@ -55,7 +55,7 @@ MADE_APART = ("complaints", "undecided", "unchecked", "rounded")  # results of t
 UNCHECKED = (
     "wall_clock: when the record was made, and how long that took",
     "provenance: the versions, the commit, the machine and the command that made it, and where the model file was",
-    "name: what it was called",
+    "name: the name of the run",
 )
 UNREAD = "hashes match, contents not checked"
 WAITED = 60.0  # [s] default time limit for reproducing a run
@@ -68,8 +68,8 @@ NOT_RERUN = {
     "comparison": "the engines were not run again",
     "robustness": "the trials were not run again",
     "rollout": "a loss is a function, which records do not contain",
-    "panel": "no trial was evaluated again: their function is not in the directory",
-    "trial": "it was not evaluated again: its function is not in the directory",
+    "panel": "no trial was evaluated again, as the function of the panel is not in the directory",
+    "trial": "the trial was not evaluated again, as its function is not in the directory",
 }
 
 
@@ -223,10 +223,10 @@ def verify(
         return _run_again(result, result.record, None)
     answer = call_with_limits("drake_diff.runs.verify:_apart", folder, models, float(time_limit), float(memory_limit))
     if answer.is_limit:
-        more = "time_limit= and memory_limit=, or --time-limit and --memory-limit, give it more"
-        return replace(result, undecided=(f"it was not made again: {answer.error}: {more}",))
+        more = "increase time_limit or memory_limit (--time-limit, --memory-limit)"
+        return replace(result, undecided=(f"the run was not reproduced: {answer.error}: {more}",))
     if answer.error:
-        return _judged(result, [f"it cannot be made again: {answer.error}"], [])
+        return _judged(result, [f"the run cannot be reproduced: {answer.error}"], [])
     texts: dict[str, Any] = {name: tuple(str(line) for line in answer.value[name]) for name in MADE_APART}
     return replace(result, **texts, checked=int(answer.value["checked"]))
 
@@ -270,7 +270,7 @@ def _looked_at(folder: Path) -> Verification:
     if is_partial(folder):
         return _of_a_part(folder)
     if path is None:
-        return Verification(folder, None, complaints=(f"there is no record: no {SealedRecord.FILE}",))
+        return Verification(folder, None, complaints=(f"no record: {SealedRecord.FILE} is missing",))
     try:
         record, problems = read_checked(path)
     except ArtifactError as error:
@@ -290,8 +290,8 @@ def _of_a_part(folder: Path) -> Verification:
         record: SealedRecord | None = load_record(folder)
     except ArtifactError:
         record = None
-    why = "it has no record" if record is None else record.sentence
-    return Verification(folder, record, undecided=(f"it is incomplete, and never took its place: {why}",))
+    why = "no record" if record is None else record.sentence
+    return Verification(folder, record, undecided=(f"the run is incomplete and was not moved to its directory: {why}",))
 
 
 def _run_again(verification: Verification, record: SealedRecord, models: Path | None) -> Verification:
@@ -307,7 +307,7 @@ def _run_again(verification: Verification, record: SealedRecord, models: Path | 
         return _judged(verification, [str(error)], [])
     except (ArithmeticError, AttributeError, DrakeDiffError, LookupError, RuntimeError, TypeError, ValueError) as error:
         # the files of a forged directory may contradict each other in any way
-        return _judged(verification, [f"it cannot be made again: {type(error).__name__}: {error}"], [])
+        return _judged(verification, [f"the run cannot be reproduced: {type(error).__name__}: {error}"], [])
 
 
 def has_recordings(record: SealedRecord) -> bool:
@@ -325,7 +325,7 @@ def _without_its_model(verification: Verification, record: SealedRecord, error: 
         for inner, phase in phase_records(folder, record):
             problems += odd_metrics(phase, read_plan(inner / PLAN))
     except (ArtifactError, KeyError, LookupError, TypeError, ValueError) as wrong:
-        problems = [f"its files do not go together: {type(wrong).__name__}: {wrong}"]
+        problems = [f"the files contradict each other: {type(wrong).__name__}: {wrong}"]
     return _judged(replace(verification, unchecked=(OF_FUNCTIONS,)), problems, content)
 
 
@@ -358,7 +358,7 @@ def _recalled_apart(directory: str, models: str | None) -> None:
 def _recalled(folder: Path, models: Path | None) -> Iterator[Solution]:
     record = load_plan_record(folder)
     _refuse(folder, read_checked(folder / record.FILE)[1])
-    _refuse(folder, () if record.solver is not None else (f"it has no plan: {record.sentence}",))
+    _refuse(folder, () if record.solver is not None else (f"the run has no plan: {record.sentence}",))
     _refuse(folder, tuple(contradictions(folder, record)))
     with recorded_solution(folder, record, models) as solution:
         _refuse(folder, tuple(_odd_contract(record, contract_of(solution.problem.model))))
@@ -384,12 +384,12 @@ def _compared(verification: Verification, record: SealedRecord, again: Reproduce
     nothing = record.subject in NOT_RERUN and not has_recordings(record)
     why = (f"every number: {NOT_RERUN[record.subject]}",) if nothing else UNCHECKED
     compared, unchecked = [fields], [*why, *_others(record, again.written or [*record.files]), *again.unchecked]
-    unchecked += [f"whatever else schema {SCHEMA_VERSION} has otherwise"] * converted
+    unchecked += [f"other fields that differ in schema {SCHEMA_VERSION}"] * converted
     for name in dict.fromkeys((*again.files, *again.written)):
         if name not in record.files:
             unchecked += [f"{name}: the file is missing"] * (name in again.files)
         elif name not in again.files:
-            unchecked += [f"{name}: its contents were not computed again"] * (bool(again.files) and not nothing)
+            unchecked += [f"{name}: the contents were not recomputed"] * (bool(again.files) and not nothing)
         else:
             compared.append(_compared_file(verification.directory, name, again))
     undecided = list(again.undecided)
@@ -397,7 +397,7 @@ def _compared(verification: Verification, record: SealedRecord, again: Reproduce
         worded = [d for d in item.differing if d.file.endswith(".html") or d.key.split(".")[-1] in WORDS]
         item.differing = [d for d in item.differing if d not in worded]
         if worded:
-            reason = f"{item.file}: {UNREAD}: schema {record.schema_version} has {worded[0].key} otherwise"
+            reason = f"{item.file}: {UNREAD}: schema {record.schema_version} has other words for {worded[0].key}"
             (unchecked if record.subject in NOT_RERUN else undecided).append(reason)
     again = replace(again, undecided=tuple(undecided))
     problems = [*_odd_schema(record), *_odd_bundle(verification.directory, record), *again.problems]
@@ -441,7 +441,7 @@ def _odd_bundle(folder: Path, record: SealedRecord) -> Iterator[str]:
     named |= set() if mpc is None else {file.sha256 for file in mpc.model.named}
     for name, file in record.files.items():
         if name.startswith(f"{BUNDLE}/") and not (file.sha256 in named and name == f"{BUNDLE}/{file.sha256}"):
-            yield f"{name}: it is no file that the model names"
+            yield f"{name}: the model does not name this file"
 
 
 def _odd_schema(record: SealedRecord) -> Iterator[str]:
@@ -450,7 +450,7 @@ def _odd_schema(record: SealedRecord) -> Iterator[str]:
     published = sha256(record.published_schema()).hexdigest()
     here = record.schema_version == SCHEMA_VERSION and record.subject != "trial"
     if here and (described is None or described.sha256 != published):
-        yield f"{record.SCHEMA_FILE}: it is not the schema {record.schema_version} of this drake_diff"
+        yield f"{record.SCHEMA_FILE}: the file differs from schema {record.schema_version} of this drake_diff"
 
 
 def _told_of_a_solve(
@@ -463,7 +463,7 @@ def _told_of_a_solve(
     """Derive the verdict from the differences and from what they depend on."""
     undecided = [*again.undecided, *(f"the search was not repeated: {why}" for why in again.unrepeated)]
     if again.missing:
-        unchecked.append(f"what rests on the search: {', '.join(again.missing)}")
+        unchecked.append(f"values that depend on the search: {', '.join(again.missing)}")
     if again.apart > SAME_PLAN:
         undecided.append(f"the repeated search ends at a plan that differs by {again.apart:.2g} of its largest number")
     differing = [d for item in compared for d in item.differing]
@@ -477,7 +477,7 @@ def _told_of_a_solve(
         if d.allowed:
             rounded.append(str(d))
         elif rounds_otherwise and _is_searched(d):
-            undecided.append(f"{d}, which rests on the steps that the search takes on this machine")
+            undecided.append(f"{d}, which depends on the steps of the search on this machine")
         else:
             problems.append(str(d))
     checked = sum(item.count for item in compared)
@@ -500,7 +500,7 @@ def _is_searched(d: Difference) -> bool:
 def _judged(verification: Verification, problems: Sequence[str], undecided: Sequence[str]) -> Verification:
     """Add the problems; if other versions made the record, they are only reasons for an undecided verdict."""
     if verification.notes and problems:
-        why = f"{'; '.join(verification.notes)}: that may be why {len(problems)} things differ"
+        why = f"{'; '.join(verification.notes)}: this may explain the {len(problems)} differences"
         return replace(verification, undecided=(*undecided, why, *problems))
     return replace(verification, complaints=tuple(problems), undecided=tuple(undecided))
 

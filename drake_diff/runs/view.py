@@ -29,7 +29,7 @@ from drake_diff.runs.verify import recalled
 PLAN, WITHOUT = "plan", "without_feedback"  # names of ghosts
 OPEN_LOOP = "open loop"
 LOOPBACK = "127.0.0.1"
-UNDER_FEEDBACK = "what moves is the plan, near which feedback keeps the robot; blue: the robot without feedback"
+UNDER_FEEDBACK = "the moving robot shows the plan, which it follows under feedback; blue: the robot without feedback"
 CONFIGURATION = ("problem", "contract", "model", "inputs", "solver")
 # Entries of the configuration that are results of the solve.
 RESULTS = ("status", "message", "solver_message", "notes", "plant", "feedback", "iterations")

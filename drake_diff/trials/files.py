@@ -181,7 +181,7 @@ def reproduce(folder: Path, record: PlanRecord, models: Path | None) -> Reproduc
     for p in section.perturbations:
         name = f"{p.worst}/{REPLAY}"
         if name not in record.files or f"{p.worst}/{TRIAL}" not in record.files:
-            raise ArtifactError(f"{record.FILE}: the worst trial of {p.name} is not where drake_diff writes it")
+            raise ArtifactError(f"{record.FILE}: the files of the worst trial of {p.name} are not listed")
         page, trial = read_plain(folder / name).decode(errors="replace"), read_fields(folder / p.worst / TRIAL)
         title = f"{trial['perturbation']} {trial['level']:g}: {trial['label'] or 'success'}"
         files[name] = replay_again(page, title + FAR * (f"{title}{FAR}</title>" in page))

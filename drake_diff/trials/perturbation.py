@@ -108,7 +108,7 @@ def parameters_of(model: Model, quantity: str) -> dict[str, Array]:
 def _scaled(quantity: str) -> Callable[[Setup, float, Random], Setup]:
     def apply(setup: Setup, level: float, random: Random) -> Setup:
         if level >= 1:
-            raise InputError(f"level of {quantity}", got=level, expected="a part of the value, less than 1")
+            raise InputError(f"level of {quantity}", got=level, expected="a fraction of the value, less than 1")
         values = {
             name: setup.parameters.get(name, value) * (1 + random.uniform(-level, level))
             for name, value in parameters_of(setup.model, quantity).items()

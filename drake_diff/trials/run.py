@@ -82,7 +82,7 @@ def robustness(
     """
     trials, seed = positive_int("trials", trials), count("seed", seed, 0, LARGEST_SEED)
     if solution.problem.motion != STEPS:
-        raise InputError("solution", got='one with motion="continuous"', expected='motion="steps": trials are stepped')
+        raise InputError("solution", got='motion="continuous"', expected='motion="steps", as trials consist of steps')
     task = Task(solution.plan, controller, loop)
     levels, sensitivity = levels_named(task.model, perturbations), LoopSensitivity(task)
     cells = []

@@ -173,7 +173,7 @@ CASES = {
     "... above it": (lambda: over(BOX, HalfSpace(), 0.3, **ON_RIGID), "aligned_faces", "warning", "0.2 m apart"),
     "tilted faces": (
         lambda: over(BOX, TABLE, 0.0995, tilt=(0.03, -0.02, 0.5), **HYDROELASTIC),
-        *("aligned_faces", "info", "faces 0.036 rad from parallel at x"),
+        *("aligned_faces", "info", "faces are 0.036 rad from parallel at x"),
     ),
     "faces in point contact": (lambda: over(BOX, TABLE, 0.0995), "aligned_faces", None, ""),
     "ball on an axis": (lambda: over(BALL, DISC, 0.0995), "cylinder_axis", "error", "AutoDiffXd is singular"),
@@ -373,7 +373,7 @@ def test_an_effort_at_its_limit_is_an_error():
     for u, slope in ((20.0, "one-sided: 0 beyond the limit"), (-25.0, "exactly 0")):
         found = only(audit(model, u=[u]), "saturated_effort")
         assert (found.severity, found.subject) == ("error", "motor")
-        assert f"limit 20 (u is {u:g}), where the derivative by u is {slope}" in found.message
+        assert f"limit 20 (u is {u:g}), the derivative with respect to u is {slope}" in found.message
     assert np.all(dd.differentiate_step(model, model.default_state, [-25.0]).B == 0)
     inside = dd.differentiate_step(model, model.default_state, [19.0]).B
     np.testing.assert_array_equal(dd.differentiate_step(model, model.default_state, [20.0]).B, inside)

@@ -149,7 +149,7 @@ FILES = {
 # The code, the severity, the file, the options, a pattern of the message, and the options that remove the finding.
 TRAPS = [
     ("no_actuator", "warning", "no_actuator", {}, "hinge.*no actuator for any of the 1 joints", {"actuators": "all"}),
-    ("massless_root", "error", "massless_root", {}, r"base\): it floats and has no mass", {"base": "weld"}),
+    ("massless_root", "error", "massless_root", {}, r"base\): the body floats and has no mass", {"base": "weld"}),
     ("massless_joint", "error", "massless_joint", {}, r"wrist\): the bodies that they move", {"fix_joints": ["wrist"]}),
     ("meshes_skipped", "info", "meshes_skipped", {}, "1 .*meshes skipped", None),
     ("collision_gone", "warning", "collision_gone", {}, r"upper\): no collision shape", {"contact": False}),
@@ -163,7 +163,7 @@ TRAPS = [
         "no inertia fits the file's mass of -1 kg; Drake uses a ball of water of 1 kg",
         None,
     ),
-    ("invented_inertia", "warning", "invented_inertia 2", {}, "the file's inertia is impossible for a body", None),
+    ("invented_inertia", "warning", "invented_inertia 2", {}, "the file's inertia is not physically valid", None),
     ("invented_inertia", "warning", "invented_inertia 3", {}, "gives no mass", None),
     ("invented_inertia", "warning", "invented_inertia 4", {}, "gives no inertia, so that the format's default", None),
     (
@@ -200,7 +200,7 @@ TRAPS = [
     ("collision_gone", "warning", "collision_gone 2", {}, r"upper\): no collision shape", {"meshes": "spheres"}),
     ("meshes_skipped", "warning", "collision_gone 2", {}, "1 collision meshes skipped", {"meshes": "spheres"}),
     ("falls", "warning", "falls 3", {}, r"it has no collision shapes", {"meshes": "spheres", "ground": True}),
-    ("massless_root", "error", "massless_root 2", {"base": "weld"}, r"ghost\): it floats and has no mass", None),
+    ("massless_root", "error", "massless_root 2", {"base": "weld"}, r"ghost\): the body floats and has no mass", None),
     (
         "saturated_effort",
         "error",
@@ -223,7 +223,7 @@ TRAPS = [
         "error",
         "falls",
         {"ground": True, "contact_model": "hydroelastic"},
-        "hydroelastic contact alone",
+        "hydroelastic contact requires",
         {"contact_geometry": "hydroelastic"},
     ),
     (
@@ -239,7 +239,7 @@ TRAPS = [
         "error",
         "falls",
         {"ground": True, "contact_model": "hydroelastic", "contact_geometry": "hydroelastic"},
-        "faces 0 rad from parallel",
+        "faces are 0 rad from parallel",
         {"contact_model": "point", "contact_geometry": "corner_spheres"},
     ),
     ("ignored", "warning", "ignored 3", {}, r"the friction of a joint, 0\.3, is ignored", None),
@@ -255,7 +255,7 @@ TRAPS = [
         {"actuators": ["j"]},
     ),
     ("left_out", "warning", "left_out 2", {}, r"pull \(motor of no joint, line 1\)", None),
-    ("switched_off", "warning", "switched_off", {}, r"contact\): the file disables it", {"contact": False}),
+    ("switched_off", "warning", "switched_off", {}, r"contact\): the file disables this effect", {"contact": False}),
     ("never_apart", "warning", "never_apart", {}, r"a - b\): the links overlap", {"contact": "separable"}),
 ]
 

@@ -91,8 +91,8 @@ def test_a_closed_loop_is_certified_by_state_policy_and_model(load, function):
     "function, column, words",
     [
         (detached_parameter, "policy[1]", "its parameter 1 is 0, and differences of the policy give"),
-        (detached_state, "", "by hinge_w is 0, and differences of the policy give"),
-        (by_hand(0.08), "", r"of u\[0\] by slide_x is"),
+        (detached_state, "", "with respect to hinge_w is 0, and differences of the policy give"),
+        (by_hand(0.08), "", r"of u\[0\] with respect to slide_x is"),
     ],
 )
 def test_a_policy_with_a_wrong_derivative_disagrees_and_says_where(load, function, column, words):
@@ -183,7 +183,7 @@ def test_an_entry_that_is_1_percent_wrong_is_found_and_named_at_every_scale_of_t
             model, X0, us, loss, sampled=True, gradient=dataclasses.replace(g, by_x0=by[0], by_us=by[1])
         )
         assert wrong.verdict == "disagree"
-        assert f"by {right.columns[j]} alone would explain it" in str(wrong)
+        assert f"an error in the entry of {right.columns[j]} would explain it" in str(wrong)
         with pytest.raises(CertificateError, match="disagree"):
             wrong.require()
 
@@ -323,7 +323,7 @@ def test_a_policy_that_switches_between_two_states_of_the_motion_is_discontinuou
         found = certified(model, policy, sampled=sampled)
         assert found.verdict == "discontinuous"
         assert "the policy jumps: at t = 0 s u[0] changes by " in str(found)
-        assert "on the way from this state to the next state" in str(found)
+        assert "on the line from this state to the next state" in str(found)
 
 
 def test_a_policy_is_asked_along_each_state_and_parameter(load):

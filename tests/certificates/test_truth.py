@@ -72,8 +72,8 @@ def test_the_truth_of_a_bounce_is_that_of_its_events_and_the_steps_have_another_
         assert slope.agrees == (abs(slope.ours - value) <= 0.011 * max(abs(slope.ours), abs(value)))
     assert len(truth.wrong) == 2
     assert "in continuous time (Hunt-Crossley, k x (1 + d x')+) the loss is" in str(certificate)
-    assert "error of the step" in str(certificate)
-    assert "2 of 2 not ours, first by slide_x[0] the slope is" in str(certificate), str(certificate)
+    assert "time-stepping error" in str(certificate)
+    assert "2 of 2 slopes differ from the gradient, first d loss / d slide_x[0]" in str(certificate), str(certificate)
 
 
 @pytest.mark.slow
@@ -120,7 +120,7 @@ def test_a_slope_that_is_not_measured_in_time_is_unknown_and_not_absent(dropped)
     for slope in certificate.truth.slopes:
         assert slope.exists is None
         assert slope.agrees is None
-        assert "not measured within the budget of 1e-06 s" in str(slope)
+        assert "not measured within the time limit of 1e-06 s" in str(slope)
 
 
 def test_a_graze_has_no_slope_and_that_is_its_own_answer(dropped):
@@ -130,7 +130,7 @@ def test_a_graze_has_no_slope_and_that_is_its_own_answer(dropped):
     certificate = dd.certify_rollout(model, start, None, lambda x: x[1], num_steps=20, method="continuous", seconds=60)
     assert certificate.verdict == "discontinuous", str(certificate)
     assert [slope.exists for slope in certificate.truth.slopes] == [False, False]
-    assert "the loss has a kink here" in str(certificate)
+    assert "the loss has a kink: slope" in str(certificate)
 
 
 @pytest.mark.slow
@@ -158,7 +158,7 @@ def test_a_closed_loop_in_continuous_time_is_certified(load):
         model, [0.5, 0.1], None, height, policy=dd.PD(model, kp=3.0, kd=0.2), num_steps=40, method="continuous"
     ).require()
     assert certificate.columns[:2] == ("hinge_q[0]", "hinge_w[0]")
-    with pytest.raises(InputError, match="refinement or a sample in continuous time"):
+    with pytest.raises(InputError, match="sampled or refine in continuous time"):
         dd.certify_rollout(model, [0.5, 0.1], np.zeros((4, 1)), height, method="continuous", sampled=True)
 
 
@@ -176,7 +176,7 @@ def test_a_slope_exists_where_the_narrow_ones_agree_and_the_wide_one_as_on_a_cur
     assert judged(over(-4.6, 2.0, 0.9, -8.1), still, 0.0).exists is False
     corner = judged(over(1.0, 1.0, 1.0, widths=three, corners=(0.5, 0.5)), still, 0.0)
     assert corner.exists is False
-    assert corner.reason == "the loss has a kink here: slope 1.25 ahead, 0.75 behind"
+    assert corner.reason == "the loss has a kink: slope 1.25 ahead, 0.75 behind"
     # An error of 1e-5 in the loss is 0.1 in a slope over 1e-4. It is unknown, unless it is far from convergence.
     noise = np.full(3, 1e-5)
     assert judged(over(1.0, 1.0, 1.0, widths=three), noise, 1e-3).exists is None
@@ -198,5 +198,5 @@ def test_contact_that_the_steps_soften_is_named_by_as_much_as_it_sinks_in(stiffn
         assert softer == pytest.approx(1.0, rel=1e-3)
         assert told is None
     else:
-        assert "times softer than specified: near-rigid at h = 0.01 s" in told
+        assert "times softer than specified (near-rigid)" in told
         assert float(told.split(" times")[0].split()[-1]) == pytest.approx(softer, rel=1e-2)

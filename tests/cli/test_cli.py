@@ -186,7 +186,7 @@ def test_a_signal_before_the_search_leaves_a_record_that_says_so(tmp_path, monke
     assert line.verdict == "incomplete"
     (undecided,) = dd.verify(left).undecided
     assert told in undecided
-    with pytest.raises(ArtifactError, match="there is no plan of a solve in it"):
+    with pytest.raises(ArtifactError, match="no plan of a solve to recover"):
         recover(left)
     shutil.rmtree(left)
 
@@ -197,7 +197,7 @@ def test_a_signal_before_the_directory_is_opened_writes_nothing_and_says_so(tmp_
     monkeypatch.chdir(tmp_path)
     with kept_handlers():
         assert exit_of(monkeypatch, "run", path) == 130
-    assert "nothing is written" in capsys.readouterr().out
+    assert "no file is written" in capsys.readouterr().out
     assert [each.name for each in tmp_path.iterdir()] == ["task.py"]
 
 

@@ -212,7 +212,7 @@ def changed(row, column, value):
         (HEADER, changed(1, 2, "1.2.3"), r"line 3, column hinge_q: .* got '1\.2\.3'"),
         (HEADER, changed(0, 5, ""), r"line 2, column force"),
         (HEADER, changed(2, 0, 0.01), r"line 4, column time: expected more than 0\.01"),
-        (HEADER[:4] + HEADER[5:], [r[:4] + r[5:] for r in ROWS], r"column hinge_w: expected one, got none"),
+        (HEADER[:4] + HEADER[5:], [r[:4] + r[5:] for r in ROWS], r"column hinge_w: expected a column, got only time"),
         ([*HEADER[:5], "frce"], ROWS, r"column: expected one of .*force.*, got 'frce'"),
         ([*HEADER[:5], "slide_x"], ROWS, r"column slide_x: expected once, got twice"),
         (HEADER, [*ROWS[:2], ROWS[2][:3]], r"line 4: expected 6, got 3 cells"),
@@ -231,7 +231,7 @@ TEXT = "\n".join(",".join(map(str, row)) for row in [HEADER, *ROWS]) + "\n"
     "data, match",
     [
         (TEXT.encode("utf-16"), "got text in UTF-16"),
-        (gzip.compress(TEXT.encode()), "got a file packed by gzip"),
+        (gzip.compress(TEXT.encode()), "got a gzip file"),
         (TEXT.replace("1.4", "\u00e9").encode("latin-1"), r"line 3, byte 18: expected text in UTF-8, got 0xe9"),
         (f"{TEXT[:-1]}{'0' * 2_000_000}\n".encode(), r"line 4: expected at most 1048576 characters"),
         (f"{TEXT[:-1]}{'0' * 200_000}\n".encode(), r"line 4: expected a row of a CSV file, got field larger"),
@@ -337,7 +337,7 @@ def test_rows_and_records_without_end_are_refused(load, tmp_path):
     with sqlite3.connect(tmp_path / "bag" / "bag.db3") as base:
         numbers = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i FROM n) SELECT i FROM n"
         base.execute(f"CREATE VIEW messages AS {numbers}")
-    with pytest.raises(ArtifactError, match=r"bag\.db3: expected tables of messages alone, got 1 views and triggers"):
+    with pytest.raises(ArtifactError, match=r"bag\.db3: expected only tables of messages, got 1 views and triggers"):
         read_recording(tmp_path / "bag", load("pendulum.urdf"))
     zeros = bytes(9 * 10)  # ten records of opcode 0 without length: mcap reads 33 million of them in a minute
     chunk = struct.pack("<QQQIIQ", 0, 0, len(zeros), zlib.crc32(zeros), 0, len(zeros)) + zeros
@@ -543,7 +543,7 @@ def test_a_body_that_is_missing_at_one_time_is_named(tmp_path):
             kept(topic, "nav_msgs/msg/Odometry", "world", t,
                  lambda types, body=body, frame=frame: {**odometry(types, body, rotation_of(body)),
                                                         "child_frame_id": frame})  # fmt: skip
-    with pytest.raises(InputError, match=r"t = 1700000000030000000 ns: .*got the joints, right_body alone"):
+    with pytest.raises(InputError, match=r"t = 1700000000030000000 ns: .*got only the joints, right_body"):
         read_recording(bag_of(tmp_path / "bag", rows), model)
 
 
@@ -572,7 +572,7 @@ def joints(names, position, velocity, effort):
     "fields, match",
     [
         (joints(["slide"], [1.0], [1.0], [1.0]), "position of hinge"),
-        (joints(["slide", "hinge"], [1.0, 1.0], [], [1.0, 1.0]), "velocity of slide: .*got 0 of slide, hinge"),
+        (joints(["slide", "hinge"], [1.0, 1.0], [], [1.0, 1.0]), "velocity of slide: .*got 0 values for slide, hinge"),
         (joints(["slide", "hinge"], [1.0, 1.0], [1.0, np.nan], [1.0, 1.0]), "velocity of hinge: .*finite"),
         (joints(["slide", "hinge"], [1.0, 1.0], [1.0, 1.0], []), "effort of slide"),
     ],

@@ -143,7 +143,7 @@ REFUSED = {
     "text": (lambda q, v, u, p: "a", {}, InputError, "expected an array of numbers"),
     "fails": (fails, {}, InputError, "IndexError"),
     "too few arguments": (lambda q: q, {}, InputError, "TypeError"),
-    "not twice the same": (changes, {}, InputError, "a function of q, v and u alone"),
+    "not twice the same": (changes, {}, InputError, "a function of only q, v and u"),
     "no function": (1.0, {}, InputError, "expected a function of q, v and u, got 1.0"),
     "integrator": (cart_pole, {"integrator": "Euler"}, UnknownNameError, "RK4"),
     "parameter": (cart_pole, {"parameters": {**TRUE, "g": np.inf}}, NonFiniteError, "parameters"),

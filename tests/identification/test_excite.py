@@ -95,7 +95,7 @@ def test_the_command_prints_the_sentence_and_writes_a_recording(load, tmp_path):
         (("--limit", "motor=1,2,3"), "NAME=MOST or NAME=LOWER,UPPER"),
         (("--limit", "moter=1"), "limit of"),
         (("--noise", "hinge_q"), "STATE=DEVIATION"),
-        (("--x0", "0.1;0"), "numbers with commas between"),
+        (("--x0", "0.1;0"), "numbers separated by commas"),
         (("--duration", "0.1"), "periods"),
         (("--out", "motor.txt"), "a .csv file"),
     ],
@@ -112,7 +112,7 @@ def test_what_makes_no_sense_is_refused(load, write_urdf):
         excite(write_urdf(), ["block.mass"])
     with pytest.raises(UnknownNameError, match="limit of"):
         excite(model, ["pole.mass"], limits={"nothing": 1.0})
-    with pytest.raises(InputError, match="one at rest"):
+    with pytest.raises(InputError, match="a state at rest"):
         excite(model, ["pole.mass"], x0=[0, 0, 1, 0])
     with pytest.raises(InputError, match="periods"):
         excite(model, ["pole.mass"], duration=0.1)

@@ -152,8 +152,8 @@ def to(key, value):
         (lambda f: f.update(verdict="fail", explained=False), "explained"),
         (lambda f: f["inputs"].update(held_out=0.0), "held_out_s"),
         (lambda f: f["inputs"].update(noise={"hinge_q": 2e-3}), "noise"),
-        (lambda f: f["recordings"][0].update(path="recordings/0/../../x"), "not where drake_diff keeps it"),
-        (lambda f: f["recordings"][0].update(sha256="0" * 64), "is not the recording"),
+        (lambda f: f["recordings"][0].update(path="recordings/0/../../x"), "the path of recording lab"),
+        (lambda f: f["recordings"][0].update(sha256="0" * 64), "the recording does not match its hash"),
         (lambda f: f["model"]["options"].update(gravity=[0.0, 0.0, -9.0]), "estimates[hinge.damping].value"),
     ],
 )
@@ -173,7 +173,7 @@ def test_a_changed_recording_is_refused_however_it_is_hashed(copy):
         fields["recordings"][0]["sha256"] = sha256(place.read_bytes()).hexdigest()
 
     reseal(copy, lambda fields: None)
-    assert any("is not the recording" in line for line in dd.verify(copy).complaints)
+    assert any("the recording does not match its hash" in line for line in dd.verify(copy).complaints)
     reseal(copy, own_hash)
     verified = dd.verify(copy)
     assert verified.verdict == "broken"
@@ -189,7 +189,7 @@ def test_a_fit_that_explains_nothing_cannot_be_sold_as_one_that_does(tmp_path):
     reseal(tmp_path / "run", lambda f: f.update(verdict="pass", explained=True))
     verified = dd.verify(tmp_path / "run")
     assert verified.verdict == "broken"
-    assert any("explained: recorded true, again false" in line for line in verified.complaints)
+    assert any("explained: recorded true, recomputed false" in line for line in verified.complaints)
 
 
 @pytest.mark.parametrize("name", slow_after(1, ["pendulum.urdf", "report.html", "trace.mcap"]))

@@ -77,13 +77,13 @@ def test_bad_input_is_refused_by_name(ball):
     xs = recording.xs.copy()
     xs[3, 8] = np.nan
     gap = dd.Recording("gap", "1", recording.times, xs, recording.us)
-    with pytest.raises(InputError, match="every position and velocity"):
+    with pytest.raises(InputError, match="measured positions and velocities"):
         identify_contact(ball, [gap], ["ball.friction"])
     with pytest.raises(InputError, match=r"ball\.inertia"):
         identify_contact(ball, [recording], ["ball.inertia"])
     with pytest.raises(InputError, match="a function that makes a model"):
         identify_contact(ball, [recording], ["ball.friction"], lengths={"radius": 0.1})
-    with pytest.raises(InputError, match="`lengths` too"):
+    with pytest.raises(InputError, match="a function and `lengths`"):
         identify_contact(lambda: ball, [recording], ["ball.friction"])
 
 

@@ -146,11 +146,11 @@ def test_a_recording_makes_a_file_that_has_what_was_found(load, tmp_path):
 @each_row(
     "name, words",
     [
-        ("shoulder.coulomb_friction", "no Coulomb friction"),
-        ("motor.strength", "no scale factor of inputs"),
+        ("shoulder.coulomb_friction", "Coulomb friction, which"),
+        ("motor.strength", "a scale factor of an input"),
         ("shoulder_q.bias", "property of the recording"),
         ("gravity.gravity", "option of load_model"),
-        ("arm.friction", "URDF has no place for it"),
+        ("arm.friction", "a quantity that cannot be written to URDF"),
     ],
 )
 def test_what_a_file_cannot_carry_is_named(arm, tmp_path, name, words):
@@ -219,9 +219,9 @@ def test_what_an_overlay_cannot_tell_apart_is_refused_and_nothing_stays(tmp_path
     parts = [adds.format(n, tmp_path / f"{f}.urdf") + weld.format(n) for n, f in (("one", "arm"), ("two", "other"))]
     (tmp_path / "two.dmd.yaml").write_text("directives:\n" + "".join(parts))
     model = dd.load_model(tmp_path / "two.dmd.yaml", time_step=0.01)
-    with pytest.raises(InputError, match=r"one::arm\.mass: .*0 URDF or SDF files .* have one::arm"):
+    with pytest.raises(InputError, match=r"one::arm\.mass: .*one URDF or SDF file with one::arm .* 0 files"):
         write_model(saying(model, {"one::arm.mass": 3.0}), tmp_path / "right.dmd.yaml")
-    with pytest.raises(InputError, match=r"a \.dmd\.yaml file, as the model's own"):
+    with pytest.raises(InputError, match=r"a \.dmd\.yaml file, like the model's file"):
         write_model(saying(model, {"one::arm.mass": 3.0}), tmp_path / "right.urdf")
     assert not list(tmp_path.glob("right*"))
 
@@ -232,7 +232,7 @@ def test_a_name_that_the_file_has_twice_is_refused(tmp_path):
     models = "".join(f'<model name="{name}">{link}</model>' for name in ("one", "two"))
     path.write_text(f'<sdf version="1.9"><world name="w">{models}</world></sdf>')
     model = dd.load_model(path, time_step=0.01)
-    with pytest.raises(InputError, match="elements link of this name"):
+    with pytest.raises(InputError, match="one element link of this name"):
         write_model(saying(model, {"one::a.mass": 2.0}), tmp_path / "right.sdf")
 
 

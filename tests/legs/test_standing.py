@@ -108,9 +108,9 @@ def test_the_centre_of_mass_has_to_be_over_the_feet(on_feet):
 @each_row(
     "change, why",
     [
-        ({"load": "0.9 0 0", "trunk": 60.0}, "no forces"),  # outside the feet, wherever legs of 0.4 m put them
-        ({"effort": 0.5}, "no forces"),  # a fourth of 14 kg on a bent knee needs a few N m
-        ({"foot": False}, "has no shape|end in a shape"),
+        ({"load": "0.9 0 0", "trunk": 60.0}, "no contact forces"),  # outside the feet, wherever legs of 0.4 m put them
+        ({"effort": 0.5}, "no contact forces"),  # a fourth of 14 kg on a bent knee needs a few N m
+        ({"foot": False}, "has no collision shape|end in a sphere"),
         ({"bottom": 0.6}, "not at the end of a limb"),  # the trunk lies on the ground
     ],
 )
@@ -162,7 +162,7 @@ def test_what_cannot_stand_is_held_and_the_reason_is_told(tmp_path):
     path.write_text(quadruped(effort=0.5))
     robot = load_robot(path, 0)
     assert robot.standing is None
-    assert any("base='weld'" in told and "it cannot stand: no forces" in told for told in robot.repairs)
+    assert any("base='weld'" in told and "it cannot stand: no contact forces" in told for told in robot.repairs)
     path.write_text(quadruped())
     assert any("base='free'" in told for told in load_robot(path, 0).repairs)
 

@@ -170,7 +170,7 @@ def test_a_schema_that_does_not_decode_is_refused(tmp_path):
             writer.start()
             writer.register_channel("/a", encoding, writer.register_schema("a", encoding, schema))
             writer.finish()
-        with pytest.raises(ArtifactError, match=r"a\.mcap is no whole MCAP file"):
+        with pytest.raises(ArtifactError, match=r"a\.mcap is not an MCAP file of drake_diff"):
             read_mcap(tmp_path / "a.mcap")
 
 
@@ -246,7 +246,7 @@ def test_a_file_that_says_that_it_holds_too_much_is_refused_before_it_is_decoded
     path, state = tmp_path / "log.mcap", TYPES["State"].cls
     write_mcap(path, [Channel(f"/{i}", state, [(0, state(time=1.0))]) for i in range(3)], {}, {})
     assert len(read_mcap(path).messages) == 3
-    for name, told in (("MOST_CHANNELS", "3 channels: at most 2"), ("MOST_MESSAGES", "3 messages: at most 2")):
+    for name, told in (("MOST_CHANNELS", "3 channels, but at most 2"), ("MOST_MESSAGES", "3 messages, but at most 2")):
         with monkeypatch.context() as patch:
             patch.setattr(mcap_file, name, 2)
             patch.setattr(mcap_file, "_unpacked", None)  # must not be called
@@ -263,5 +263,5 @@ def test_a_file_that_holds_more_than_it_says_is_refused(tmp_path, monkeypatch, w
     else:
         monkeypatch.setattr(mcap_file, "_declared", lambda *_: 3)
         monkeypatch.setattr(mcap_file, "MOST_CHANNELS", 2)
-    with pytest.raises(ArtifactError, match=f"more (messages than its statistics say, 2|than 2 {what})"):
+    with pytest.raises(ArtifactError, match=f"more (messages than its statistics declare, 2|than 2 {what})"):
         read_mcap(path)

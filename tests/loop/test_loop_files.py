@@ -158,8 +158,8 @@ def test_what_a_users_code_made_is_data_and_is_not_executed(folder):
     assert Counted.calls == calls == 80
     assert (record.closed_loop.given, record.problem) == (["estimates", "commands"], {})
     assert {
-        "commands: used as recorded, as Counted is not executed",
-        "estimates: used as recorded, as Counted is not executed",
+        "commands: not recomputed, as Counted is not executed",
+        "estimates: not recomputed, as Counted is not executed",
     } < set(verification.unchecked)
     with pytest.raises(InputError, match="a result of solve, identify or closed_loop"):
         dd.save(run.motion, folder / "motion")

@@ -77,7 +77,7 @@ def test_a_goal_that_gravity_pulls_away_from_is_stayed_at_by_the_input_that_hold
     assert mpc([np.pi / 2, 0], 10.0) == pytest.approx(9.81 / 2, abs=1e-6)
     bounds = dd.Bounds(u_lower=[-4.0], u_upper=[4.0])
     weak = dd.Problem(model, x0=[0, 0], x_goal=[np.pi / 2, 0], num_steps=50, running_cost=EFFORT, bounds=bounds)
-    with pytest.raises(InputError, match=r"held by u = \[4\.9"):
+    with pytest.raises(InputError, match=r"a fixed point with u = \[4\.9"):
         dd.loop.MPC(weak, horizon=20, plan=(np.zeros((51, 2)), np.zeros((50, 1))))
 
 

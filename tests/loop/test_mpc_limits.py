@@ -257,7 +257,7 @@ def test_a_solution_of_another_horizon_starts_it():
     np.testing.assert_allclose(found[0]._reference.us, found[1]._reference.us, atol=3e-3)
     model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.05)
     of_another = dd.solve(dd.Problem(model, x0=np.zeros(4), num_steps=5, running_cost=EFFORT))
-    with pytest.raises(InputError, match="a Solution of 4 states"):
+    with pytest.raises(InputError, match="a Solution with 4 states"):
         MPC(problem, horizon=5, plan=of_another)
 
 

@@ -261,11 +261,11 @@ def test_loops_are_closed_from_a_posture_nearby(tmp_path):
     model = load(parallelogram(tmp_path))
     x = dd.model.assembled(model, [0.5, 0.0, 0.0, 1.0, 2.0, 3.0], keep=["a_q"])
     np.testing.assert_allclose(x, [0.5, -0.5, 0.5, 1.0, 2.0, 3.0], atol=1e-7)
-    with pytest.raises(ModelError, match=r"loops cannot be closed from this posture: points stay 0\.\d+ m apart"):
+    with pytest.raises(ModelError, match=r"loops cannot be closed from x, in which points are 0\.\d+ m apart"):
         dd.model.assembled(model, [0.5, 0.0, 0.0, 0, 0, 0], keep=["a_q", "b_q", "c_q"])
     with pytest.raises(UnknownNameError, match="position to keep"):
         dd.model.assembled(model, x, keep=["crank"])
-    with pytest.raises(InputError, match=r"x0: expected a closed loop, .*points 0\.\d+ m apart"):
+    with pytest.raises(InputError, match=r"x0: expected closed loops, .*got 0\.\d+ m between two points"):
         dd.Problem(model, x0={"a_q": 0.5}, x_goal={"a_q": 0.6}, num_steps=10)
 
 
@@ -306,7 +306,7 @@ def test_points_at_the_origins_of_their_bodies_can_be_held(tmp_path):
             "expected a body of loop to connect, got the unknown name nobody",
         ),
         ('<weld site1="end" site2="tip"/>', "line 1: expected a <connect> of two sites"),
-        ('<connect site1="inner" site2="tip"/>', "line 1: expected sites of bodies or frames with a name"),
+        ('<connect site1="inner" site2="tip"/>', "line 1: expected sites on bodies or frames that have a name"),
     ],
 )
 def test_what_cannot_be_held_is_refused_by_name(tmp_path, equality, words):
@@ -350,7 +350,7 @@ def test_an_open_loop_of_a_millimetre_is_refused(tmp_path):
         )
     path.write_text(text)
     model = load(path)
-    with pytest.raises(InputError, match=r"x0: expected a closed loop"):
+    with pytest.raises(InputError, match=r"x0: expected closed loops"):
         dd.Problem(model, x0={"c_q": 0.5}, x_goal={"a_q": 0.6}, num_steps=10)
     x = dd.model.assembled(model, [0.5, 0.0, 0.0, 0, 0, 0], keep=["a_q"])
     np.testing.assert_allclose(x[:3], [0.5, -0.5, 0.5], atol=1e-7)

@@ -236,7 +236,7 @@ def test_gains_of_the_default_of_another_kind_are_told(tmp_path):
     """MuJoCo has one default for all actuator kinds."""
     servo = '<actuator><general joint="j"/></actuator>'
     model = load(write(tmp_path, HINGE.format("", ""), defaults='<default><position kp="50"/></default>', more=servo))
-    assert "has the gains of the default of position in MuJoCo" in str(model.notes)
+    assert "inherits in MuJoCo from defaults of position are ignored" in str(model.notes)
 
 
 def test_bounds_of_masses_are_told_where_shapes_are_in_frames(tmp_path):
@@ -650,13 +650,13 @@ def test_frames_are_bodies_without_a_joint(tmp_path):
 @each_row(
     "body, head, told",
     [
-        ('<replicate count="3"><geom size="0.1"/></replicate>', "", "<replicate> and what is in it is ignored"),
+        ('<replicate count="3"><geom size="0.1"/></replicate>', "", "<replicate> and its contents are ignored"),
         (
             '<body><joint name="b" type="ball" armature="2"/><geom size="0.1"/></body>',
             "",
             "armature of the ball joint b is ignored",
         ),
-        ("", '<asset><mesh name="x" file="part.obj" inertia="shell"/></asset>', "its inertia is ignored"),
+        ("", '<asset><mesh name="x" file="part.obj" inertia="shell"/></asset>', 'inertia="shell" of a mesh is ignored'),
         ('<frame pos="0 0 1"><joint name="l"/></frame>', "", "tag 'frame' found as a child of 'body'"),
     ],
 )

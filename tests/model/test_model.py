@@ -132,15 +132,15 @@ BAD_FILES = {
         urdf("</joint>", '</joint>\n<transmission>\n\n<type/><joint name="j"/><actuator name="m"/></transmission>'),
         r"transmission_empty.urdf:4: <type> of a <transmission> is empty: write SimpleTransmission in it",
     ),
-    "circle.xml": (mjcf(more='<include file="circle.xml"/>'), r"it includes itself: circle.xml -> circle.xml"),
+    "circle.xml": (mjcf(more='<include file="circle.xml"/>'), r"the file includes itself: circle.xml -> circle.xml"),
     # Drake would download these packages.
     "drake_models.urdf": (
         shape('<mesh filename="package://drake_models/a.obj"/>'),
-        r"unknown package 'drake_models'.*packages=\{'drake_models': folder\}\); drake_diff downloads nothing",
+        r"unknown package 'drake_models'.*packages=\{'drake_models': folder\}\); drake_diff does not download it",
     ),
     "drake_models.dmd.yaml": (
         "directives:\n- add_model:\n    name: x\n    file: package://drake_models/a.urdf\n",
-        r"packages=\{'drake_models': folder\}\); drake_diff downloads nothing",
+        r"packages=\{'drake_models': folder\}\); drake_diff does not download it",
     ),
     # A condition in Drake's C++ rejects these two. pydrake raises it as SystemExit, which ended the process.
     "limits_crossed.urdf": (urdf("</joint>", LIMITED).replace("continuous", "revolute"), "limit"),
@@ -154,7 +154,7 @@ BAD_FILES = {
     "broken.xml": ("<mujoco><", "XML"),
     "broken_with_meshes.urdf": ("<robot> hand.stl <link", "not well-formed|unclosed"),
     "no_robot.urdf": ("<html/>", "robot tag"),
-    "nothing.urdf": ("", "line 1: no XML: no element found"),
+    "nothing.urdf": ("", "line 1: invalid XML: no element found"),
     "nothing.dmd.yaml": ("", "top level element"),
     "binary.urdf": (bytes(range(256)), "text in UTF-8, got byte 0x80 at position 128"),
     "binary.dmd.yaml": (bytes(range(256)), "UTF-8"),
@@ -336,6 +336,6 @@ def test_a_package_newer_than_tested_is_named_once(monkeypatch, bound, warns):
         warnings.simplefilter("always")
         for _ in range(2):
             dd.load_model(MODELS / "pendulum.urdf", time_step=0.01)
-    expected = f"newer than what drake_diff was tested with: numpy {np.__version__} (tested: below {bound})"
+    expected = f"packages newer than the tested versions: numpy {np.__version__} (tested: below {bound})"
     assert [str(w.message).startswith(expected) for w in caught] == [True] * warns
     load_file.warn_of_newer_versions.cache_clear()

@@ -58,7 +58,7 @@ def test_a_textbook_arm_becomes_one_that_can_be_driven(write):
     assert (model.nq, model.nu, model.input_names) == (2, 2, ("shoulder", "elbow"))
     assert [a.effort_limit for a in model.contract.actuators] == [7.0, 7.0]
     assert model.notes == (
-        "2 actuators added, with the effort limits that the file gives: shoulder (7), elbow (7).",
+        "2 actuators added, with the effort limits of the file: shoulder (7), elbow (7).",
         "The base base was welded to the world.",
         "A ground was added at z = 0, with friction 0.5.",
     )
@@ -82,7 +82,7 @@ def test_a_joint_without_a_limit_or_with_one_of_zero_gets_none_and_that_is_told(
     model, _ = load(write(robot(joint("shoulder", "base", "upper", "continuous", ""), zero)), actuators="all")
     assert [math.isinf(a.effort_limit) for a in model.contract.actuators] == [True, True]
     assert model.notes == (
-        "2 actuators added without an effort limit, as the file gives none or 0: shoulder, elbow.",
+        "2 actuators added without an effort limit, as the file has no limit or 0: shoulder, elbow.",
         "Limits of 0 of driven joints removed: elbow (velocity).",
     )
     assert model.contract.velocities[-1].upper == math.inf
@@ -96,7 +96,7 @@ def test_actuators_by_name_and_by_effort(write):
     assert [(a.joint, a.effort_limit) for a in model.contract.actuators] == [("elbow", 3.0), ("shoulder", math.inf)]
     again, told = load(MODELS / "cart_pole.urdf", actuators={"slide": 5})
     assert [a.effort_limit for a in again.contract.actuators] == [5.0]
-    assert told.endswith("The effort limit of force became 5; the file says 20.")
+    assert told.endswith("The effort limit of force became 5; the file has 20.")
     same, told = load(MODELS / "cart_pole.urdf", actuators=["slide"])
     assert (same.nu, told) == (1, "")
 
@@ -206,7 +206,7 @@ def test_without_contact_nothing_touches(write):
         ({"fix_joints": ["wrist"]}, UnknownNameError, "joint that can move: expected one of elbow, shoulder"),
         ({"fix_joints": "elbow"}, InputError, "fix_joints: expected names of joints, got 'elbow'"),
         ({"packages": {"arm": "/nowhere"}}, InputError, r"packages\['arm'\]: expected a folder that exists"),
-        ({"packages": "arm"}, InputError, "packages: expected the folder of each package"),
+        ({"packages": "arm"}, InputError, "packages: expected a mapping from names of packages to folders"),
         ({"ground": False}, InputError, "ground"),
         ({"ground": 0.5, "contact": False}, InputError, "ground: expected contact"),
         ({"contact": "no"}, InputError, 'contact: expected True, False, "ground" or "separable", got \'no\''),
@@ -219,17 +219,17 @@ def test_bad_repairs_are_named(write, options, error, words):
 
 def test_a_base_that_is_held_is_not_free_and_needs_no_weld(write):
     path = write(robot(joint("shoulder", "world", "upper"), ELBOW, links="upper lower"))
-    with pytest.raises(ModelError, match=r"arm.urdf: base=\"free\": nothing floats.*shoulder \(revolute\) holds upper"):
+    with pytest.raises(ModelError, match=r"arm.urdf: base=\"free\": expected .*shoulder \(revolute\) of upper"):
         load(path, base="free")
     model, told = load(path, base="weld")
     assert (model.nq, told) == (2, "")
-    with pytest.raises(ModelError, match="expected a frame of something that floats"):
+    with pytest.raises(ModelError, match="expected a frame of a floating body"):
         load(path, base="lower")
     assert load(write(), base="free")[0].nq == 9
 
 
 def test_what_has_no_joint_cannot_be_welded_away():
-    with pytest.raises(ModelError, match="no joint would be left to move"):
+    with pytest.raises(ModelError, match="expected floating bodies with joints"):
         load(MODELS / "projectile.sdf", base="weld")
 
 
@@ -257,7 +257,7 @@ def test_slips_that_say_nothing_of_the_robot_are_mended_and_told(write):
     assert model.notes[:4] == (
         "The robot has no name in the file: it is called arm.",
         "Materials: black is defined twice, and the first definition is drawn.",
-        "Limits of continuous joints left out, lower and upper are the same: shoulder.",
+        "Limits of continuous joints removed, as lower and upper limit are equal: shoulder.",
         "The joint elbow is fixed, so that it mimics nothing.",
     )
     assert (model.name, model.contract.positions[0].upper) == ("arm", math.inf)

@@ -100,7 +100,7 @@ def test_without_a_foot_that_stands_there_are_no_forces():
     refused = plan_forces(
         3.0, G, H, (np.zeros(3), np.zeros(3)), np.zeros((11, 3)), np.zeros((11, 4, 3)), np.zeros((10, 4), bool), 0.5
     )
-    assert "no forces" in str(refused)
+    assert "no contact forces" in str(refused)
 
 
 def test_a_foot_is_on_the_ground_before_and_after_each_step_it_stands_in():
@@ -183,7 +183,7 @@ def test_a_schedule_that_does_not_fit_the_problem_is_refused(solo, standing):
         dd.optimize.ContactSchedule([(4, ["base_link"])]).guess(solo, standing)
     far = np.array(standing[: solo.nq])
     far[4] += 50.0
-    with pytest.raises(InputError, match="no forces"):
+    with pytest.raises(InputError, match="no contact forces"):
         hop.guess(solo, standing, far)
 
 

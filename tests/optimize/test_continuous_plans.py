@@ -165,7 +165,7 @@ def test_a_plan_in_continuous_time_is_refused_what_it_has_not():
     problem = dd.Problem(model, motion="continuous", **asked)
     with pytest.raises(InputError, match='method="ilqr" or "shooting"'):
         dd.solve(problem, method="collocation")
-    with pytest.raises(InputError, match="use restarts to try other first guesses"):
+    with pytest.raises(InputError, match="use restarts to try other initial guesses"):
         dd.solve(problem, method="ilqr", options=Options(continuation="auto"))
     with pytest.raises(InputError, match=r"num_steps \* model\.time_step"):
         dd.Problem(model, motion="continuous", horizon=(0.1, 0.2), **asked)
@@ -177,7 +177,7 @@ def test_a_plan_in_continuous_time_is_refused_what_it_has_not():
     with pytest.raises(InputError, match="plain dynamics"):
         dd.Problem(block, x0=[0, 0], x_goal=[1, 0], num_steps=5, horizon=1.0, motion="continuous")
     solution = dd.solve(problem, method="ilqr")
-    with pytest.raises(InputError, match='motion="steps": trials are stepped'):
+    with pytest.raises(InputError, match='motion="steps", as trials consist of steps'):
         dd.robustness(solution)
     with pytest.raises(ModelError, match="no second derivatives"):
         dd.sensitivity(solution)

@@ -83,7 +83,7 @@ def test_a_motion_that_does_not_repeat_is_refused():
 
 def test_what_takes_no_couplings_says_so():
     problem = swing(waypoints=None)
-    with pytest.raises(InputError, match=r'couplings.*method="shooting", as method="ilqr" does not support it'):
+    with pytest.raises(InputError, match=r'couplings.*method="ilqr"; method="shooting" supports it'):
         dd.solve(problem, method="ilqr")
     with pytest.raises(InputError, match=r"couplings"):
         dd.solve(problem, method="collocation", options=Options(scheme="drake", solver="snopt"))
@@ -101,7 +101,7 @@ def test_what_takes_no_couplings_says_so():
         (lambda: Periodic(entries=[0, 0]), "each once"),
         (lambda: swing(couplings=Periodic(entries=[2])), "from 0 to 1"),
         (lambda: swing(couplings=Periodic(M=np.eye(3))), "shape"),
-        (lambda: swing(couplings=[Periodic(), Periodic()]), "a name of its own"),
+        (lambda: swing(couplings=[Periodic(), Periodic()]), "a different name"),
         (lambda: swing(couplings=Coupling(lambda a, b: a[0], knots=(0, 41), lower=0)), "from -41 to 40"),
         (lambda: swing(couplings=Coupling(lambda a, b: a[0], knots=(40, -1), lower=0)), "each once"),
         (lambda: swing(couplings=Coupling(lambda a, b: a[:1] - b, lower=[0, 0, 0])), "2 values"),

@@ -259,7 +259,7 @@ def test_a_record_that_lies_of_it_is_found(pushed, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @each_row(
-    "there, words", [(True, "mujoco, which is not installed here"), (False, "mujoco, which was not installed where")]
+    "there, words", [(True, "mujoco, which is not installed on this"), (False, "mujoco, which was not installed where")]
 )
 def test_what_a_simulator_said_that_is_not_installed_stands_unchecked(pushed, tmp_path, monkeypatch, there, words):
     with monkeypatch.context() as without:

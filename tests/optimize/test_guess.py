@@ -111,7 +111,7 @@ def test_drakes_trajectories_are_a_guess(write_urdf):
         ((PiecewisePolynomial.FirstOrderHold([0, 1], np.zeros((2, 2))),) * 2, "initial_guess input: expected shape"),
         ((PiecewisePolynomial.FirstOrderHold([0, 1], np.zeros((2, 2))), np.zeros((10, 1))), "initial_guess input: exp"),
         ((PiecewisePolynomial.FirstOrderHold([0, 1], np.zeros((2, 2))),), "two trajectories"),
-        ((PiecewisePolynomial([[0.0], [0.0]]), PiecewisePolynomial([[0.0]])), "a beginning and an end"),
+        ((PiecewisePolynomial([[0.0], [0.0]]), PiecewisePolynomial([[0.0]])), "a duration in"),
     ],
 )
 def test_trajectories_that_do_not_fit_are_refused(write_urdf, given, message):

@@ -112,7 +112,7 @@ def test_the_cost_falls_from_row_to_row():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"trajectory_cost": lambda xs, us: xs[3, 0] ** 2}, 'trajectory_cost: expected method="shooting"'),
+        ({"trajectory_cost": lambda xs, us: xs[3, 0] ** 2}, 'trajectory_cost: expected no value for method="ilqr"'),
     ],
 )
 def test_what_ilqr_cannot_keep_is_refused(changes, words):

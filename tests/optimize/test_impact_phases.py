@@ -191,7 +191,7 @@ def test_what_is_no_impact_is_refused_early(landed):
     stance = landed.problem.phases[1].system
     for wrong, message in (
         ({"restitution": 1.1}, "restitution: expected a number from 0 to 1"),
-        ({"at": [0.0]}, "at: expected a height, or 2 places"),
+        ({"at": [0.0]}, "at: expected a height, or a coordinate for each"),
         ({"friction": -0.1}, "friction: expected"),
     ):
         with pytest.raises(InputError, match=message):

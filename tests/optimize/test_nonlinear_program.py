@@ -147,7 +147,7 @@ def test_snopts_rows_are_read_where_their_columns_stand():
 
 def test_a_drake_without_snopt_is_named(monkeypatch):
     monkeypatch.setattr(SnoptSolver, "available", lambda self: False)
-    with pytest.raises(MissingDependencyError, match="SNOPT is not in this Drake"):
+    with pytest.raises(MissingDependencyError, match="this build of Drake has no SNOPT"):
         run(program(bowl))
 
 

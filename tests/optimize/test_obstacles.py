@@ -212,7 +212,7 @@ def test_neighbours_and_what_always_overlaps_are_left_out_of_self_collision():
     left = dd.SelfCollision().left_out(model)
     assert left
     assert not labels & set(left)
-    with pytest.warns(ModelWarning, match=f"does not keep {len(left)} pairs of links apart, .*{left[0]}"):
+    with pytest.warns(ModelWarning, match=f"ignores {len(left)} pairs of links, .*{left[0]}"):
         dd.Problem(model, x0=x0, num_steps=5, final_cost=lambda x: x[0] ** 2, goals=[dd.SelfCollision()])
     some = dd.SelfCollision(ignore=[("wrist_3_link", "upper_arm_link")])
     fewer = dd.Problem(model, x0=x0, num_steps=5, final_cost=lambda x: x[0] ** 2, goals=[some])

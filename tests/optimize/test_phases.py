@@ -264,7 +264,7 @@ def test_what_does_not_fit_is_refused_early():
         (lambda: make([fall, up], resets=[lambda x: float(x[0])]), "the reset from phase 0 to phase 1"),
         (lambda: make([fall, up], horizon=(20, 30)), "horizon"),
         (lambda: make([fall, up], names=["one"]), "names"),
-        (lambda: make([fall, dd.Problem(saving, x0=[0, 0], x_goal=[1, 0], num_steps=3)]), "map"),
+        (lambda: make([fall, dd.Problem(saving, x0=[0, 0], x_goal=[1, 0], num_steps=3)]), "DiscreteMaps in all phases"),
         (lambda: dd.solve(problem, method="ilqr"), "method"),
         (lambda: dd.solve(problem, method="shooting"), "method"),
         (lambda: dd.solve(problem, options=Options(scheme="drake")), "scheme"),

@@ -86,7 +86,7 @@ def test_a_nan_goal_is_free(load):
         ({"optimize": "initial_state", "initial_state_mask": [True]}, "initial_state_mask: expected shape"),
         ({"optimize": "initial_state", "initial_state_mask": [1, 0, 0, 0]}, "booleans"),
         ({"optimize": "initial_state", "initial_state_mask": [False] * 4}, "booleans, of which some are True"),
-        ({"initial_state_mask": [True] * 4}, "none, without"),
+        ({"initial_state_mask": [True] * 4}, "no True without"),
         ({"running_cost": 3.0}, "a function or a QuadraticCost, got float"),
         ({"running_cost": dd.QuadraticCost(R=np.eye(2))}, r"running_cost.R: expected shape \(1, 1\)"),
         ({"running_cost": dd.QuadraticCost(Q=np.eye(3))}, r"running_cost.Q: expected shape \(4, 4\)"),

@@ -185,7 +185,7 @@ def test_a_hopper_that_stands_gets_half_a_metre_on(time_step, clearance):
 
 def test_what_has_no_relaxed_contact_is_refused_by_name(load, two_spheres):
     pendulum = dd.Problem(load("pendulum.urdf"), x0=[0, 0], num_steps=5, x_goal=[1, 0])
-    with pytest.raises(InputError, match="no sphere has a collision pair"):
+    with pytest.raises(InputError, match="no sphere of the model has a collision pair"):
         dd.solve(pendulum, method="ilqr", options=Options(continuation="relaxed"))
     free = push(two_spheres(), gap=0.4, goal=1.0, optimize=("controls", "initial_state"))
     with pytest.raises(InputError, match="free initial state"):

@@ -104,9 +104,12 @@ def test_a_given_first_state_need_not_keep_a_constraint():
     [
         (3, "constraints: expected a Constraint or several, got int"),
         ([3], "constraints: expected a Constraint or several, got int"),
-        (dd.optimize.Periodic(), "constraints: expected a Constraint or several; couplings= takes it, got Periodic"),
+        (
+            dd.optimize.Periodic(),
+            "constraints: expected a Constraint or several; pass a coupling as couplings=, got Periodic",
+        ),
         (dd.Constraint(lambda x: x[5], upper=1), "constraint .* got IndexError"),
-        (dd.Constraint(lambda x: x, upper=[1, 2, 3]), "constraint .* expected 3, as its bounds, got 2 values"),
+        (dd.Constraint(lambda x: x, upper=[1, 2, 3]), "constraint .* expected 3, one per bound, got 2 values"),
         (
             dd.Constraint(lambda x: x, upper=1, knots=[11], name="far"),
             "knots of constraint far: expected whole",

@@ -207,7 +207,7 @@ def test_of_a_run_whose_model_cannot_be_rebuilt_its_page_is_named(tmp_path):
     model = dd.model_from_diagram(dd.load_model(MODELS / "pendulum.urdf", time_step=0.02).diagram)
     problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=10, running_cost=dd.QuadraticCost(R=[[1.0]]))
     dd.save(dd.solve(problem, method="shooting"), tmp_path)
-    with pytest.raises(ArtifactError, match=r"a user's own diagram .* replay.html in it shows the motion"):
+    with pytest.raises(ArtifactError, match=r"a user's diagram .* replay.html in it shows the motion"):
         scene_of_run(tmp_path)
 
 

@@ -235,7 +235,7 @@ def test_ctrl_c_keeps_what_is_finished_and_says_how_to_go_on(write, tmp_path):
     os.killpg(process.pid, signal.SIGINT)  # to all processes at once, like a terminal
     output = process.communicate(timeout=30)[0]
     assert process.returncode == 130
-    assert "the same command goes on" in output
+    assert "the same command continues" in output
     assert "Traceback" not in output
     assert no_worker_lives(path)
     assert 3 <= len(finished(out)) < 500
@@ -278,11 +278,11 @@ def test_another_panels_directory_is_refused_and_so_is_one_of_its_trials(write, 
         run_panel(write("cheap"), out=tmp_path / "other", workers=1)
     foreign = min((tmp_path / "other" / "trials").iterdir())
     shutil.copy(foreign, tmp_path / "out" / "trials")
-    with pytest.raises(ArtifactError, match=f"{foreign.name}: it belongs to another panel"):
+    with pytest.raises(ArtifactError, match=f"{foreign.name}: the trial belongs to another panel"):
         run_panel(write("cheap"), out=tmp_path / "out", workers=1)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes").touch()
-    with pytest.raises(InputError, match="holds 'notes'"):
+    with pytest.raises(InputError, match="with 'notes'"):
         run_panel(write("cheap"), out=tmp_path / "mine", workers=1)
 
 
@@ -380,7 +380,7 @@ def test_bad_options_are_refused(write, tmp_path):
     for options, message in [
         ({"workers": 0}, "workers: expected a whole number of at least 1, got 0"),
         ({"engine": "dask"}, "engine: expected one of local, ray, got 'dask'"),
-        ({"address": "host:1"}, 'address: expected none for engine="local"'),
+        ({"address": "host:1"}, 'address: expected no address for engine="local"'),
     ]:
         with pytest.raises(InputError, match=message):
             run_panel(write(), out=tmp_path / "out", **options)
@@ -449,27 +449,34 @@ def test_a_panel_whose_files_do_not_follow_from_its_trials_is_broken(write, tmp_
         "verdict": "pass",
         "sentence": "it ran, and does not say whether it is a success",
     }
-    broken(lambda d: sealed_again(d / in_trials, **better), "table.csv: it does not come out")
-    broken(lambda d: sealed_again(d / in_trials, **better), "is not that of table.csv", of=in_trials)
+    broken(lambda d: sealed_again(d / in_trials, **better), "table.csv: it differs from the file recomputed")
+    broken(lambda d: sealed_again(d / in_trials, **better), "differs from table.csv", of=in_trials)
     platform = {**one["trial"]["conditions"], "platform": "another"}
-    broken(lambda d: sealed_again(d / in_trials, conditions=platform), "to another panel|not what the panel writes")
+    broken(
+        lambda d: sealed_again(d / in_trials, conditions=platform),
+        "from another panel|differs from the record that the panel writes",
+    )
     broken(lambda d: sealed_again(d / in_trials, conditions=platform), "its result or its panel", of=in_trials)
-    broken(lambda d: sealed_again(d / in_trials, name="another"), "is not what the panel writes")
+    broken(lambda d: sealed_again(d / in_trials, name="another"), "differs from the record that the panel writes")
     other = {**one["trial"]["inputs"], "seed": 1}
-    broken(lambda d: sealed_again(d / in_trials, inputs=other), "is not what the panel writes", of=in_trials)
+    broken(
+        lambda d: sealed_again(d / in_trials, inputs=other),
+        "differs from the record that the panel writes",
+        of=in_trials,
+    )
     wrong = (made / "table.csv").read_text().replace("ValueError", "Nothing")
-    broken(lambda d: (d / "table.csv").write_text(wrong), "table.csv: it does not come out")
+    broken(lambda d: (d / "table.csv").write_text(wrong), "table.csv: it differs from the file recomputed")
     broken(lambda d: (d / in_trials).write_text(trial.read_text().replace("a level", "b level")), "record_sha256",
            of=in_trials)  # fmt: skip
     ranking = [{**row, "place": 1} for row in dd.load_record(made).panel.ranking]
-    broken(lambda d: sealed_again(d / "record.json", ranking=ranking), "record.json: panel is not what the table says")
+    broken(lambda d: sealed_again(d / "record.json", ranking=ranking), "record.json: panel differs from the value")
     page = (made / "panel.html").read_text().replace("<h2>Ranking", "<h2>Ranking of experts")
     broken(lambda d: (d / "panel.html").write_text(page), "panel.html: the text from")
     broken(lambda d: (d / in_trials).unlink(), "only one of them has trial")
     plain = tmp_path / "changed"
     shutil.copytree(made, plain)
     (plain / "summary.json").write_text("{}")  # without new hashes
-    assert any("summary.json: its 2 bytes" in line for line in dd.verify(plain).complaints)
+    assert any("summary.json: the content (2 bytes)" in line for line in dd.verify(plain).complaints)
 
 
 def cell(name, successes, trials, cost=None, errors=0):

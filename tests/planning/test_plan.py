@@ -99,8 +99,8 @@ AVOID = ["--goal", "elbow=1", "--avoid"]
 @each_row(
     "words, message",
     [
-        (["--goal", "elbow"], "NAME=x,y,z of a frame"),
-        (["--goal", "elbow=a"], "NAME=x,y,z of a frame"),
+        (["--goal", "elbow"], "NAME=x,y,z for a frame"),
+        (["--goal", "elbow=a"], "NAME=x,y,z for a frame"),
         (["--goal", "elbow=1,2"], "three numbers"),
         (["--goal", "knee=1"], "goal: joint"),
         (["--goal", "elbow=4"], "within its limits"),
@@ -110,7 +110,7 @@ AVOID = ["--goal", "elbow=1", "--avoid"]
         ([*AVOID, "0,0,0,1"], "sphere:x,y,z,radius or box:"),
         ([*AVOID, "sphere:0,0,0"], "4 numbers"),
         ([*AVOID, "box:0,0,0,1"], "6 numbers"),
-        ([*AVOID, "sphere:a,0,0,1"], "numbers with commas"),
+        ([*AVOID, "sphere:a,0,0,1"], "numbers separated by commas"),
         ([*AVOID, "sphere:0,0,0,-1"], "SphereObstacle.radius"),
         ([*AVOID, "box:0,0,0,1,0,1"], "BoxObstacle.size"),
     ],

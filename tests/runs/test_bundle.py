@@ -249,15 +249,15 @@ def missing(named, bundle):
 @each_row(
     "change, verdict, words",
     [
-        (altered, "broken", "it is no"),
+        (altered, "broken", "does not"),
         (replaced, "broken", ""),
         (exchanged, "broken", ""),
-        (added, "broken", "0000: it is no file that the model names"),
+        (added, "broken", "0000: the model does not name this file"),
         (added_and_named, "broken", "it does not list the files that far.urdf names: c.obj"),
         (left_out, "broken", "it does not list the files that far.urdf names"),
-        (outside, "broken", "'../record.json' is no hash of a file"),
-        (linked, "broken", "a link, or not a plain file"),
-        (missing, "undecided", "which the artifact does not hold"),
+        (outside, "broken", "'../record.json' is not the hash of a file"),
+        (linked, "broken", "a link, or not a regular file"),
+        (missing, "undecided", "which the artifact does not contain"),
     ],
 )
 def test_a_changed_file_of_the_model_is_found_although_all_seals_are_right(arm, tmp_path, change, verdict, words):

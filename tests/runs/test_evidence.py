@@ -156,7 +156,7 @@ def test_plain_dynamics_are_saved_and_what_cannot_be_known_is_said(tmp_path):
     assert "plain dynamics" in page
     found = dd.verify(tmp_path / "run")
     assert (found.verdict, found.complaints) == ("undecided", ())
-    assert "function, which no artifact can hold" in str(found)
+    assert "function, which cannot be stored" in str(found)
 
 
 def test_a_refined_mesh_comes_back_and_is_measured_at_the_problem_s_own_knots(swing_up, tmp_path):

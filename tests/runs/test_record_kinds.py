@@ -141,7 +141,7 @@ def test_a_run_of_version_3_1_is_verified_as_before(tmp_path):
     found = dd.verify(folder)
     assert found.record.schema_version == "3.1.0"
     assert found.complaints == ()
-    reasons = ("steps that the search takes", "contents not checked: schema 3.1.0 has")  # that version used other words
+    reasons = ("steps of the search", "contents not checked: schema 3.1.0 has")  # that version used other words
     assert found.holds or found.notes or all(any(why in line for why in reasons) for line in found.undecided)
     assert len(found.record.gradient.final_state_norms) == 21
     assert found.record.gradient.stationarity < 1e-6

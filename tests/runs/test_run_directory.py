@@ -97,7 +97,7 @@ def test_what_breaks_off_leaves_the_old_run_and_says_where_its_own_files_are(run
     with pytest.raises(ZeroDivisionError) as raised:
         breaks_off("half")
     (left,) = run.parent.glob("run.partial-*")
-    assert raised.value.__notes__ == [f"what was written is in {left}"]
+    assert raised.value.__notes__ == [f"the files written so far are in {left}"]
     with pytest.raises(ZeroDivisionError):
         breaks_off(None)
     assert (goal_of(run), names(run.parent)) == (OLD, ["run", left.name])  # an empty partial run is removed
@@ -139,9 +139,9 @@ def test_others_files_are_refused_and_stay(run, solutions, monkeypatch):
         (notes, "'notes.txt'"),
         (link, "'link'"),
         (subfolder, "'mine'"),
-        (edited, "which holds"),
+        (edited, "which contains"),
         (own_page, "'report.html'"),
-        (file, "no directory"),
+        (file, "not a directory"),
         (here, "the working directory"),
     ):
         target = Path(shutil.copytree(run, run.parent / change.__name__))
@@ -169,7 +169,7 @@ def test_a_panel_leaves_others_files_alone(tmp_path):
     (tmp_path / "panel.toml").write_text('evaluate = "trials.py:square"\n[axes]\nx = [1, 2]')
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "table.csv").write_text("mine")
-    with pytest.raises(InputError, match=r"which holds 'table\.csv'"):
+    with pytest.raises(InputError, match=r"out with 'table\.csv'"):
         run_panel(tmp_path / "panel.toml", out=tmp_path / "out", workers=1)
     assert names(tmp_path / "out") == ["table.csv"]
     assert (tmp_path / "out" / "table.csv").read_text() == "mine"
@@ -384,9 +384,9 @@ def test_what_cannot_be_recovered_is_said(run, solutions, tmp_path):
         recover(run)
     open_ = run.parent / "run.partial-1-0123abcd"
     begin(open_, solutions[1].problem)
-    with pytest.raises(InputError, match="recover replaces no run"):
+    with pytest.raises(InputError, match="recover does not replace a run"):
         recover(open_)
-    with pytest.raises(ArtifactError, match="no plan of a solve in it"):
+    with pytest.raises(ArtifactError, match="no plan of a solve to recover"):
         recover(open_, tmp_path / "out")
     with writing(run), pytest.raises(ArtifactError, match="being written"):
         recover(open_, tmp_path / "out")
@@ -400,7 +400,7 @@ def test_what_cannot_be_recovered_is_said(run, solutions, tmp_path):
     problem = dd.Problem(model, x0=[0, 0], num_steps=3, running_cost=dd.QuadraticCost(R=[[1.0]]))
     keep_plan(dd.solve(problem, method="shooting"), run.parent / "moved.partial-1-0123abcd")
     model_file.unlink()
-    with pytest.raises(ModelError, match="is gone"):
+    with pytest.raises(ModelError, match="does not exist"):
         recover(run.parent / "moved.partial-1-0123abcd")
     assert names(run.parent) == [
         "mine.partial-1-0123abcd", "moved.partial-1-0123abcd", "run", "run.partial-1-0123abcd",

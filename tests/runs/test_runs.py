@@ -114,7 +114,7 @@ def test_the_commands_print_and_exit_as_they_should(runs, tmp_path, monkeypatch,
     (copy / "trace.mcap").write_bytes(b"")
     status, shown = told("verify", copy)
     assert status == 1
-    assert "trace.mcap: its 0 bytes are not those that record.json describes" in shown
+    assert "trace.mcap: the content (0 bytes) differs from the one listed in record.json" in shown
     assert "verdict: incomplete" in told("verify", runs / OPEN)[1]
     assert told("verify", runs / "nowhere")[0] == 2
     status, shown = told("list", runs)

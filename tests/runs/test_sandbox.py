@@ -104,7 +104,7 @@ def test_a_model_that_ends_drake_breaks_the_run(run, monkeypatch):
     monkeypatch.setattr("drake_diff.runs.verify.call", lambda *_: ask(end, monkeypatch))
     found = dd.verify(run)
     assert found.verdict == "broken"
-    assert "the model cannot be read or run: the process that did so ended by SIGABRT" in found.sentence
+    assert "the model cannot be read or run: the child process was ended by SIGABRT" in found.sentence
 
 
 @pytest.mark.slow
@@ -112,7 +112,7 @@ def test_a_model_that_ends_drake_breaks_the_run(run, monkeypatch):
 def test_a_limit_makes_a_run_undecided_and_is_named(run, limit):
     found = dd.verify(run, **limit)
     assert found.verdict == "undecided"
-    assert "--time-limit and --memory-limit, give it more" in found.sentence
+    assert "increase time_limit or memory_limit" in found.sentence
 
 
 def test_limits_and_folders_that_are_none_are_refused(run, tmp_path):

@@ -186,7 +186,7 @@ def test_what_is_begun_and_not_ended_says_so_beside_the_one_before(result, tmp_p
     other = tmp_path / "out" / "worst" / "mine"
     other.mkdir()
     (other / "notes.txt").write_text("keep")
-    with pytest.raises(InputError, match="which holds 'mine'"):
+    with pytest.raises(InputError, match="which contains 'mine'"):
         save_robustness(result, tmp_path / "out")
     assert (other / "notes.txt").read_text() == "keep"
 

@@ -84,7 +84,7 @@ _Solve = Callable[[LinearQuadratic, float], AffinePolicy | None]
 def check_problem(problem: Problem) -> None:
     """Raise InputError for parts of the problem that iLQR does not support, and name a method that does."""
     for subject in _unkept(problem):
-        raise InputError(subject, got="given", expected='method="shooting", as method="ilqr" does not support it')
+        raise InputError(subject, got="given", expected='no value for method="ilqr"; method="shooting" supports it')
 
 
 def takes(problem: Problem) -> bool:

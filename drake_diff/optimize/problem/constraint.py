@@ -16,7 +16,7 @@ from drake_diff.model.assembly import single_coordinates
 from drake_diff.model.model import Model
 
 LOOKED_AT = 5  # number of states at which a constraint's slopes are computed
-FORM = "a function of x, or of x and u, in ordinary arithmetic that gives a number or numbers (m,)"
+FORM = "a function of x, or of x and u, in ordinary arithmetic that returns a number or an array (m,)"
 
 
 class ShowsArrays:
@@ -235,7 +235,7 @@ class Constraint:
             values = self._call(x, u)
         size = len(self.lower)
         if size not in (1, len(values)):
-            raise InputError(f"constraint {self.label}", got=f"{len(values)} values", expected=f"{size}, as its bounds")
+            raise InputError(f"constraint {self.label}", got=f"{len(values)} values", expected=f"{size}, one per bound")
         lower, upper = (np.broadcast_to(side, values.shape) for side in (self.lower, self.upper))
         return replace(self, lower=lower, upper=upper)
 

@@ -274,7 +274,7 @@ class TrackingCost(TimedCost):
         times, xs, us = _table(self.reference)
         times = finite_array("TrackingCost times [s]", times, ("M",))
         if len(times) < 2 or np.any(np.diff(times) <= 0):
-            raise InputError("TrackingCost times [s]", got=f"{len(times)} of them", expected="two or more, increasing")
+            raise InputError("TrackingCost times [s]", got=f"{len(times)} times", expected="two or more, increasing")
         xs = finite_array("TrackingCost xs", xs, (len(times), "nx"))
         us = None if us is None else finite_array("TrackingCost us", us, (len(times), "nu"))
         if self.Q is None and self.R is None:

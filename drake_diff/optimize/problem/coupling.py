@@ -19,7 +19,7 @@ from drake_diff.model.plant import joints, labelled
 from drake_diff.optimize.problem.constraint import Constraint, Described, arguments_of, short
 from drake_diff.optimize.problem.dynamics import DiscreteMap, Dynamics, by_place
 
-FORM = "a function of the states at its knots, or of these and of the inputs there, that gives numbers (m,)"
+FORM = "a function of the states at its knots, or of the states and inputs at its knots, that returns numbers (m,)"
 
 
 class Couples(Described):
@@ -240,7 +240,7 @@ class Periodic(Joins):
     def bound(self, num_steps: int, nx: int, nu: int, *, input_at_end: bool) -> BoundCoupling:
         entries = np.arange(nx) if self.entries is None else np.array(self.entries)
         if np.max(entries) >= nx:
-            raise InputError("Periodic.entries", got=entries.tolist(), expected=f"from 0 to {nx - 1}")
+            raise InputError("Periodic.entries", got=entries.tolist(), expected=f"indices from 0 to {nx - 1}")
         offset = np.zeros(len(entries)) if self.offset is None else finite_array("offset", self.offset, (len(entries),))
         M = np.eye(nx)[entries] if self.M is None else finite_array("Periodic.M", self.M, (len(entries), nx))
 
@@ -284,7 +284,7 @@ class RateLimit(Couples):
         """Return the limited inputs, or the limited entries of x', and their limits."""
         kind = type(self).__name__
         if isinstance(system, DiscreteMap):
-            raise InputError(kind, got="a DiscreteMap", expected="a system in time")
+            raise InputError(kind, got="a DiscreteMap", expected="a system whose time is in seconds")
         known = self._known(system)
         if not isinstance(self.limit, dict):
             if not len(known):

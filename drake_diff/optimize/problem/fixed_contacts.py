@@ -142,7 +142,7 @@ class FixedContacts(Dynamics):
             return np.array([float(positions) if row.endswith(" z") else np.nan for row in self.rows])
         where = np.asarray(positions, dtype=float)
         if where.shape != (len(self.rows),) or np.any(np.isinf(where)):
-            raise InputError("at", got=repr(positions), expected=f"a height, or {len(self.rows)} places: {self.rows}")
+            raise InputError("at", got=repr(positions), expected=f"a height, or a coordinate for each of {self.rows}")
         return where
 
     def _pushing(self, friction: float) -> Iterator[Constraint]:
@@ -323,7 +323,7 @@ class Impact:
             positions = [np.nan if position is None else position for position in values["at"]]
             return cls(contacts, restitution=values["restitution"], at=positions, friction=values["friction"])
         except (KeyError, TypeError) as error:
-            raise InputError("impact", got=repr(values)[:80], expected="what Impact.to_dict tells") from error
+            raise InputError("impact", got=repr(values)[:80], expected="the values of Impact.to_dict") from error
 
 
 def friction_cone(f: Any, z: int, along: list[int], friction: float) -> Any:

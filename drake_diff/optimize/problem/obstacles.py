@@ -110,7 +110,7 @@ class ClearanceConstraint(GoalConstraint):
             raise InputError(
                 subject,
                 got=str(self.check_at(x, subject, self.between)),
-                expected="a state clear of the obstacle, as each plan passes through it",
+                expected="a state clear of the obstacle, as each plan contains this state",
             )
 
 
@@ -387,7 +387,7 @@ def _solids(model: Model, kinematics: ForwardKinematics, links: Sequence[str] | 
     solids = cover_of(model, kinematics).solids
     for name in links or ():
         if all(solid.body != name for solid in solids):
-            raise InputError("links", got=name, expected="a body with a shape, with mass, or with a next joint")
+            raise InputError("links", got=name, expected="a body with a collision shape, a mass or a child joint")
     return [solid for solid in solids if links is None or solid.body in links]
 
 
@@ -468,6 +468,6 @@ def doubts_of(goals: Sequence[Goal], model: Model, x0: Array | None = None) -> I
     for goal in goals:
         if isinstance(goal, SelfCollision) and (left := goal.left_out(model, x0)):
             yield (
-                f"SelfCollision does not keep {len(left)} pairs of links apart, as their shapes overlap in the posture "
-                f"of the file or in every one: {', '.join(left)}"
+                f"SelfCollision ignores {len(left)} pairs of links, whose shapes overlap in the file's posture or in "
+                f"every posture: {', '.join(left)}"
             )

@@ -74,7 +74,7 @@ class PhasedProblem(PicklesItsFields, ShowsItsRepr):
                 raise InputError("phases", got=type(phase).__name__, expected="Problems")
         least = 2 if self.periodic is False else 1
         if not least <= len(phases) <= MOST_PHASES:
-            expected = f"{least} to {MOST_PHASES}" + (": a Problem is one phase" if least == 2 else "")
+            expected = f"{least} to {MOST_PHASES} phases" + (" (one phase is a Problem)" if least == 2 else "")
             raise InputError("phases", got=f"{len(phases)}", expected=expected)
         names = [f"phase {i}" for i in range(len(phases))] if self.names is None else self.names
         if isinstance(names, str) or len(names) != len(phases) or len(set(names)) != len(names):
@@ -86,7 +86,7 @@ class PhasedProblem(PicklesItsFields, ShowsItsRepr):
         resets = [None] * (len(phases) - 1) if self.resets is None else self.resets
         if not isinstance(resets, (tuple, list)) or len(resets) != len(phases) - 1:
             got = f"{len(resets)}" if isinstance(resets, (tuple, list)) else type(resets).__name__
-            raise InputError("resets", got=got, expected=f"{len(phases) - 1}, one for each pair of neighbours")
+            raise InputError("resets", got=got, expected=f"{len(phases) - 1}, one for each pair of successive phases")
         self._set("resets", tuple(resets))
         if self.horizon is not None:
             self._set("horizon", self._check_horizon())
@@ -132,8 +132,8 @@ class PhasedProblem(PicklesItsFields, ShowsItsRepr):
         lower, upper = (positive_float("horizon [s]", value) for value in given)
         least, most = (sum(side) for side in zip(*(duration_of(phase) for phase in self.phases), strict=True))
         if not (lower <= upper and lower <= most and upper >= least):
-            got = f"[{lower:g}, {upper:g}], of phases that take {least:g} to {most:g} s"
-            raise InputError("horizon", got=got, expected="lower at most upper, and a duration that the phases allow")
+            got = f"[{lower:g}, {upper:g}] for phases of {least:g} to {most:g} s in total"
+            raise InputError("horizon", got=got, expected="lower <= upper and a duration that the phases allow")
         return lower, upper
 
 
@@ -211,7 +211,7 @@ def duration_of(problem: Problem) -> tuple[float, float]:
 
 def _check_phase(name: str, phase: Problem, is_map: bool) -> None:
     if phase.is_map != is_map:
-        raise InputError(name, got="a map among motions in time", expected="phases in time, or DiscreteMaps alone")
+        raise InputError(name, got="a mixture", expected="DiscreteMaps in all phases, or in none")
     if phase.parameters.parameters or phase.trajectory_cost is not None:
         raise InputError(
             f"{name}: parameters, trajectory_cost",
@@ -223,4 +223,4 @@ def _check_phase(name: str, phase: Problem, is_map: bool) -> None:
     free = phase.horizon is not None and phase.horizon[0] < phase.horizon[1]
     if free and isinstance(phase.running_cost, TimedCost):
         expected = "a running_cost that is constant in time, as the horizon is free"
-        raise InputError(f"{name}: running_cost", got="one that changes in time", expected=expected)
+        raise InputError(f"{name}: running_cost", got="a cost that changes in time", expected=expected)

@@ -60,7 +60,7 @@ class ContactSchedule(Goal):
 
     def _check(self) -> None:
         if not isinstance(self.phases, (list, tuple)) or not self.phases:
-            raise InputError("ContactSchedule.phases", got=repr(self.phases)[:80], expected="(steps, feet) of each")
+            raise InputError("ContactSchedule.phases", got=repr(self.phases)[:80], expected="(steps, feet) per phase")
         phases = tuple(_phase(phase) for phase in self.phases)
         named = tuple(dict.fromkeys(foot for _, standing in phases for foot in standing))
         feet = named if self.feet is None else tuple(name_of("ContactSchedule.feet", foot) for foot in self.feet)
@@ -202,7 +202,7 @@ class ContactSchedule(Goal):
             return
         worst = standing[np.argmax(over[standing])]
         if over[worst] > self.touch or np.min(over[standing]) >= 0:
-            got = f"{self.feet[worst]} {1e3 * over[worst]:.3g} mm over the ground"
+            got = f"{self.feet[worst]} at {1e3 * over[worst]:.3g} mm above the ground"
             expected = "standing feet that press into the ground; see ContactSchedule.standing"
             raise InputError("ContactSchedule: x0", got=got, expected=expected)
 

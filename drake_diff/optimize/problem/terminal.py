@@ -155,7 +155,7 @@ class TerminalSet(Goal):
 
     def bind_to(self, problem: Any) -> tuple[GoalConstraint, ...]:
         if problem.optimizes_parameters:
-            raise InputError("TerminalSet", got='"parameters" in optimize', expected="a model that does not change")
+            raise InputError("TerminalSet", got='"parameters" in optimize', expected="a model with constant parameters")
         region = self.region(problem.model, problem.bounds, problem.parameters)
         return (
             TerminalConstraint(
@@ -184,13 +184,13 @@ def _make_region(asked: TerminalSet, model: Model, bounds: Bounds) -> Region:
     if tangent_space(model).quaternions:
         raise ModelError("TerminalSet: expected a state without quaternions, as the set needs differences of states")
     if np.any((x_goal <= bounds.x_lower) | (x_goal >= bounds.x_upper)):
-        raise InputError("TerminalSet.x_goal", got=x_goal.tolist(), expected="a state within its bounds, not on one")
+        raise InputError("TerminalSet.x_goal", got=x_goal.tolist(), expected="a state strictly within its bounds")
     neutral = model.neutral_input(x_goal)
     d = differentiate_step(model, x_goal, neutral)
     u_goal = neutral + np.asarray(np.linalg.lstsq(d.B, x_goal - d.x_next, rcond=None)[0])
     if np.any((u_goal <= bounds.u_lower) | (u_goal >= bounds.u_upper)):
-        got = f"a state that is held by u = {u_goal.round(4).tolist()}"
-        raise InputError("TerminalSet.x_goal", got=got, expected="a fixed point of inputs within their limits")
+        got = f"a fixed point with u = {u_goal.round(4).tolist()}"
+        raise InputError("TerminalSet.x_goal", got=got, expected="a fixed point with inputs strictly within limits")
     Q = np.eye(model.nx) if asked.Q is None else finite_array("TerminalSet.Q", asked.Q, (model.nx, model.nx))
     R = np.eye(model.nu) if asked.R is None else finite_array("TerminalSet.R", asked.R, (model.nu, model.nu))
     regulator = LQR(model, x_goal, u_goal, Q, R)
@@ -198,7 +198,7 @@ def _make_region(asked: TerminalSet, model: Model, bounds: Bounds) -> Region:
     if np.min(np.linalg.eigvalsh(S)) <= 0:
         raise InputError(
             "TerminalSet.Q",
-            got="weights with a cost-to-go of 0",
+            got="a cost-to-go that is not positive definite",
             expected="weights with a positive definite cost-to-go",
         )
     most = linear_level(K, S, x_goal, u_goal, bounds, model.nq)
@@ -223,7 +223,7 @@ def _sampled(model: Model, region: Region, asked: TerminalSet) -> Region:
             in_a_row += 1
             continue
         value = float(region.value(x))
-        got = f"a state at {value:.2g} of the level that does not converge, {x.round(4).tolist()}"
+        got = f"no convergence from {x.round(4).tolist()}, at {value:.2g} of the level"
         level = min(LOWERED * level, WITHIN * value * level) if in_a_row < TRIED else WITHIN * level
         if asked.level is not None or level < 1e-12 * first:
             expected = f"a level up to {first:.3g} from which all random states converge"

@@ -112,7 +112,7 @@ class Rolling:
         policy = least_regularized(quadratic.unbounded())
         if policy is None:
             raise InputError(
-                "running_cost", got="no positive curvature by the inputs", expected="a cost with a minimum"
+                "running_cost", got="no positive curvature in the inputs", expected="a cost with a minimum"
             )
         ranges = problem.state_scales(xs)
         for side in (b.x_lower, b.x_upper):

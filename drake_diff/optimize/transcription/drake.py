@@ -140,7 +140,7 @@ def _solve_snopt(
     """
     engine, options = SnoptSolver(), solvers.SolverOptions()
     if not (engine.available() and engine.enabled()):
-        raise MissingDependencyError('SNOPT is not in this Drake: take Drake\'s wheel, or solver="ipopt"')
+        raise MissingDependencyError('this build of Drake has no SNOPT: install Drake\'s wheel, or use solver="ipopt"')
     with tempfile.TemporaryDirectory() as folder, noted_interrupts() as interrupted:
         watch, print_file = Watch(limits, interrupted), Path(folder) / "log"
         options.SetOption(solvers.CommonSolverOption.kPrintFileName, str(print_file))

@@ -34,7 +34,7 @@ NEAREST = 1e-5  # of max(1, |p|): a corner (a change of the active set) nearer t
 ROUNDED = 1e-7  # of the largest derivative of a kind: smaller ones count as 0
 SINGULAR, REFINEMENTS = 1e-10, 4  # diagonal entry for redundant rows, and refinements of its error
 DIFFERENCE = 1e-5  # of max(1, |p|): step of differences of exact first derivatives with respect to a model parameter
-FLAT = "the plan has no derivative: it is not the only optimum, as some change of it leaves the cost equal"
+FLAT = "the plan has no derivative: the optimum is not unique, as a change of the plan leaves the cost unchanged"
 Mask = NDArray[np.bool_]
 
 
