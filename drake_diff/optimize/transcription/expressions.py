@@ -10,10 +10,10 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.values import Refusal
 from drake_diff.mechanics.casadi_tree import PlantFunctions, symbolic_plant
 from drake_diff.mechanics.fixed_contacts import FixedContactPlant
+from drake_diff.mechanics.symbol import Mapped
 from drake_diff.optimize.knots import (
     Called,
     Linearize,
-    Mapped,
     PointFunction,
     Traced,
     Values,
