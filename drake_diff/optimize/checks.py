@@ -53,6 +53,8 @@ class Check:
         return self.value / self.tolerance if self.tolerance > 0 else math.inf
 
     def __str__(self) -> str:
+        if self.passes:
+            return f"pass: {self.what}, {self.where}: {self.value:.3g} {self.unit}, tolerance {self.tolerance:.3g}"
         return messages.clause(self)
 
 

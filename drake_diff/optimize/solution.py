@@ -504,7 +504,7 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         Collocation has another Lagrangian, that of its scheme, and its multipliers come from the solver.
         """
         if self.scheme != "step":
-            return Refusal("only discrete steps have it, as the Lagrangian of a collocation belongs to its scheme")
+            return Refusal("the plan has no discrete steps: the Lagrangian of a collocation belongs to its scheme")
         if not self._is_whole or not np.all(np.isfinite(self.xs)):
             return Refusal("the plan is not finite")
         try:

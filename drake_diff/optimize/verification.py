@@ -213,7 +213,9 @@ def limits_of(solution: Solution, restarts: int) -> Iterator[str]:
         free = [n for n, *sides in zip(problem.input_names, b.u_lower, b.u_upper, strict=True) if np.isinf(sides).any()]
         if isinstance(problem.running_cost, ConstantCost) and free:
             yield f"the least time of inputs without limits: {messages.joined(free)}"
-    if not restarts and NEAR not in solution.notes:
+    if problem.total_running_cost is None and problem.total_final_cost is None and problem.trajectory_cost is None:
+        yield "not an optimum: the problem has no cost"
+    elif not restarts and NEAR not in solution.notes:
         yield "a local optimum: no other first guess was tried (restarts=0)"
 
 
@@ -250,6 +252,8 @@ def _remedies(solution: Solution, arguments: dict[str, Any], other_methods: Sequ
         yield from (f'method="{method}"' for method in other_methods)
     if status is Status.NO_GRADIENT and touching:
         yield "an initial_guess in which the bodies touch"
+    elif solution.certificates and solution.certificates[0].verdict == "discontinuous":
+        yield "an x0 that is not exactly at a contact or joint limit"
     else:
         yield "another initial_guess"
 

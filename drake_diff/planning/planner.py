@@ -122,7 +122,7 @@ class Plan(ShowsItsRepr):
             f"solved    {s.method}, {len(s.us)} intervals in {s.horizon:.3g} s, cost {s.cost:.4g}{self._optima}",
             f"gradients {agreeing}",
             f"plan      {s.message}",
-            f"verified  {self.verification.verdict}: {self.verification.sentence[:200]}",
+            f"verify    {self.verification.verdict}: {self.verification.sentence[:200]}",
             f"wrote     {path}: {', '.join(self.record.file_names)}",
         )
 

@@ -28,7 +28,8 @@ def test_what_is_unknown_or_too_large_fails(value):
     assert [f.name for f in dataclasses.fields(c)] == FIELDS
     assert (c.plant, c.feedback, c.verdict, c.passes) == ("plan", None, "fail", False)
     assert c.ratio >= 2
-    assert check("goal", "hinge_q", 0.1, 0.1, "rad").passes
+    assert str(c).startswith("hinge_q ends ")
+    assert str(check("goal", "hinge_q", 0.1, 0.1, "rad")) == "pass: goal, hinge_q: 0.1 rad, tolerance 0.1"
 
 
 def test_checks_come_worst_first_and_print_as_a_table():
