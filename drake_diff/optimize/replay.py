@@ -63,6 +63,7 @@ OTHER_APPROXIMATION = {"sap": "lagged", "similar": "sap", "lagged": "sap", "tams
 FINE = 8  # parts of a step; at h/8 the O(h) error that remains is a seventh of the change from h to h/8
 # Largest numbers of steps in an interval. A hand that must be within 5 mm at 1 m/s needs steps of 5 ms.
 FINER, FINEST = 16, 64
+HOPELESS = 2.0  # extrapolated ratio of a value to its tolerance beyond which finer steps are not tried
 MOST_STEPS = 4000  # of a replay with more than FINER parts per interval
 ANOTHER_INTEGRATION, IN_CONTINUOUS_TIME = "by another integration in continuous time", "in continuous time"
 TOLERANCE = 1e-6  # of each step of the integration in continuous time; the motion is judged to 5 %
@@ -220,6 +221,8 @@ def replays(plan: ReplayPlan) -> tuple[Replay, ...]:
     if plan.continuous:
         most = finest_parts(plan)
         while parts < most and not (any(r.holds for r in rows[-2:]) and any(r.holds for r in rows[-4:-2])):
+            if parts >= FINE and _fails_in_the_limit(rows):
+                break
             parts *= 2
             rows += plan.follower(parts).in_steps()
         return tuple(rows)
@@ -234,6 +237,18 @@ def replays(plan: ReplayPlan) -> tuple[Replay, ...]:
         name = f"{name} in steps of {plan.time_step / FINE:.4g} s"
         tried += plan.follower().in_model(name, lambda: plan.model_at(FINE).with_contact(other), FINE)
     return (*rows, *tried)
+
+
+def _fails_in_the_limit(rows: Sequence[Replay]) -> bool:
+    """Return whether the plan fails under every controller in ever finer steps, by its last two variants.
+
+    The error of a replay is O(h), so that the worst ratio of a value to its tolerance tends to 2 r(h/2) - r(h).
+    """
+    coarse, fine = (
+        [max(c.ratio for c in r.checks) for r in rows if r.variant == variant]
+        for variant in list(dict.fromkeys(r.variant for r in rows))[-2:]
+    )
+    return all(np.isfinite(a) and 2 * b - a > HOPELESS for a, b in zip(coarse, fine, strict=True))
 
 
 def finest_parts(plan: ReplayPlan) -> int:

@@ -81,6 +81,7 @@ class Run:
     report: Report | None
     searched: Problem | None = None  # the problem to solve, if it differs from `problem`
     closest: bool = False  # whether any motion near the guess suffices, an optimum or not
+    convert: Callable[[Solution], Solution | None] | None = None  # see `solve._in_steps`
     start: float = field(default_factory=now)
     started: float = field(default_factory=time.monotonic)
     certified: dict[bytes, Certificate] = field(default_factory=dict)  # keyed by state, input and parameters
@@ -164,7 +165,8 @@ class Run:
         if motion.cleared:
             self.options["clearance_rounds"] = [list(row) for row in motion.cleared]
         solution = self._judge_collocated(transcription, motion, before)
-        return solution if refine is not None else self._refined(transcription, motion, solution, before)
+        is_final = refine is not None or solution.method != self.method
+        return solution if is_final else self._refined(transcription, motion, solution, before)
 
     def _certify_guess(self, transcription: Transcription, guesses: Sequence[Guess]) -> tuple[Certificate, ...]:
         """Certify the derivatives at the guess. For a problem in phases, only the result is certified."""
@@ -274,7 +276,12 @@ class Run:
         for plan, phase in zip(drafts, motion.phases, strict=True):
             if self.searched is None and plan.transcribed is not None:  # otherwise it was measured with another cost
                 plan.transcribed.measured_as(phase)
-        solution = self._judge(self._joined(drafts, certificates=links), result)
+        joined = self._joined(drafts, certificates=links)
+        if self.convert and error is None and result.outcome in FOUND and not joined.plan_checks.failing:
+            converted = self.convert(joined)
+            if converted is not None:
+                return converted
+        solution = self._judge(joined, result)
         if error is not None and solution.status in PLANS:
             return ended(solution, Status.NO_GRADIENT, str(error))
         return solution

@@ -37,6 +37,7 @@ DEFAULTS = Options()
 METHODS = ("auto", "collocation", "shooting", "ilqr")
 DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": "ipopt", "ilqr": "riccati"}
 OTHER_GUESS = "another first guess"
+CONVERTED = "the collocated plan in the model's own steps"
 REFINING = 30  # iterations from a collocated plan to the optimum in discrete steps; well-posed problems take ten
 NOT_FOUND = (Status.INFEASIBLE, Status.ITERATION_LIMIT, Status.DIVERGED, Status.FAILED)
 BLIND = (Status.NO_GRADIENT, Status.DIVERGED)
@@ -267,6 +268,7 @@ class _Task:
     report: Report
     on_start: Callable[[], None] | None
     start: float = field(default_factory=now)
+    converted: list[Solution] = field(default_factory=list)  # solutions in steps from collocated plans
 
     @property
     def is_late(self) -> bool:
@@ -279,8 +281,11 @@ class _Task:
         if on_start is not None:
             on_start()
 
-    def prepare(self, attempt: Attempt, given: Any) -> Callable[[], Any]:
-        """Check that `attempt` is possible from the guess `given`, and return a function that runs it."""
+    def prepare(self, attempt: Attempt, given: Any, convert: Any = None) -> Callable[[], Any]:
+        """Check that `attempt` is possible from the guess `given`, and return a function that runs it.
+
+        A collocated plan that passes its own checks goes to `convert`, whose solution replaces it.
+        """
         problem, method = self.problem, attempt.method
         scheme = _check_attempt(problem, attempt)
         guesses = first_guesses(problem, method, given, self.seed)
@@ -306,7 +311,9 @@ class _Task:
             options = {name: options[name] for name in ("initial_guess", "seed")}
         solver = attempt.options.solver or DEFAULT_SOLVERS[method]
         run = Run(
-            problem, method, scheme, solver, limits, attempt.options, options, self.report, searched, attempt.closest
+            *(problem, method, scheme, solver, limits, attempt.options, options, self.report, searched),
+            closest=attempt.closest,
+            convert=convert,
         )
 
         def make() -> Solution:
@@ -358,8 +365,19 @@ def _attempted(task: _Task, asked: Attempt, given: Any, chain: list[dict[str, st
         if solutions and task.is_late:
             chain.append({**attempt.told(in_phases), "ended": "not begun: time limit"})
             break
+        rows: list[dict[str, str]] = []
+
+        def convert(plan: Solution, rows: list[dict[str, str]] = rows) -> Solution | None:
+            """Solve in steps before the plan's replays and finer meshes, which take longer and are often not needed."""
+            if rows:
+                return None
+            _convert(task, _shooting(asked), plan, rows)
+            last = task.converted[-1] if task.converted else None
+            return last if last is not None and last.status in (Status.CONVERGED, Status.INTERRUPTED) else None
+
+        early = asked.method == "auto" and attempt.method == "collocation" and not in_phases
         try:
-            make = task.prepare(attempt, guess)
+            make = task.prepare(attempt, guess, convert if early and _has_steps(task.problem) else None)
         except DrakeDiffError as error:
             if not solutions:
                 raise
@@ -372,6 +390,7 @@ def _attempted(task: _Task, asked: Attempt, given: Any, chain: list[dict[str, st
         chain.append({**attempt.told(in_phases), "ended": last.status.value})
         if attempt.options.continuation is not None:
             chain[-1]["continuation"] = "auto"
+        chain += rows
         if last.status in ENDED:
             break
     return solutions
@@ -384,29 +403,44 @@ def _in_steps(task: _Task, asked: Attempt, plan: Solution, chain: list[dict[str,
     plan stays in continuous time if the problem has a horizon, if its jerk is limited (jerk jumps with a held input),
     or if the steps do not support the problem.
     """
-    problem = task.problem
-    has_steps = problem.has_model and problem.horizon is None and all(limit.of_inputs for limit in problem.rate_limits)
-    if not (plan.success and plan.transcribed is not None and has_steps):
+    if not (plan.success and plan.transcribed is not None and _has_steps(task.problem)):
         return plan
-    refined: list[Solution] = []
-    first = asked.by("shooting", "the collocated plan in the model's own steps")
+    first = _shooting(asked)
     nearest = "the motion in the model's own steps that is nearest to the collocated plan"
-    closest = replace(first, reason=nearest, closest=True, max_iterations=5 * REFINING)
-    attempts = [replace(a, max_iterations=REFINING) for a in (first, asked.by("ilqr", f"{first.reason}, by iLQR"))]
-    for attempt in [*(a for a in attempts if _is_possible(problem, a)), closest]:
-        try:
-            make = task.prepare(attempt, plan)
-        except DrakeDiffError as error:
-            chain.append({**attempt.told(False), "ended": f"not possible: {error}"})
-            continue
-        refined.append(near(plan, make()) if attempt.closest else make())
-        chain.append({**attempt.told(False), "ended": refined[-1].status.value})
-        task.report.say(f"shooting ({attempt.reason}): {refined[-1].status.value}")
-        if refined[-1].status in ENDED:
+    attempts = (
+        first,
+        replace(asked.by("ilqr", f"{CONVERTED}, by iLQR"), max_iterations=REFINING),
+        replace(first, reason=nearest, closest=True, max_iterations=5 * REFINING),
+    )
+    for attempt in attempts[1 if task.converted and "refinements" not in plan.options else 0 :]:
+        if task.converted and task.converted[-1].status in ENDED:
             break
-    if not refined:
+        if attempt.method == "shooting" or _is_possible(task.problem, attempt):
+            _convert(task, attempt, plan, chain)
+    if not task.converted:
         return plan.noted("in continuous time alone: no method takes the problem in the model's own steps")
-    return refined[-1] if refined[-1].success else not_in_steps(plan, refined[0])
+    return task.converted[-1] if task.converted[-1].success else not_in_steps(plan, task.converted[0])
+
+
+def _shooting(asked: Attempt) -> Attempt:
+    return replace(asked.by("shooting", CONVERTED), max_iterations=REFINING)
+
+
+def _has_steps(problem: Problem) -> bool:
+    return problem.has_model and problem.horizon is None and all(limit.of_inputs for limit in problem.rate_limits)
+
+
+def _convert(task: _Task, attempt: Attempt, plan: Solution, chain: list[dict[str, str]]) -> None:
+    """Run an attempt in the model's own steps from a collocated plan, and add its solution to `task.converted`."""
+    try:
+        make = task.prepare(attempt, plan)
+    except DrakeDiffError as error:
+        chain.append({**attempt.told(False), "ended": f"not possible: {error}"})
+        return
+    task.converted.append(near(plan, make()) if attempt.closest else make())
+    status = task.converted[-1].status.value
+    chain.append({**attempt.told(False), "ended": status})
+    task.report.say(f"{attempt.method} ({attempt.reason}): {status}")
 
 
 def _best_of(solutions: list[Solution]) -> Solution:

@@ -336,18 +336,19 @@ class Steps(PointFunction):
         return np.array([np.hstack([d.A, d.B, self.design.pull_back(c, d.C)]) for d in steps])
 
     def hessian(self, points: Array, weights: Array, jacobian: Array) -> Array:
-        """Return the analytic curvature if known, or differences of Jacobians, or a learned one if these are slow."""
+        """Return the analytic curvature of known steps; of others, differences of Jacobians, or learned if slow."""
         steps, xs, known = self.along(points), points[:, : self.rows], None
+        curvature, rest = np.zeros((*points.shape, self.width)), np.ones(len(points), dtype=bool)
         if not self.design.vector.parameters and self.problem.has_model:
             ends = np.array([d.x_next for d in steps])
             states = np.vstack([xs, ends[-1:]])
             known = curvature_along(self.problem, Motion(states, self._inputs(points), ends - states[1:]), weights)
-        if known is not None and known[1].all():
-            curvature = known[0]
-        elif self.lenient and not {d.method for d in steps} <= CHEAP:
-            curvature = self._learned(points, jacobian.reshape(len(points), self.rows, -1), weights)
-        else:
-            curvature = self._differences(points, weights)
+        if known is not None:
+            curvature[known[1]], rest = known[0], ~known[1]
+        if rest.any() and self.lenient and not {d.method for d in steps} <= CHEAP:
+            curvature[rest] = self._learned(points, jacobian.reshape(len(points), self.rows, -1), weights)[rest]
+        elif rest.any():
+            curvature[rest] = self._differences(points[rest], weights[rest])
         return np.asarray(curvature[:, *self.hessian_at])
 
     def _learned(self, points: Array, jacobians: Array, weights: Array) -> Array:
