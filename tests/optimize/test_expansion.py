@@ -10,6 +10,7 @@ from helpers.problems import pendulum
 import drake_diff as dd
 from drake_diff.derivatives import analytic
 from drake_diff.optimize.ilqr.expansion import Motion, curvature_along
+from drake_diff.optimize.transcription.steps import StepProgram
 
 
 def motion_of(problem, us):
@@ -108,6 +109,12 @@ def test_no_step_at_a_joint_limit_has_one(exact, monkeypatch):
     after = np.r_[xs[1:], xs[:1]]
     found, known = curvature_along(problem, Motion(np.r_[xs, xs[:1]], us, ends - after), v)
     assert known.tolist() == [True, False, False, True]
+    steps, counted, points = StepProgram(problem, lenient=True).steps, [], np.hstack([xs, us])
+    differences = steps._differences
+    steps._differences = lambda at, weights: counted.append(len(at)) or differences(at, weights)
+    upper = steps.hessian(points, v, steps.jacobian(points))
+    np.testing.assert_allclose(upper[known], found[:, *steps.hessian_at], rtol=1e-6, atol=1e-6 * np.abs(found).max())
+    assert counted == [2]  # only the steps at the stop
     for k, curvature in zip((0, 3), found, strict=True):
         expected = cart_poles_by_hand(0.04, xs[k], us[k], v[k])
         np.testing.assert_allclose(curvature, expected, rtol=0, atol=2e-5 * np.abs(expected).max())

@@ -13,12 +13,17 @@ import drake_diff as dd
 from drake_diff.model.parameters import select
 from drake_diff.motion import LQR
 from drake_diff.optimize import Options
+from drake_diff.optimize.checks import check
 from drake_diff.optimize.replay import (
+    FEEDBACK,
     FEEDBACK_TOLERANCE,
     GAINS_ALONE,
+    OPEN_LOOP,
     SAME,
     STATE_TOLERANCE,
+    Replay,
     ReplayPlan,
+    _fails_in_the_limit,
     deciding,
     energy_check,
     held,
@@ -413,3 +418,21 @@ def test_a_law_with_limits_of_rates_begins_each_motion_anew(write_urdf):
     first, *_, far = (law(np.array([-9.0 * k, 0.0]), k * H) for k in range(6))
     assert far[0] - first[0] == pytest.approx(5 * H)
     assert law(np.zeros(2), 0.0) == first
+
+
+@each_row(
+    "coarse, fine, fails",
+    [
+        ((5.0, 9.0), (4.9, 9.1), True),
+        ((5.0, 9.0), (3.4, 9.1), False),  # open loop, 2 * 3.4 - 5 is 1.8: finer steps may pass
+        ((5.0, 0.9), (4.9, 0.8), False),  # TVLQR passes
+        ((math.inf, 9.0), (math.inf, 9.1), False),  # a replay that broke off says nothing of finer steps
+    ],
+)
+def test_finer_steps_are_not_tried_if_the_extrapolated_error_is_too_large(coarse, fine, fails):
+    rows = [
+        Replay(variant, control, h, "sap", None, (check("goal", "a", ratio, 1.0),))
+        for variant, h, ratios in (("in steps of 1 s", 1.0, coarse), ("in steps of 0.5 s", 0.5, fine))
+        for control, ratio in zip((OPEN_LOOP, FEEDBACK), ratios, strict=True)
+    ]
+    assert _fails_in_the_limit(rows) == fails

@@ -267,8 +267,8 @@ def test_auto_goes_on_from_what_a_failed_attempt_left(load, monkeypatch):
     problem = pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0])
     solution = dd.solve(problem, options=Options(other_guesses=0))
     assert solution.success, solution.message
-    assert [link["method"] for link in solution.options["chain"]] == ["collocation", "ilqr"]
-    assert solution.options["chain"][1]["reason"] == "collocation was not verified: a guess for it"
+    assert [link["method"] for link in solution.options["chain"]] == ["collocation", "shooting", "ilqr"]
+    assert solution.options["chain"][2]["reason"] == "collocation was not verified: a guess for it"
     assert solution.options["chain"][0]["ended"] == "infeasible"
 
 
