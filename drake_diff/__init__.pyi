@@ -13,8 +13,8 @@ from .derivatives.step import linearize as linearize
 from .identification.explain import explain as explain
 from .identification.identify import identify as identify
 from .mechanics import quantities as quantities
-from .model.example import example_model as example_model
 from .model.model import Model as Model
+from .model.model import example_model as example_model
 from .model.model import load_model as load_model
 from .model.model import model_from_diagram as model_from_diagram
 from .model.parameters import list_parameters as list_parameters

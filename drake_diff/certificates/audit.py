@@ -34,7 +34,7 @@ from drake_diff.exceptions import DrakeDiffError, ModelError, SimulationError
 from drake_diff.model.contact_geometry import collision_geometries
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import IDENTITY_OFFSET
-from drake_diff.model.plant import FLOATING, actuators, bodies, instances, joints
+from drake_diff.model.plant import FLOATING, actuators, bodies, central_inertia, instances, joints
 from drake_diff.model.step import advance, check_point, set_state
 
 AT_LIMIT = 1e-6  # [m or rad] distance to a joint limit within which the joint counts as at the limit
@@ -67,7 +67,7 @@ def audit(model: Model, x: ArrayLike | None = None, u: ArrayLike | None = None) 
     Example:
         >>> model = dd.load_model("models/cart_pole.urdf", time_step=0.01)
         >>> dd.audit(model, [0, 0, 0, 0], [50.0])[0]
-        error saturated_effort (force): its effort is at the limit 20 (u is 50), where the derivative by u is exactly 0
+        error saturated_effort (force): at the effort limit 20 (u is 50), the derivative with respect to u is exactly 0
           -> stay inside the limit (the bounds of a Problem do), or raise it in the file
     """
     x = model.default_state if x is None else x
@@ -85,8 +85,8 @@ Found = Iterator[Finding]
 
 def _no_step(point: Point) -> Found:
     if point.step_error is not None:
-        remedy = "choose x and u that `step` can take; if it names contact, see the finding pair_refused"
-        yield Finding("error", "no_step", "step", f"the double step fails here: {short(point.step_error)}", remedy)
+        remedy = "choose x and u for which `step` succeeds; if the error names contact, see finding pair_refused"
+        yield Finding("error", "no_step", "step", f"the step fails at x and u: {short(point.step_error)}", remedy)
 
 
 def _pd_gains(point: Point) -> Found:
@@ -114,8 +114,8 @@ def _identity_frame(point: Point) -> Found:
     names = [name for name, frame in offsets if frame.GetFixedPoseInBodyFrame().IsExactlyIdentity()]
     if names:
         message = (
-            "the joint's frame on its parent is exactly the identity, for which Drake drops the derivative by the "
-            f"joint's offset; drake_diff moves the frame by {IDENTITY_OFFSET:g} m to keep this derivative"
+            "the joint's frame on its parent is exactly the identity, so Drake drops the derivative with respect "
+            f"to the joint's offset; drake_diff moves the frame by {IDENTITY_OFFSET:g} m to keep this derivative"
         )
         remedy = "no action is needed in drake_diff; add the same offset in your own AutoDiffXd code"
         yield Finding("info", "identity_frame", ", ".join(names), message, remedy)
@@ -152,7 +152,7 @@ def _saturated_effort(point: Point) -> Found:
         if abs(effort) >= limit:
             corner = abs(u) == limit and not actuator.has_controller()
             slope = "one-sided: 0 beyond the limit" if corner else "exactly 0"
-            message = f"its effort is at the limit {limit:g} (u is {u:.6g}), where the derivative by u is {slope}"
+            message = f"at the effort limit {limit:g} (u is {u:.6g}), the derivative with respect to u is {slope}"
             yield Finding("error", "saturated_effort", actuator.name(), message, remedy)
         elif abs(rest) > limit:
             message = f"an effort of {rest:.6g} would hold x at rest (without contact), but the limit is {limit:g}"
@@ -186,7 +186,7 @@ def _jacobian(point: Point) -> Found:
     if isinstance(result, ModelError | SimulationError):
         result = point.differentiate("finite_difference")
     if isinstance(result, DrakeDiffError):
-        remedy = "move x off the singular pose; `certify` shows which entry is wrong, `smooth_step` averages over it"
+        remedy = "move x off the singular pose; `certify` shows the wrong entry, `smooth_step` averages nearby states"
         yield Finding("error", "gradient_refused", "step", str(result), remedy)
         return
     jacobian = np.abs(np.hstack([result.A, result.B]))
@@ -196,8 +196,8 @@ def _jacobian(point: Point) -> Found:
         entry = f"d {names[row]} / d {(*names, *point.model.input_names)[column]}"
         message = f"{entry} is {jacobian[row, column]:.3g} (by {result.method}), {count} entries are above {HUGE:g}"
         remedy = (
-            "contact_approximation sap has the tamest Jacobians; otherwise a shorter time step, softer contact or a "
-            "longer relaxation time, lighter inertia ratios, or `smooth_step`"
+            'contact_approximation="sap" gives the smallest Jacobians; otherwise use a shorter time step, softer '
+            "contact, a longer relaxation time, smaller ratios of inertia, or `smooth_step`"
         )
         yield Finding("warning", "huge_jacobian", entry, message, remedy)
 
@@ -218,11 +218,11 @@ def _constraints(point: Point) -> Found:
     plant, context = point.model.plant, point.model.double.context
     if point.model.num_constraints:
         message = f"the plant has constraints ({plant.num_constraints()}), which the implicit method does not support"
-        remedy = "no action is needed: method auto uses autodiff; `certify` a state, as a few kinds lack AutoDiffXd"
+        remedy = "no action is needed: method auto uses autodiff; `certify` a state, as AutoDiffXd lacks a few kinds"
         yield Finding("info", "constraints", "plant", message, remedy)
     if locked := [joint.name() for joint in joints(plant) if joint.is_locked(context)]:
         message = (
-            "the lock exists only in the double context, not in the AutoDiffXd twin, so that its derivative is refused"
+            "the joint is locked in the context for double, but not for AutoDiffXd, so that the derivative is refused"
         )
         remedy = "weld it in the plant instead (WeldFrames), or joint.Unlock(model.double.context)"
         yield Finding("info", "locked_joint", ", ".join(locked), message, remedy)
@@ -240,7 +240,7 @@ def _undriven(point: Point) -> Found:
         names, all_joints = listed(row.name for row in undriven), {"actuators": "all"}
         yield Finding("warning", "no_actuator", names, message, remedy, all_joints)
     elif meant:
-        message = f"{len(meant)} joints have an effort limit in the file and no actuator; {driven} others have one"
+        message = f"{len(meant)} joints have an effort limit in the file but no actuator; {driven} others have one"
         yield Finding("info", "undriven", listed(meant), message, remedy, {"actuators": meant})
 
 
@@ -251,14 +251,14 @@ def _left_out_actuators(point: Point) -> Found:
         match = re.match(r"(\d+ actuators left out)[^:]*: (.*)\.$", note)
         if match and (missing or others):
             message = f"{match[1]}, of kinds or transmissions that Drake does not read: {match[2]}"
-            remedy = "drive joints with a torque, load_model(..., actuators=), or write the file with motors"
+            remedy = "drive the joints by efforts with load_model(..., actuators=), or use motors in the file"
             arguments = {"actuators": missing} if missing and not others else {}
             yield Finding("warning", "left_out", "actuators", message, remedy, arguments)
 
 
 def _switched_off(point: Point) -> Found:
     off, gravity = point.model.file_facts.disabled, point.model.plant.gravity_field().gravity_vector()
-    message = "the file disables it, but Drake simulates it"
+    message = "the file disables this effect, but Drake simulates it"
     if off & {"contact", "constraint"} and point.pairs:
         remedy = "load_model(..., contact=False)"
         yield Finding("warning", "switched_off", "contact", message, remedy, {"contact": False})
@@ -272,7 +272,7 @@ def _massless(point: Point) -> Found:
     for base in sorted(plant.GetFloatingBaseBodies()):
         welded = plant.GetBodiesWeldedTo(plant.get_body(base))
         if sum(body.default_mass() for body in welded) == 0:
-            message = "it floats and has no mass, so that the step is singular"
+            message = "the body floats and has no mass, so that the step is singular"
             carries = any(joint.num_velocities() and joint.parent_body() in welded for joint in joints(plant))
             remedy = 'load_model(..., base="weld") if it is fixed to the world, else ' if carries else ""
             remedy, arguments = f"{remedy}give it a mass in the file", {"base": "weld"} if carries else {}
@@ -281,7 +281,7 @@ def _massless(point: Point) -> Found:
     mass = np.diag(plant.CalcMassMatrix(point.model.double.context))
     light = [row.name for row in point.joints if mass[row.joint.velocity_start()] < NO_MASS]
     if light:
-        message = "the bodies that they move have no mass and no inertia, so that the step is singular"
+        message = "these joints move no mass and no inertia, so that the step is singular"
         fixed = _fixed(point, light)
         remedy = "load_model(..., fix_joints=) fixes them, or give the links a mass in the file"
         remedy = remedy if fixed else "give the links a mass in the file"
@@ -296,7 +296,7 @@ def _fixed(point: Point, names: list[str]) -> dict[str, Any]:
 def _skipped_meshes(point: Point) -> Found:
     for note in point.model.notes:
         if re.search(r"\bmeshes skipped", note):
-            remedy = 'load_model(..., meshes="convex") or "spheres" takes collision meshes; packages= says where'
+            remedy = 'load_model(..., meshes="convex") or "spheres" uses collision meshes; packages= gives folders'
             summary = note.split(":")[0].split("; ")[0]
             arguments = {"meshes": "spheres"} if SKIPPED.match(note) else {}
             severity: Severity = "warning" if "collision" in note else "info"
@@ -350,22 +350,19 @@ def _falls(point: Point) -> Found:
 
 
 def _invented_inertia(point: Point) -> Found:
-    plant = point.model.plant
-    fixed = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
-    kinds: dict[tuple[Severity, str], list[str]] = {}
+    plant, kinds = point.model.plant, dict[tuple[Severity, str], list[str]]()
     for body in bodies(plant):
         says = point.link_says(body)
-        if says is not None and int(body.index()) not in fixed and (kind := _invention(body, says)):
+        if says is not None and not plant.IsAnchored(body) and (kind := _invention(body, says)):
             kinds.setdefault(kind, []).append(body.name())
     for (severity, message), names in kinds.items():
-        remedy = "give a mass above 0, and an inertia whose moments each are at most the sum of the other two"
+        remedy = "give a mass above 0, and an inertia whose principal moments satisfy the triangle inequality"
         yield Finding(severity, "invented_inertia", listed(names), message, remedy)
 
 
 def _invention(body: Any, says: Any) -> tuple[Severity, str] | None:
     inertia = body.default_spatial_inertia()
-    mass, about_center = inertia.get_mass(), inertia.Shift(inertia.get_com()).CalcRotationalInertia()
-    trace = float(np.trace(about_center.CopyToFullMatrix3()))
+    mass, trace = inertia.get_mass(), sum(central_inertia(inertia)[:3])
     if says.mass is None and says.defaults:
         return "warning", "the file gives no mass, so that the format's default of 1 kg applies"
     if says.mass is not None and not np.isclose(mass, says.mass, rtol=SAME_MASS, atol=0):
@@ -378,7 +375,7 @@ def _invention(body: Any, says: Any) -> tuple[Severity, str] | None:
     if says.trace is not None and not np.isclose(trace, says.trace, rtol=SAME_MASS, atol=1e-12):
         return (
             "warning",
-            "the file's inertia is impossible for a body; Drake uses that of a ball of water of the same mass",
+            "the file's inertia is not physically valid; Drake uses the inertia of a ball of water of the same mass",
         )
     return None
 
@@ -393,7 +390,7 @@ def _ignored(point: Point) -> Found:
     for kind, count in kinds.items():
         quoted = re.search(r"'([^']+)'", kind)
         severity: Severity = "info" if any(word in kind for word in HARMLESS) else "warning"
-        message = f"Drake does not read it ({count} times in the file): {kind}"
+        message = f"Drake does not read this part of the file ({count} times): {kind}"
         remedy = "no action if it does not matter; else use an element that Drake reads, or change the plant"
         yield Finding(severity, "ignored", quoted[1] if quoted else "file", message, remedy)
 
@@ -410,7 +407,7 @@ def _zero_limits(point: Point) -> Found:
             kinds.setdefault((f"the position limits are both {low:g}", mended), []).append(row.name)
     for (kind, mended), names in kinds.items():
         arguments = _fixed(point, names)
-        remedy = "load_model(..., fix_joints=) fixes such joints there" if arguments else "give it limits in the file"
+        remedy = "load_model(..., fix_joints=) fixes these joints" if arguments else "give it limits in the file"
         if mended == "actuators":
             arguments = {"actuators": names}
             remedy = "load_model(..., actuators=) removes limits of 0 of the joints that it drives; or fix_joints="

@@ -22,6 +22,7 @@ from drake_diff.exceptions import CertificateError, GradientError, InputError, S
 from drake_diff.model.contact import Pair
 
 VERDICTS = ("agree", "undecided", "not_converged", "disagree", "discontinuous")  # from best to worst
+NUMBERS = ("derivative", "difference", "tolerance", "noticeable", "size")
 
 
 @dataclass(frozen=True)
@@ -109,10 +110,8 @@ def judge(
     reasons = _beside(around, a, gap, codes)
     reasons |= _stairs(around, size) | _broken(around, a, difference, size)
     if beside is not None:
-        jittery = np.argwhere(_jittery(around, a, beside)).tolist()
-        reasons = {
-            (i, j): f"at a distance of 1e-9 from the point the derivative is {beside[i, j]:.6g}" for i, j in jittery
-        } | reasons
+        for i, j in np.argwhere(_jittery(around, a, beside)).tolist():
+            reasons.setdefault((i, j), f"at a distance of 1e-9 from the point the derivative is {beside[i, j]:.6g}")
     for entry in reasons:
         codes[entry] = DISCONTINUOUS
     return Judgement(difference, tolerance, noticeable, size, codes, reasons)
@@ -377,10 +376,9 @@ class Certificate(ShowsItsRepr):
 
     def entry(self, row: int, column: int) -> Entry:
         """Return the entry at (`row`, `column`)."""
-        numbers = (self.derivative, self.difference, self.tolerance, self.noticeable)
-        a, d, t, n = (float(values[row, column]) for values in numbers)
+        numbers = {name: float(getattr(self, name)[row, column]) for name in NUMBERS[:4]}
         verdict, reason = VERDICTS[self.codes[row, column]], self.reasons.get((row, column), "")
-        return Entry(self.rows[row], self.columns[column], a, d, t, n, verdict, reason)
+        return Entry(self.rows[row], self.columns[column], **numbers, verdict=verdict, reason=reason)
 
     def of(self, derivative: ArrayLike) -> Certificate:
         """Return the certificate of another `derivative` (m, n) at this point, from the same differences."""
@@ -539,13 +537,9 @@ def certificate_of(
     return Certificate(**numbers, codes=by.codes, reasons=by.reasons, **more, **named)
 
 
-def unscaled(
-    scale: Array, derivative: Array, difference: Array, tolerance: Array, noticeable: Array, size: Array
-) -> dict[str, Any]:
-    """Convert the numbers (m, n) of a certificate from scaled displacements to the units of its columns."""
-    numbers = {"derivative": derivative, "difference": difference, "tolerance": tolerance}
-    numbers |= {"noticeable": noticeable, "size": size}
-    return {name: frozen(values / scale) for name, values in numbers.items()}
+def unscaled(scale: Array, *numbers: Array) -> dict[str, Any]:
+    """Convert the NUMBERS (m, n) of a certificate from scaled displacements to the units of its columns."""
+    return {name: frozen(values / scale) for name, values in zip(NUMBERS, numbers, strict=True)}
 
 
 def jitter(scale: Array) -> Array:

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from drake_diff._base.arrays import Array
 from drake_diff.certificates.finding import PARALLEL, Collider, ColliderPair, Finding, Point, Severity, listed
 from drake_diff.exceptions import DrakeDiffError, ModelError, SimulationError
 from drake_diff.model.contact_geometry import MEETS_A_SPHERE, inseparable_pairs, links_of
-from drake_diff.model.plant import PROXIMITY, bodies, joints
+from drake_diff.model.plant import PROXIMITY, joints
 from drake_diff.model.step import set_state
 
 
@@ -84,7 +85,7 @@ def _refusal(point: Point, pairs: list[ColliderPair]) -> str:
     names, error = " against ".join(", ".join(side) for side in sides), point.by_autodiff
     why = "AutoDiffXd has no point contact between these shapes, and throws once their bounding boxes meet"
     if any(pair.contact == "none" for pair in pairs):
-        why = "hydroelastic contact alone needs properties on both, one of them not rigid; the double step throws too"
+        why = "hydroelastic contact requires properties of both shapes, one compliant; the double step throws too"
     if any("HalfSpace" in pair.kinds for pair in pairs):
         why += ", and the bounding box of a tilted half space is infinite, so that the step throws without contact"
     if not isinstance(error, SimulationError):
@@ -105,13 +106,13 @@ def aligned_faces(point: Point) -> Iterator[Finding]:
         if angle is None:
             continue
         severity: Severity = "info"
-        consequence = "the hydroelastic step would jump if the faces came to lie flat"
+        consequence = "the hydroelastic step would jump if the faces became parallel"
         if angle <= PARALLEL and gap <= OPTIONS.reach:
             severity = "error"
             consequence = "the hydroelastic step jumps there, and AutoDiffXd gives a finite, plausible, wrong number"
         elif angle <= OPTIONS.nearly_parallel:
             severity, consequence = "warning", "the hydroelastic step jumps if the faces meet at this angle"
-        message = f"faces {angle:.2g} rad from parallel at x, {gap:.3g} m apart: {consequence}"
+        message = f"the faces are {angle:.2g} rad from parallel at x and {gap:.3g} m apart: {consequence}"
         arguments = {} if severity == "info" else {"contact_model": "point", "contact_geometry": "corner_spheres"}
         yield Finding(severity, "aligned_faces", pair.label, message, remedy, arguments)
 
@@ -122,12 +123,12 @@ def _alignment(pair: ColliderPair) -> tuple[float | None, float]:
     The gap is negative if the bounding boxes overlap. Drake's mesh of a round shape counts as flat if its centre lies
     in a plane of symmetry of a box's mesh, or in a plane of symmetry through the axis of a cylinder's mesh.
     """
-    for first, other in ((pair.a, pair.b), (pair.b, pair.a)):
+    for first, other in pair.both_orders:
         if first.kind in ROUND and other.kind in ("Box", "Cylinder"):
             offset = other.pose.inverse() @ first.pose.translation()
             if np.min(np.abs(offset[: 3 if other.kind == "Box" else 2])) > OPTIONS.in_plane:
                 return None, np.inf
-    faces = [(n, m) for n in _normals(pair.a, pair.b) for m in _normals(pair.b, pair.a)]
+    faces = list(product(*(_normals(*both) for both in pair.both_orders)))
     if not faces:
         return None, np.inf
     gaps = []
@@ -149,14 +150,14 @@ def _normals(collider: Collider, other: Collider) -> list[Array]:
 def spheres_on_axes(point: Point) -> Iterator[Finding]:
     """Find spheres on a cylinder's axis, where AutoDiffXd is singular."""
     distances: dict[str, float] = {}  # [m]
-    for pair in point.pairs:
-        both = pair.in_order("Sphere", "Cylinder")
-        if both is not None and pair.contact == "point":
-            offset = both[0].pose.translation() - both[1].pose.translation()
-            distances[pair.label] = float(np.linalg.norm(np.cross(both[1].axis(2), offset)))
+    for pair in (pair for pair in point.pairs if pair.contact == "point"):
+        for first, other in pair.both_orders:
+            if (first.kind, other.kind) == ("Sphere", "Cylinder"):
+                offset = first.pose.translation() - other.pose.translation()
+                distances[pair.label] = float(np.linalg.norm(np.cross(other.axis(2), offset)))
     consequences: dict[bool, tuple[Severity, str]] = {
-        True: ("error", "if they touch AutoDiffXd is singular on it (NaN, or a plausible wrong number)"),
-        False: ("info", "exactly on it AutoDiffXd would be singular"),
+        True: ("error", "AutoDiffXd is singular on the axis in contact (NaN, or a plausible wrong number)"),
+        False: ("info", "AutoDiffXd would be singular exactly on the axis"),
     }
     for on_axis, (severity, consequence) in consequences.items():
         labels = [label for label, distance in distances.items() if (distance < OPTIONS.on_axis) == on_axis]
@@ -201,8 +202,8 @@ def unread_compliance(point: Point) -> Iterator[Finding]:
     given, read = ("dissipation", "relaxation_time") if point.is_sap else ("relaxation_time", "dissipation")
     names = [collider.label for collider in point.colliders if collider.has(given) and not collider.has(read)]
     if names:
-        by, other = ("sap", "similar") if point.is_sap else ("similar and lagged", "sap")
-        message = f"{PROXIMITY[given][1]} is set, but {by} read {PROXIMITY[read][1]}, which is not set"
+        by, other = ("sap reads", "similar") if point.is_sap else ("similar and lagged read", "sap")
+        message = f"{PROXIMITY[given][1]} is set, but {by} {PROXIMITY[read][1]}, which is not set"
         remedy = f'set drake:{PROXIMITY[read][1]} too, or load_model(..., contact_approximation="{other}")'
         yield Finding("warning", "unread_compliance", listed(names), message, remedy, {"contact_approximation": other})
 
@@ -224,7 +225,7 @@ def pairs_at_touch(point: Point) -> Iterator[Finding]:
             yield Finding("warning", "touching", pair.label, message, remedy)
     if unmeasured:
         message = (
-            "Drake computes no distance between these shapes, so that the audit cannot say whether they just touch"
+            "Drake computes no distance between these shapes, so that the audit cannot check whether they just touch"
         )
         remedy = "compare the steps from x and from x moved by 1e-6 m, or replace one shape by spheres (corner_spheres)"
         yield Finding("info", "not_measured", ", ".join(unmeasured), message, remedy)
@@ -244,7 +245,7 @@ def inseparable(point: Point) -> Iterator[Finding]:
             f"the links overlap at all joint positions (pairs of shapes: {len(pairs)}) and push each other apart in "
             "every step; in a deep overlap Drake's contact point jumps and has no derivative"
         )
-        remedy = 'load_model(..., contact="separable") lets these pairs alone pass through each other'
+        remedy = 'load_model(..., contact="separable") lets only these pairs pass through each other'
         subject = links_of(model.plant, model.double.scene_graph, pairs)
         yield Finding("warning", "never_apart", subject, message, remedy, {"contact": "separable"})
 
@@ -252,19 +253,17 @@ def inseparable(point: Point) -> Iterator[Finding]:
 def corners_on_both_sides(point: Point) -> Iterator[Finding]:
     """Find two kinematic trees that can only touch at the spheres in their corners."""
     plant = point.model.plant
-    fixed = {body.name() for body in plant.GetBodiesWeldedTo(plant.world_body())}
-    above = {joint.child_body().name(): joint.parent_body().name() for joint in joints(plant)}
+    above = {joint.child_body().name(): joint.parent_body() for joint in joints(plant)}
 
     def root(name: str) -> str:
-        while name in above and above[name] not in fixed:
-            name = above[name]
+        while name in above and not plant.IsAnchored(above[name]):
+            name = above[name].name()
         return name
 
-    roots = {body.name(): root(body.name()) for body in [plant.world_body(), *bodies(plant)]}
     links = [
         " - ".join(sorted(pair.bodies))
         for pair in point.pairs
-        if CORNER.search(pair.a.label) and CORNER.search(pair.b.label) and roots[pair.a.body] != roots[pair.b.body]
+        if CORNER.search(pair.a.label) and CORNER.search(pair.b.label) and root(pair.a.body) != root(pair.b.body)
     ]
     if links:
         message = (
@@ -272,6 +271,6 @@ def corners_on_both_sides(point: Point) -> Iterator[Finding]:
         )
         remedy = (
             'contact_geometry="hydroelastic" with contact_model="hydroelastic_with_fallback", or "differences"; or '
-            "cover the face of one of them that touches with spheres, in the file"
+            "cover the touching face of one link with spheres in the file"
         )
         yield Finding("warning", "corners_miss", listed(links), message, remedy, {"contact_geometry": "differences"})

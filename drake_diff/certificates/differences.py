@@ -176,16 +176,12 @@ def _stairs(
     for k in range(1, len(DIFFERENCES.spacings) if len(slope) else 0):
         finest = np.maximum(scatter[:, 0].max(axis=0), rounding[:, k].max(axis=0)) + TINY
         values = 2 * rounding[:, k].max(axis=0) / DIFFERENCES.last_place
-        least, both = (
-            np.maximum(np.maximum(DIFFERENCES.significant * finest, unsolved), DIFFERENCES.visible * values),
-            scatter[:, k].min(axis=0),
-        )
+        least = np.maximum(np.maximum(DIFFERENCES.significant * finest, unsolved), DIFFERENCES.visible * values)
+        both, spacing = scatter[:, k].min(axis=0), DIFFERENCES.spacings[k]
         # At spacings at which several contacts may start, only a function that is flat between jumps is a staircase.
-        if DIFFERENCES.spacings[k] > DIFFERENCES.fine:
+        if spacing > DIFFERENCES.fine:
             risen = np.abs(along[:, k]).max(axis=(0, 1))
-            both = np.where(
-                np.abs(slope) * DIFFERENCES.values * DIFFERENCES.spacings[k] <= DIFFERENCES.flat * risen, both, 0.0
-            )
+            both[~(np.abs(slope) * DIFFERENCES.values * spacing <= DIFFERENCES.flat * risen)] = 0.0
         row = int(np.argmax(both / finest))
         if row in reasons or not both[row] > least[row]:
             continue
@@ -206,10 +202,7 @@ def _jumps(
     along_line: Callable[[Array], Array], row: int, sign: int, k: int, values: Array, slope: float, least: float
 ) -> list[tuple[float, float]]:
     """Return up to three jumps of a row and their places, each found by bisection between two of `values` (k,)."""
-    places, heights = (
-        sign * DIFFERENCES.spacings[k] * np.arange(DIFFERENCES.values + 1),
-        np.concatenate([[0.0], values]),
-    )
+    places, heights = sign * DIFFERENCES.spacings[k] * np.arange(DIFFERENCES.values + 1), np.append(0.0, values)
     off = np.abs(np.diff(heights) - slope * np.diff(places))
     jumps: list[tuple[float, float]] = []
     for i in np.argsort(-off, kind="stable")[: DIFFERENCES.stairs]:

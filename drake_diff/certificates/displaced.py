@@ -274,15 +274,6 @@ class _Copier(cloudpickle.Pickler):  # type: ignore[misc]  # cloudpickle has no 
         return len(self.shared) - 1
 
 
-class _Restorer(pickle.Unpickler):
-    def __init__(self, file: BytesIO, shared: list[Any]):
-        super().__init__(file)
-        self.shared = shared
-
-    def persistent_load(self, number: Any) -> Any:
-        return self.shared[number]
-
-
 def fresh(policy: Any) -> Any:
     """Copy `policy` with its memory: containers, arrays and closures are copied at any depth.
 
@@ -292,7 +283,9 @@ def fresh(policy: Any) -> Any:
     copier = _Copier(file)
     copier.dump(policy)
     file.seek(0)
-    return _Restorer(file, copier.shared).load()
+    restorer = pickle.Unpickler(file)
+    restorer.persistent_load = copier.shared.__getitem__  # type: ignore[method-assign]
+    return restorer.load()
 
 
 def with_parameters(policy: Any, parameters: Array) -> Any:
@@ -341,8 +334,9 @@ def wrong_derivative(policy: Any, space: TangentSpace, g: RolloutGradient, time_
             i, j = np.unravel_index(int(np.argmax(gap)), gap.shape)
             unit = np.concatenate([np.ones(space.size), scale])[j]
             return (
-                f"the policy's derivative is wrong: at t = {t:g} s the derivative of u[{i}] by {columns[j]} is "
-                f"{stated[i, j] / unit:.6g}, and differences of the policy give {quotients[-1][i, j] / unit:.6g}"
+                f"the policy's derivative is wrong: at t = {t:g} s the derivative of u[{i}] with respect to "
+                f"{columns[j]} is {stated[i, j] / unit:.6g}, and differences of the policy give "
+                f"{quotients[-1][i, j] / unit:.6g}"
             )
     return ""
 
@@ -417,7 +411,7 @@ class _PolicyProbe:
             for sign in (1.0, -1.0) if reach > ASK.moves * np.max(np.abs(xs)) else ():
                 k, way = int(np.argmax(sign * offsets[:, i])), np.zeros(self.space.size + len(none))
                 way[i] = sign * reach
-                yield self._switch(k, way, f"{name} by {sign * reach:.3g}")
+                yield self._switch(k, way, f"along {name} by {sign * reach:.3g}")
 
     def _staircase(self, k: int, way: Array, name: str, lengths: Sequence[float] = LENGTHS) -> str:
         jump = _stairs(self._along(k, way), self._least(k), lengths)
@@ -429,7 +423,7 @@ class _PolicyProbe:
         with np.errstate(all="ignore"), suppress(*OUTSIDE):
             jumps = _jumps(self._along(k, way), np.linspace(0.0, 1.0, ASK.cells // 2 + 1), least)
             if jumps:
-                return f"the policy jumps: {self._jump_text(k, way, jumps[0])} on the way from this state {name}"
+                return f"the policy jumps: {self._jump_text(k, way, jumps[0])} on the line from this state {name}"
         return ""
 
     def _jump_text(self, k: int, way: Array, jump: Jump) -> str:

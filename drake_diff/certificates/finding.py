@@ -15,7 +15,7 @@ from drake_diff.derivatives.step import StepDerivatives, differentiate_step
 from drake_diff.exceptions import DrakeDiffError, GradientError, ModelError, SimulationError
 from drake_diff.model.contact_geometry import autodiff_supports
 from drake_diff.model.model import Model
-from drake_diff.model.plant import PROXIMITY, actuators, joints, labelled
+from drake_diff.model.plant import PROXIMITY, actuators, joints, key_of, labelled
 from drake_diff.model.repairs import can_be_driven
 from drake_diff.model.step import advance, set_state
 
@@ -143,12 +143,9 @@ class ColliderPair:
     def refused(self) -> bool:
         return self.contact == "none" or not autodiff_supports(self.a.shape, self.b.shape, self.contact)
 
-    def in_order(self, first: str, other: str) -> tuple[Collider, Collider] | None:
-        """Return the two colliders in the order of the given kinds, or None if the kinds differ."""
-        for a, b in ((self.a, self.b), (self.b, self.a)):
-            if a.kind == first and b.kind == other:
-                return a, b
-        return None
+    @property
+    def both_orders(self) -> tuple[tuple[Collider, Collider], ...]:
+        return (self.a, self.b), (self.b, self.a)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,16 +210,15 @@ class Point:
         driven = {actuator.joint().index() for actuator in actuators(plant)}
         rows = []
         for name, joint in labelled(joints(plant)).items():
-            key = plant.GetModelInstanceName(joint.model_instance()), joint.name()
             if can_be_driven(joint):
-                is_driven, follows, left_out = joint.index() in driven, key in facts.followers, key in facts.left_out
+                key, is_driven = key_of(joint), joint.index() in driven
+                follows, left_out = key in facts.followers, key in facts.left_out
                 rows.append(JointFacts(name, joint, is_driven, follows, left_out, facts.joints.get(key)))
         return rows
 
     def link_says(self, body: Any) -> Any:
         """Return the file's information about a body, or None if there is none."""
-        key = self.model.plant.GetModelInstanceName(body.model_instance()), body.name()
-        return self.model.file_facts.links.get(key)
+        return self.model.file_facts.links.get(key_of(body))
 
     @cached_property
     def query(self) -> Any:

@@ -129,9 +129,9 @@ def certify_rollout(
     """
     is_continuous = method == CONTINUOUS or (gradient is not None and CONTINUOUS in gradient.methods)
     for wrong, got, expected in (
-        (us is not None and policy is not None, "us and policy", "one of them"),
-        (is_continuous and (sampled or refine), "refinement or a sample in continuous time", "neither there"),
-        ((policy is not None or sampled) and refine, "refinement of a closed loop or sample", "it of given inputs"),
+        (us is not None and policy is not None, "us and policy", "either us or policy"),
+        (is_continuous and (sampled or refine), "sampled or refine in continuous time", "neither argument"),
+        ((policy is not None or sampled) and refine, "refine with policy or sampled", "refine only with us"),
     ):
         if wrong:
             raise InputError("certify_rollout", got=got, expected=expected)

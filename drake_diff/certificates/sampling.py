@@ -85,7 +85,7 @@ class SampledCertificate(Certificate):
     def _lines(self) -> list[str]:
         count = int((self.noticeable <= SAMPLE.limit * np.abs(self.derivative)).sum())
         power = (
-            f"an error of {100 * self.power:.1g} % in an entry that matters, or of 1 % in any of {count} entries of "
+            f"an error of {100 * self.power:.1g} % in a significant entry, or of 1 % in any of {count} entries of "
             f"{len(self.columns)}, would be missed with a probability below {SAMPLE.miss:g}"
         )
         head = f"{self.verdict} ({self.rollouts} rollouts along random directions, seed {self.seed}, {self.method})"
@@ -107,8 +107,8 @@ class Gaps:
         worst = int(np.argmax(np.abs(self.gap)))
         stated, differenced = self.stated[worst], self.stated[worst] - self.gap[worst]
         return (
-            f"along direction {worst} the gradient states {stated:.6g} and differences say {differenced:.6g}, in units "
-            "of an entry that matters"
+            f"along direction {worst} the slope of the gradient is {stated:.6g}, the slope of the differences is "
+            f"{differenced:.6g}, in units of a significant entry"
         )
 
     @property
@@ -200,7 +200,7 @@ def judge(first: Gaps, second: Gaps | None, doubt: float) -> tuple[str, str]:
         return "agree", ""
     if _steady(fine.gap, coarse.gap) and _size(coarse.gap) > max(doubt, coarse.rounding):
         return "disagree", "the gap is the same at both step sizes"
-    return "undecided", "the error bound of the differences exceeds the error that must be noticed"
+    return "undecided", "the error bound of the differences exceeds the error that must be detected"
 
 
 def _bound(values: Array) -> float:
@@ -224,24 +224,23 @@ def certify_sampled(moved: Displaced, g: RolloutGradient, seed: int) -> SampledC
     weight = weights(np.abs(derivative), moved.kinds)
     probe = Probe(lambda d: moved.losses(d)[:, 0], derivative, weight, seed, 0 if moved.policy is None else 1)
     drake, doubt, note = probe.f, 0.0, ""
-    if not moved.solver_tolerance(g):
-        first, second = probe.two(g.loss)
-    else:
-        try:
+    try:
+        if moved.solver_tolerance(g):
             left, worst = moved.left_by_drake(g)
             probe.f, probe.spent = (lambda d: moved.solved_losses(left, d)[:, 0]), probe.spent + 1
-            (first, second), note = probe.two(g.loss), differences_of_solved(worst)
-        except UnsolvedError as why:
-            probe.f, note = drake, differences_of_drake(str(why))
-            doubt = SAMPLE.doubt * float(np.linalg.norm(derivative * weight))
-            first, second = probe.two(g.loss)
+            note = differences_of_solved(worst)
+        first, second = probe.two(g.loss)
+    except UnsolvedError as why:
+        probe.f, note = drake, differences_of_drake(str(why))
+        doubt = SAMPLE.doubt * float(np.linalg.norm(derivative * weight))
+        first, second = probe.two(g.loss)
     verdict, reason = judge(first, second, doubt)
     best = min((gaps for gaps in (first, second) if gaps is not None), key=lambda gaps: gaps.bound)
     if verdict == "disagree" and (explanation := probe.alone(best)):
         j, error = explanation
         stated, right = (value / moved.scale[j] for value in (derivative[j], derivative[j] - error))
         reason += (
-            f"; an error by {moved.columns[j]} alone would explain it: {stated:.6g} is stated, {right:.6g} is right"
+            f"; an error in the entry of {moved.columns[j]} would explain it: expected {right:.6g}, got {stated:.6g}"
         )
     off = np.linalg.lstsq(probe.normals(len(best.gap)), best.gap, rcond=None)[0] / weight
     code, size, noticeable = VERDICTS.index(verdict), 1 / weight[None], best.bound / weight[None]

@@ -105,10 +105,11 @@ class TrueSlope(ShowsItsRepr):
     def __repr__(self) -> str:
         if not self.exists:
             over = ", ".join(f"{s:.4g} over +-{w:.2g}" for w, s in zip(self.widths, self.slopes, strict=True))
-            return f"by {self.column} our slope is {self.ours:.4g}, {self.reason}{f': {over}' if over else ''}"
+            return f"d loss / d {self.column}: gradient {self.ours:.4g}, {self.reason}{f': {over}' if over else ''}"
         sign = {True: "", False: ", of the opposite sign", None: ""}[self.sign_agrees]
         law = f", {self.by_other_law:+.4g} under the other law" if np.isfinite(self.by_other_law) else ""
-        return f"by {self.column} the slope is {self.value:.6g} (+-{self.error:.1g}), ours {self.ours:.6g}{sign}{law}"
+        gradient = f"d loss / d {self.column}: gradient {self.ours:.6g}{sign}"
+        return f"{gradient}, slope {self.value:.6g} (+-{self.error:.1g}){law}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,18 +149,18 @@ class Truth(ShowsItsRepr):
         formula = f" ({self.law}, {FORMULAS[self.law]})" if self.touches else ""
         lines = [
             f"in continuous time{formula} the loss is {self.loss:.6g} (+-{self.error:.1g}), in the model's steps it is "
-            f"{self.ours:.6g}, error of the step {self.ours - self.loss:.3g}"
+            f"{self.ours:.6g}, so that the time-stepping error is {self.ours - self.loss:.3g}"
         ]
         if self.other_law:
             difference = self.other_reason or f"the loss changes by {self.by_other_law:.3g}"
             lines.append(f"difference to {self.other_law}, the contact law of Drake's continuous plant: {difference}")
         for label, slopes in (
-            ("not ours", self.wrong),
-            ("without a slope", [slope for slope in self.slopes if slope.exists is False]),
-            ("not known", [slope for slope in self.slopes if slope.exists is None]),
-            ("ours", [slope for slope in self.slopes if slope.agrees]),
+            ("differ from the gradient", self.wrong),
+            ("do not exist", [slope for slope in self.slopes if slope.exists is False]),
+            ("are unknown", [slope for slope in self.slopes if slope.exists is None]),
+            ("agree with the gradient", [slope for slope in self.slopes if slope.agrees]),
         ):
-            lines += [f"{len(slopes)} of {len(self.slopes)} {label}, first {slopes[0]!r}"] if slopes else []
+            lines += [f"{len(slopes)} of {len(self.slopes)} slopes {label}, first {slopes[0]!r}"] if slopes else []
         return "; ".join([*lines, *self.notes])
 
 
@@ -194,7 +195,7 @@ def softest_contact(model: Model, xs: Array) -> str | None:
             factor = beta**2 * float(np.linalg.norm(inverse)) / 3 / (4 * np.pi**2) / stated
             if factor > worst:
                 worst = factor
-                note = f"the steps make {name} {factor:.3g} times softer than specified: near-rigid at h = {h:g} s"
+                note = f"at h = {h:g} s, the contact of {name} is {factor:.3g} times softer than specified (near-rigid)"
     return note
 
 
@@ -225,7 +226,7 @@ class _Measurement:
         return self._beside_other_law(truth, lines) if law == KELVIN_VOIGT and self.touches else truth
 
     def _beyond(self) -> str:
-        return f"not measured within the budget of {self.seconds:g} s"
+        return f"not measured within the time limit of {self.seconds:g} s"
 
     def _ours(self, line: DisplacedDirection) -> float:
         return float(self.gradient[line.columns].sum())
@@ -264,7 +265,7 @@ class _Measurement:
         widths = self._widths()
         measured = TrueSlope(line.name, tuple(line.columns.tolist()), self._ours(line))
         if widths[0] * line.scale > line.room:
-            return replace(measured, reason=f"not measured: a move by {widths[0] * line.scale:.2g} would be clipped")
+            return replace(measured, reason=f"not measured: u changed by {widths[0] * line.scale:.2g} would be clipped")
         try:
             over = [self._slope(line, w) for w in widths]
             if not abs(over[0][0] - over[1][0]) <= TRUTH.settled * max(abs(slope) for slope, _ in over):
@@ -273,7 +274,7 @@ class _Measurement:
         except TimeoutError:
             return replace(measured, reason=self._beyond())
         except DrakeDiffError as error:
-            return replace(measured, reason=f"not measured: the motion near this one fails: {error}")
+            return replace(measured, reason=f"not measured: a perturbed motion fails: {error}")
         slopes, corners = zip(*over, strict=True)
         return replace(measured, widths=tuple(w * line.scale for w in widths), slopes=slopes, corners=corners)
 
@@ -304,7 +305,7 @@ def judged(slope: TrueSlope, noise: Array, least: float) -> TrueSlope:
     size = max(abs(narrow), abs(middle), least)
     sized = replace(slope, size=max(size, abs(slope.ours)) if size > 0 else abs(slope.ours))
     if least > 0 and hidden[-1] > TRUTH.known * size and hidden[-1] > abs(narrow - middle):
-        return replace(sized, reason=f"unknown: the integration's error is {hidden[-1]:.1g} of the slope")
+        return replace(sized, reason=f"unknown: the integration's error in the slope is {hidden[-1]:.1g}")
     narrows = abs(narrow - middle) <= TRUTH.settled * size + hidden[1] + hidden[2]
     gap, slack = wide - middle, TRUTH.settled * size + hidden[0] + hidden[1]
     bends = (
@@ -313,9 +314,7 @@ def judged(slope: TrueSlope, noise: Array, least: float) -> TrueSlope:
     corner, before = abs(slope.corners[-1]), abs(slope.corners[-2])
     if corner > TRUTH.settled * size + 4 * hidden[2] and corner > TRUTH.shrinks * before:
         ahead, behind = (narrow + s * slope.corners[-1] / 2 for s in (1, -1))
-        return replace(
-            sized, exists=False, reason=f"the loss has a kink here: slope {ahead:.4g} ahead, {behind:.4g} behind"
-        )
+        return replace(sized, exists=False, reason=f"the loss has a kink: slope {ahead:.4g} ahead, {behind:.4g} behind")
     if narrows and (abs(gap) <= slack or bends):
         return replace(sized, exists=True, value=narrow, error=abs(narrow - middle) + hidden[2])
     return replace(sized, exists=False, reason="the slopes do not converge")
@@ -371,15 +370,15 @@ class Refinement:
     def __str__(self) -> str:
         distance = np.abs(self.values[0] - self.limit) / np.maximum(self.scale, TINY)
         j, wrong = int(np.argmax(distance + 1e6 * ~self.converged)), int((~self.converged).sum())
-        head = f"not converged: do not optimize with this ({wrong} of {len(self.columns)} entries)"
+        head = f"not converged: do not optimize with this gradient ({wrong} of {len(self.columns)} entries)"
         levels, values = (", ".join(f"{v:.4g}" for v in row) for row in (self.levels, self.values[:, j]))
         text = (
-            f"{head if wrong else 'converges'} with the time step ({levels}): by {self.columns[j]} {values}, "
+            f"{head if wrong else 'converges'} with the time step ({levels}): d loss / d {self.columns[j]} {values}, "
             f"limit {self.limit[j]:.4g}"
         )
         if self.apart:
             more = f" and {len(self.apart) - 1} more" if len(self.apart) > 1 else ""
-            text += f"; by {self.apart[0]}{more} it is not known to be the slope of the motion in continuous time"
+            text += f"; with respect to {self.apart[0]}{more} it is not known to equal the slope in continuous time"
         return text
 
 
@@ -429,12 +428,11 @@ def refine_by_time_step(moved: Displaced, gradient: RolloutGradient, truth: Trut
 
 def _overlaps(model: Model, xs: Array) -> bool:
     """Return whether geometries that may collide overlap in one of the states `xs` (N + 1, nx)."""
-    return bool(model.contract.contact.collision_pairs) and any(_overlap(model, x) for x in xs)
-
-
-def _overlap(model: Model, x: Array) -> bool:
-    set_state(model.double, x)
-    return bool(model.double.overlaps())
+    for x in xs if model.contract.contact.collision_pairs else ():
+        set_state(model.double, x)
+        if model.double.overlaps():
+            return True
+    return False
 
 
 def beside_truth(

@@ -72,7 +72,7 @@ def plan(
     if robot is not None and not robot.is_file():
         raise InputError("ROBOT", got=str(robot), expected="a file that exists")
     # Imported late, so that invalid input is rejected before Drake is loaded.
-    from drake_diff.model.example import example_files
+    from drake_diff.model.model import example_files
     from drake_diff.optimize.problem.obstacles import BoxObstacle, SphereObstacle
     from drake_diff.planning.planner import plan as planned
     from drake_diff.planning.robot import TIME_STEP

@@ -52,8 +52,8 @@ def check_closed(model: Model, subject: str, x: Array) -> None:
     """Raise InputError if a loop of the model is open in the state x (nx,)."""
     distance, size = gap(model, x[: model.nq]) if model.file_facts.held_points else (0.0, 0.0)
     if distance > OPEN * size:
-        expected = f"a closed loop, as dd.model.assembled(model, {subject}) makes it"
-        raise InputError(subject, got=f"points {distance:.3g} m apart that the file holds together", expected=expected)
+        expected = f"closed loops, as in dd.model.assembled(model, {subject})"
+        raise InputError(subject, got=f"{distance:.3g} m between two points that a loop connects", expected=expected)
 
 
 def assembled(model: Model, x: ArrayLike, *, keep: Collection[str] = ()) -> Array:
@@ -85,7 +85,7 @@ def assembled(model: Model, x: ArrayLike, *, keep: Collection[str] = ()) -> Arra
     if q is None:
         distance, _ = gap(model, state[: model.nq])
         raise ModelError(
-            f"the loops cannot be closed from this posture: points stay {distance:.3g} m apart; keep fewer coordinates"
+            f"the loops cannot be closed from x, in which points are {distance:.3g} m apart; keep fewer positions"
         )
     return np.concatenate([q, state[model.nq :]])
 

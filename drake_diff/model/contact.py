@@ -140,10 +140,12 @@ def body_of(model: Model, geometry: Any) -> Any:
 
 def _carrier(model: Model, geometry: Any) -> tuple[str, bool]:
     """Return the name of that body and whether it is fixed to the world, from a cache, as every contact needs them."""
-    if geometry not in model.carriers:
+
+    def carrier() -> tuple[str, bool]:
         body = body_of(model, geometry)
-        model.carriers[geometry] = body.name(), model.plant.IsAnchored(body)
-    return model.carriers[geometry]
+        return str(body.name()), bool(model.plant.IsAnchored(body))
+
+    return model.cache(("carrier", geometry), carrier, of_structure=True)
 
 
 def _pair(model: Model, a: Any, b: Any) -> Pair:
@@ -306,6 +308,7 @@ def softened(model: Model, contact: SoftContact) -> Model:
         forces=(*model.forces, contact),
         coupling=model.coupling,
         body_forces=model.body_forces,
+        servos=model.servos,
         facts=model.file_facts,
         shared=model.shared,
     )
@@ -369,7 +372,7 @@ def _pairs(plant: Any, context: Any) -> list[tuple[Any, tuple[Any, Any]]]:
         try:
             pair = from_half_space(query, ids) or query.ComputeSignedDistancePairClosestPoints(*ids)
         except RuntimeError as error:
-            why = "soft contact needs the distance of every pair, and Drake cannot compute one"
+            why = "soft contact requires the distance of every pair of shapes, and Drake does not support one of them"
             raise ModelError(f"{why}: {error}") from error
         bodies = [plant.GetBodyFromFrameId(inspector.GetFrameId(i)) for i in (pair.id_A, pair.id_B)]
         pairs.append((pair, (bodies[0], bodies[1])))

@@ -24,7 +24,7 @@ from pydrake.systems.framework import Diagram
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.model.file_facts import GeomSays, TouchFilter
-from drake_diff.model.plant import bodies, joints
+from drake_diff.model.plant import bodies, joints, key_of
 
 ROUTES = ("corner_spheres", "hydroelastic", "differences")
 CORNER_RADIUS = 0.05  # of a corner sphere, relative to the smallest edge [1]: small enough to preserve the shape's size
@@ -69,37 +69,39 @@ def replace_collision_geometry(plant: MultibodyPlant, scene_graph: pg.SceneGraph
         if route == "hydroelastic":
             return _to_hydroelastic(plant, scene_graph)
     except RuntimeError as error:
-        raise ModelError(f"Drake refuses the route {route!r}: {error}") from error
+        raise ModelError(f"Drake refuses contact_geometry={route!r}: {error}") from error
     return ("Steps with contacts that AutoDiffXd refuses are differentiated by finite differences, as chosen.",)
 
 
 def _to_corner_spheres(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
     inspector = scene_graph.model_inspector()
     geometries = collision_geometries(plant, scene_graph)
-    welded = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
-    fixed = [int(body.index()) in welded for body, _ in geometries]
+    fixed = {body.index() for body in plant.GetBodiesWeldedTo(plant.world_body())}
     # Pairs that a file or a user excludes from collision. Drake stores its filters by geometry, so the spheres would
     # not inherit them.
     pairs = [(a, b) for (body_a, a), (body_b, b) in combinations(geometries, 2) if body_a.index() != body_b.index()]
     filtered = [(a, b) for a, b in pairs if inspector.CollisionFiltered(a, b)]
     became = {geometry: [geometry] for _, geometry in geometries}
     notes = []
-    for (body, geometry), stays in zip(geometries, fixed, strict=True):
+    for body, geometry in geometries:
         name, shape = f"{inspector.GetName(geometry)} on {body.name()}", inspector.GetShape(geometry)
         if isinstance(shape, pg.Convex | pg.Ellipsoid | pg.Mesh):
             notes.append(
-                f"{name}: a {type(shape).__name__} stays as it is, and AutoDiffXd refuses every point contact with it; "
-                "take the route hydroelastic or differences where something can touch it."
+                f"{name}: a {type(shape).__name__} is not replaced, and AutoDiffXd refuses point contact with it; "
+                'use contact_geometry="hydroelastic" or "differences" if another shape can touch it.'
             )
-        elif not stays and isinstance(shape, pg.Box | pg.Capsule | pg.Cylinder):
-            became[geometry], note = _replace(plant, scene_graph, body, geometry, shape)
+        elif body.index() not in fixed and isinstance(shape, pg.Box | pg.Capsule | pg.Cylinder):
+            became[geometry], note = _replace(plant, scene_graph, geometry, shape)
             notes.append(f"{name}: {note}")
     for a, b in filtered:
-        declaration = pg.CollisionFilterDeclaration().ExcludeBetween(
-            pg.GeometrySet(became[a]), pg.GeometrySet(became[b])
-        )
-        scene_graph.collision_filter_manager().Apply(declaration)
+        exclude(scene_graph, became[a], became[b])
     return tuple(notes)
+
+
+def exclude(scene_graph: pg.SceneGraph, some: Sequence[Any], others: Sequence[Any]) -> None:
+    """Exclude contact between two groups of geometries."""
+    between = pg.CollisionFilterDeclaration().ExcludeBetween(pg.GeometrySet(some), pg.GeometrySet(others))
+    scene_graph.collision_filter_manager().Apply(between)
 
 
 def collision_geometries(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> list[tuple[Any, Any]]:
@@ -118,22 +120,31 @@ def collision_geometries(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> l
     ]
 
 
-def _replace(
-    plant: MultibodyPlant, scene_graph: pg.SceneGraph, body: Any, geometry: Any, shape: Any
-) -> tuple[list[Any], str]:
-    """Replace a geometry by spheres and remove its proximity role; return their ids and a description."""
+def add_spheres(
+    plant: MultibodyPlant, scene_graph: pg.SceneGraph, geometry: Any, radius: float, centres: Mapping[str, Array]
+) -> list[Any]:
+    """Add spheres with the properties of a geometry, and return their ids.
+
+    `centres` (3,) [m] are in the geometry's frame, by the suffix that each sphere adds to the geometry's name.
+    """
     inspector = scene_graph.model_inspector()
+    body = plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))
     X_BG = RigidTransform(inspector.GetPoseInFrame(geometry))
     properties = pg.ProximityProperties(inspector.GetProximityProperties(geometry))
-    name = inspector.GetName(geometry).removeprefix(f"{plant.GetModelInstanceName(body.model_instance())}::")
-    scene_graph.RemoveRole(plant.get_source_id(), geometry, pg.Role.kProximity)
+    name = inspector.GetName(geometry).removeprefix(f"{key_of(body)[0]}::")
+    return [
+        plant.RegisterCollisionGeometry(body, X_BG @ RigidTransform(p), pg.Sphere(radius), name + suffix, properties)
+        for suffix, p in centres.items()
+    ]
+
+
+def _replace(plant: MultibodyPlant, scene_graph: pg.SceneGraph, geometry: Any, shape: Any) -> tuple[list[Any], str]:
+    """Replace a geometry by spheres and remove its proximity role; return their ids and a description."""
     radius, centres = _spheres(shape)
-    spheres = []
-    for i, p_GS in enumerate(centres):
-        pose, corner = X_BG @ RigidTransform(p_GS), f"{name}_corner_{i}"
-        spheres.append(plant.RegisterCollisionGeometry(body, pose, pg.Sphere(radius), corner, properties))
+    spheres = add_spheres(plant, scene_graph, geometry, radius, {f"_corner_{i}": p for i, p in enumerate(centres)})
+    scene_graph.RemoveRole(plant.get_source_id(), geometry, pg.Role.kProximity)
     became = f"a {type(shape).__name__.lower()} became {len(centres)} spheres of radius {radius:.4g} m"
-    stiffness = "each with the stiffness of the whole, as every contact point has its own spring"
+    stiffness = "each with the stiffness of the original shape, as every contact point has its own spring"
     if isinstance(shape, pg.Capsule):
         return spheres, f"{became} at its ends ({stiffness}); between them there is no contact."
     if isinstance(shape, pg.Box):
@@ -318,8 +329,7 @@ def touch_what_can_separate(plant: MultibodyPlant, scene_graph: pg.SceneGraph, d
     """Exclude pairs that overlap in every posture; call it on the built diagram before its contexts are in use."""
     pairs = inseparable_pairs(plant, diagram)
     for a, b in pairs:
-        filtered = pg.CollisionFilterDeclaration().ExcludeBetween(pg.GeometrySet([a]), pg.GeometrySet([b]))
-        scene_graph.collision_filter_manager().Apply(filtered)
+        exclude(scene_graph, [a], [b])
     if not pairs:
         return ()
     number = f"{len(pairs)} pairs of shapes pass" if len(pairs) > 1 else "One pair of shapes passes"
@@ -359,7 +369,7 @@ def _shapes_of(
     """Return the shapes of an instance with the file's data; include the world's shapes if the instance is `alone`."""
     inspector, by_body = scene_graph.model_inspector(), dict[str, list[Any]]()
     for body, geometry in collision_geometries(plant, scene_graph):
-        whose = plant.GetModelInstanceName(body.model_instance())
+        whose, _ = key_of(body)
         if whose == instance or (alone and body.index() == plant.world_body().index()):
             by_body.setdefault("world" if whose != instance else body.name(), []).append(geometry)
     names = list(dict.fromkeys(geom.body for geom in says.geoms))

@@ -7,7 +7,7 @@ from typing import Any
 from pydrake.geometry import Role
 
 from drake_diff._base.values import plain_numbers, preformatted
-from drake_diff.model.plant import PROXIMITY, actuators, bodies, joints, proximity_property
+from drake_diff.model.plant import PROXIMITY, actuators, bodies, central_inertia, joints, proximity_property
 from drake_diff.model.twin import Twin
 
 
@@ -198,38 +198,30 @@ _UNITS = {  # joint type: (units of q, units of v)
 }
 
 
-def read_contract(
-    twin: Twin,
-    *,
-    name: str,
-    source: str | None,
-    coordinates: tuple[tuple[str, ...], tuple[str, ...]],
-    contact_geometry: str | None,
-    notes: tuple[str, ...],
-) -> Contract:
-    """Read the contract of the plant in `twin`; `coordinates` are the names of q and v."""
-    plant, inspector = twin.plant, twin.inspector
-    (positions, velocities), inputs = coordinates, twin.inputs
+def read_contract(model: Any) -> Contract:
+    """Read the contract of a Model."""
+    twin: Twin = model.double
+    plant, inspector, inputs = twin.plant, twin.inspector, twin.inputs
     geometries = [] if inspector is None else inspector.GetAllGeometryIds(Role.kProximity)
     contact_models = {"kPoint": "point", "kHydroelastic": "hydroelastic"}
     contact = ContactTerms(
         model=contact_models.get(plant.get_contact_model().name, "hydroelastic_with_fallback"),
         approximation=plant.get_discrete_contact_approximation().name.removeprefix("k").lower(),
-        geometry=contact_geometry or "as modelled",
+        geometry=model.contact_geometry or "as modelled",
         collision_pairs=len(inspector.GetCollisionCandidates()) if inspector is not None else 0,
         solver_relative_tolerance=SAP_RELATIVE_TOLERANCE,
         sap_near_rigid_threshold=float(plant.get_sap_near_rigid_threshold()),
     )
     return Contract(
-        name=name,
-        source=source,
+        name=model.name,
+        source=str(model.source) if model.source else None,
         time_step=plant.time_step(),
         integrator="semi-implicit Euler; damping, PD control, limits and contact implicit",
         scalar_types=("double", "AutoDiffXd"),
         gravity=_floats(plant.gravity_field().gravity_vector()),
         frame="world, z up; v of a floating body is w_WB then v_WBo, expressed in world",
-        positions=_terms(positions, _units(twin, 0), *twin.position_limits),
-        velocities=_terms(velocities, _units(twin, 1), *twin.velocity_limits),
+        positions=_terms(model.position_names, _units(twin, 0), *model.position_limits),
+        velocities=_terms(model.velocity_names, _units(twin, 1), *model.velocity_limits),
         inputs=_terms(inputs.names, inputs.units, inputs.lower, inputs.upper),
         bodies=tuple(_body(twin, body) for body in bodies(plant)),
         joints=tuple(_joint(twin, joint) for joint in joints(plant)),
@@ -237,7 +229,7 @@ def read_contract(
         geometries=tuple(_geometry(twin, geometry) for geometry in geometries),
         contact=contact,
         constraints=plant.num_constraints() if twin.coupling is None else 0,
-        notes=notes,
+        notes=model.notes,
     )
 
 
@@ -261,8 +253,7 @@ def _units(twin: Twin, which: int) -> list[str]:
 
 def _body(twin: Twin, body: Any) -> BodyTerms:
     inertia = body.CalcSpatialInertiaInBodyFrame(twin.context)
-    about_com = inertia.Shift(inertia.get_com()).CalcRotationalInertia()
-    six = _floats(about_com.get_moments()) + _floats(about_com.get_products())
+    six = _floats(central_inertia(inertia))
     return BodyTerms(body.name(), float(inertia.get_mass()), _floats(inertia.get_com()), six)
 
 

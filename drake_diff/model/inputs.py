@@ -12,6 +12,7 @@ at the end (q', v') of the step, while MuJoCo's <position> uses the state at the
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -22,11 +23,11 @@ from pydrake.multibody.plant import MultibodyPlant, Propeller, PropellerInfo
 from pydrake.planning import RobotDiagram
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPortIndex, OutputPortIndex, PortDataType
 
-from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff._base.arrays import Array, finite_array, frozen, slices_of
 from drake_diff._base.values import plain_numbers
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.model.file_facts import FileFacts
-from drake_diff.model.plant import actuators, bodies, instances, joints, labelled
+from drake_diff.model.plant import actuators, bodies, instances, joints, key_of, labelled
 
 BODY_FORCES = "body_forces"  # the exported port of the forces that `load_model` adds
 UNKNOWN = "?"  # the unit of an input that only its own system defines
@@ -182,7 +183,7 @@ class _Wiring:
     """The sources of the input ports of a diagram's leaves: a leaf, the number of the diagram's port, or None."""
 
     def __init__(self, diagram: Diagram):
-        self.leaves: list[Any] = []
+        self.leaves: dict[int, Any] = {}  # by id
         self.sources: dict[tuple[int, int], Any] = {}
         self._kept: list[Any] = []  # keeps the Python objects alive, so that ids stay unique
         self._read(diagram, list(range(diagram.num_input_ports())))
@@ -190,30 +191,22 @@ class _Wiring:
     def _read(self, diagram: Any, outside: list[Any]) -> None:
         systems, connections = diagram.GetSystems(), diagram.connection_map()
         self._kept += [systems, connections]
-        inside = {(id(system), int(port)): source for (system, port), source in connections.items()}
-        exported = {}
+        sources = {(id(system), int(port)): _leaf(*source) for (system, port), source in connections.items()}
         for i, source in enumerate(outside):
             for system, port in diagram.GetInputPortLocators(InputPortIndex(i)):
-                exported[id(system), int(port)] = source
+                sources[id(system), int(port)] = source
         for system in systems:
-            fed = []
-            for i in range(system.num_input_ports()):
-                key = (id(system), i)
-                fed.append(_leaf(*inside[key]) if key in inside else exported.get(key))
+            fed = [sources.get((id(system), i)) for i in range(system.num_input_ports())]
             if isinstance(system, Diagram):
                 self._read(system, fed)
             else:
-                self.leaves.append(system)
+                self.leaves[id(system)] = system
                 self.sources.update({(id(system), i): source for i, source in enumerate(fed)})
 
     def consumers(self, port: int) -> list[tuple[Any, int]]:
         """Return the leaves and their input port indices that an input port of the diagram feeds."""
-        by_id = {id(leaf): leaf for leaf in self.leaves}
-        return [
-            (by_id[system_id], i)
-            for (system_id, i), source in self.sources.items()
-            if isinstance(source, int) and source == port
-        ]
+        fed = [key for key, source in self.sources.items() if isinstance(source, int) and source == port]
+        return [(self.leaves[leaf], i) for leaf, i in fed]
 
     def behind(self, plant: Any, ports: Sequence[int]) -> tuple[list[Any], set[int]]:
         """Return the systems, except plant and scene graph, and the diagram ports that ports of `plant` depend on."""
@@ -252,13 +245,8 @@ def read_inputs(
     ports_of = {i: int(plant.get_actuation_input_port(i).get_index()) for i in instances(plant)}
     generalized = int(plant.get_applied_generalized_force_input_port().get_index())
     targets = [int(plant.get_desired_state_input_port(i).get_index()) for i in instances(plant)]
-    acting = [
-        whole,
-        *ports_of.values(),
-        generalized,
-        int(plant.get_applied_spatial_force_input_port().get_index()),
-        *targets,
-    ]
+    spatial = int(plant.get_applied_spatial_force_input_port().get_index())
+    acting = [whole, *ports_of.values(), generalized, spatial, *targets]
     systems, reached = wiring.behind(plant, acting)
     _check_states(systems)
     always_exported = [generalized, *targets] if isinstance(diagram, RobotDiagram) else []
@@ -277,27 +265,22 @@ def read_inputs(
             left_out.append(port.get_name())
         elif not (alone and into <= set(always_exported)):
             vectors.append((number, port, into))
-    chosen = {number for number, _, _ in vectors}
-    fed = frozenset(i for i in acting if _is_fed(wiring.sources[id(plant), i], chosen))
+    chosen, sources = {number for number, _, _ in vectors}, {i: wiring.sources[id(plant), i] for i in acting}
+    fed = frozenset(i for i, s in sources.items() if (s in chosen if isinstance(s, int) else s is not None))
     driven = [i for i, a in enumerate(actuators(plant)) if whole in fed or ports_of[a.model_instance()] in fed]
     commanded = [servos and a.has_controller() for a in actuators(plant)]
-    rows = _rows_of_actuators(plant, facts, [i for i in range(len(commanded)) if i not in driven], commanded)
-    input_rows: list[Row] = []
-    ports: list[tuple[int, slice]] = []
+    free = [i for i in range(len(commanded)) if i not in driven]
+    rows = [_rows_of_port(plant, port, into, generalized, forces) for _, port, into in vectors]
     first = min(places, default=0)
-    for number, port, into in vectors:
-        if len(ports) == first:
-            input_rows += rows
-        ports.append((number, slice(len(input_rows), len(input_rows) + port.size())))
-        input_rows += _rows_of_port(plant, port, into, generalized, forces)
-    if len(ports) == first:
-        input_rows += rows
-    if not ports and (whole in fed or driven):
+    rows.insert(first, _rows_of_actuators(plant, facts, free, commanded))
+    slices = list(slices_of(map(len, rows)))
+    del slices[first]
+    if not vectors and (whole in fed or driven):
         raise ModelError(
             "the plant's actuation input is connected inside the diagram, but drake_diff has to set it: leave it free "
             "or export it, or export the input of the system that feeds it"
         )
-    names, units, lower, upper, index = zip(*input_rows, strict=True) if input_rows else ((),) * 5
+    names, units, lower, upper, index = zip(*chain(*rows), strict=True) if any(rows) else ((),) * 5
     return Inputs(
         names=_told_apart(names),
         units=units,
@@ -305,16 +288,12 @@ def read_inputs(
         upper=frozen(upper),
         actuator=np.array(index, dtype=np.intp),
         commanded=np.array([i >= 0 and commanded[i] for i in index], dtype=bool),
-        ports=tuple(ports),
+        ports=tuple((number, s) for (number, *_), s in zip(vectors, slices, strict=True)),
         fed=fed,
         fed_actuators=tuple(driven),
         systems=tuple(str(system.get_name()) for system in systems),
         left_out=tuple(left_out),
     )
-
-
-def _is_fed(source: Any, chosen: set[int]) -> bool:
-    return source in chosen if isinstance(source, int) else source is not None
 
 
 def _check_states(systems: Sequence[Any]) -> None:
@@ -327,24 +306,24 @@ def _check_states(systems: Sequence[Any]) -> None:
         for kind in (kind for kind, count in kinds.items() if count):
             raise ModelError(
                 f"the system {system.get_name()!r} in the diagram acts on the plant and has a {kind} state of its own, "
-                "which is not part of the state x: [q; v] of the plant; use a system without a state, or bodies and "
-                "joints that move as it does"
+                "which is not part of the state x: [q; v] of the plant; use a system without a state, or model "
+                "its state by bodies and joints"
             )
 
 
 def _rows_of_actuators(plant: Any, facts: FileFacts, which: list[int], commanded: list[bool]) -> list[Row]:
-    motors, rows = actuators(plant), list[Row]()
-    for i, name in enumerate(labelled(motors)):
-        joint, limit = motors[i].joint(), float(motors[i].effort_limit())
+    rows = list[Row]()
+    for i, (name, motor) in enumerate(labelled(actuators(plant)).items()):
+        joint, limit = motor.joint(), float(motor.effort_limit())
         slides = joint.type_name() == "prismatic"
-        says = facts.joints.get((plant.GetModelInstanceName(joint.model_instance()), joint.name()))
+        says = facts.joints.get(key_of(joint))
         if commanded[i]:
             limits = float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
-            lower, upper = says.command if says and says.command else limits
-            rows.append((name, "m" if slides else "rad", lower, upper, i))
-            continue
-        lower, upper = says.sides if says and says.sides and np.isfinite(limit) else (-limit, limit)
-        rows.append((name, "N" if slides else "N m", lower, upper, i))
+            sides, unit = says.command if says and says.command else limits, "m" if slides else "rad"
+        else:
+            sides = says.sides if says and says.sides and np.isfinite(limit) else (-limit, limit)
+            unit = "N" if slides else "N m"
+        rows.append((name, unit, *sides, i))
     return [rows[i] for i in which]
 
 
@@ -352,9 +331,7 @@ def _rows_of_port(plant: Any, port: Any, into: set[int], generalized: int, force
     if forces and port.get_name() == BODY_FORCES:
         return [(force.name, "N", force.lower, force.upper, -1) for force in forces]
     size, name = port.size(), port.get_name()
-    units = [UNKNOWN] * size
-    if into == {generalized}:
-        units = _force_units(plant)
+    units = _force_units(plant) if into == {generalized} else [UNKNOWN] * size
     names = [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
     return [(n, unit, -np.inf, np.inf, -1) for n, unit in zip(names, units, strict=True)]
 

@@ -30,19 +30,13 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
 from drake_diff.exceptions import InputError, ModelError
-from drake_diff.model.file_facts import (
-    FileFacts,
-    Mjcf,
-    as_mujoco_means,
-    compiler_changes_masses,
-    correct,
-    read_facts,
-    write_masses,
-)
-from drake_diff.model.meshes import DOWNLOADED, FileMeshes, make_absolute, put_meshes, read_meshes
+from drake_diff.model.file_facts import FileFacts, Mjcf, read_facts
+from drake_diff.model.meshes import DOWNLOADED, FileMeshes, make_absolute, put_meshes, read_meshes, resolve_uri
+from drake_diff.model.mjcf_repairs import as_mujoco_means, compiler_changes_masses, correct, write_masses
+from drake_diff.model.plant import note
 from drake_diff.model.xml_text import XmlText
 
-OF_SIMULATORS = {"gazebo": "what only Gazebo reads", "contact": "friction and the like that only PyBullet reads"}
+OF_SIMULATORS = {"gazebo": "elements that only Gazebo reads", "contact": "properties that only PyBullet reads"}
 MOST_NODES = 100_000  # of a YAML file with its aliases expanded
 TESTED = re.compile(r"([\w-]+)<([\d.]+) ?; extra == .tested.")
 IN_CPP = re.compile(r"Failure at \S+ in \w+\(\): ")
@@ -59,7 +53,7 @@ def warn_of_newer_versions() -> None:
                     newer.append(f"{name} {version(name)} (tested: below {bound})")
     if newer:
         advice = "pip install 'drake-diff[tested]' installs tested versions"
-        warnings.warn(f"newer than what drake_diff was tested with: {', '.join(newer)}; {advice}", stacklevel=3)
+        warnings.warn(f"packages newer than the tested versions: {', '.join(newer)}; {advice}", stacklevel=3)
 
 
 def _numbers(text: str) -> list[int]:
@@ -81,7 +75,7 @@ def text_of(path: Path, notes: list[str]) -> XmlText | None:
         if error.__cause__ is None:
             raise ModelError(f"{path}, {error}") from error
         # Drake accepts more than XML allows; if Drake fails, this line is the cause.
-        notes.append(f"{path}, {error}: only what Drake reads of it is known.")
+        notes.append(f"{path}, {error}: only the data that Drake reads are known.")
         return None
     if xml.root.tag == "mujoco":
         return as_mujoco_means(xml, path, notes)
@@ -95,9 +89,7 @@ def text_of(path: Path, notes: list[str]) -> XmlText | None:
     if not xml.root.get("name"):
         xml.set(xml.root, "name", path.stem)
         notes.append(f"The robot has no name in the file: it is called {path.stem}.")
-    notes += _one_colour_for_each_material(xml)
-    notes += _continuous_without_limits(xml)
-    notes += _without_lost_joints(xml)
+    notes += [*_one_colour_for_each_material(xml), *_continuous_without_limits(xml), *_without_lost_joints(xml)]
     return xml
 
 
@@ -160,20 +152,16 @@ def _one_colour_for_each_material(xml: XmlText) -> list[str]:
     return [f"Materials: {'; '.join(renamed)}."] if renamed else []
 
 
-def _continuous_without_limits(xml: XmlText) -> list[str]:
+def _continuous_without_limits(xml: XmlText) -> tuple[str, ...]:
     """Remove equal limits of continuous joints, which have no limits in URDF; Drake would lock such a joint."""
-    sentences = []
+    names = []
     for joint in [j for j in xml.root.findall("joint") if j.get("type") == "continuous"]:
         limit = joint.find("limit")
         if limit and limit.get("lower") and limit.get("lower") == limit.get("upper"):
-            sentences.append(joint.get("name"))
+            names.append(joint.get("name"))
             xml.drop(limit, "lower")
             xml.drop(limit, "upper")
-    return (
-        [f"Limits of continuous joints left out, lower and upper are the same: {', '.join(sentences)}."]
-        if sentences
-        else []
-    )
+    return note("Limits of continuous joints removed, as lower and upper limit are equal", names)
 
 
 def included(path: Path) -> list[str]:
@@ -195,14 +183,14 @@ def files_of_directives(path: Path) -> list[str]:
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line_number = f":{mark.line + 1}" if mark else ""
-        raise ModelError(f"{path}{line_number}: no YAML: {getattr(error, 'problem', None) or error}") from error
+        raise ModelError(f"{path}{line_number}: invalid YAML: {getattr(error, 'problem', None) or error}") from error
     except RecursionError as error:
-        raise ModelError(f"{path}: its lists are too deep") from error
+        raise ModelError(f"{path}: its lists are nested too deeply") from error
     files, count = [], 0
     while waiting:
         node, count = waiting.pop(), count + 1
         if count > MOST_NODES:
-            raise ModelError(f"{path}: its aliases stand for more than {MOST_NODES} entries")
+            raise ModelError(f"{path}: its aliases expand to more than {MOST_NODES} entries")
         if isinstance(node, yaml.MappingNode):
             files += [str(v.value) for k, v in node.value if k.value == "file" and isinstance(v, yaml.ScalarNode)]
             waiting += [entry for pair in node.value for entry in pair]
@@ -230,20 +218,14 @@ def add_packages(packages: PackageMap, path: Path, given: Mapping[str, str] | No
 def _add_packages_of(packages: PackageMap, file: Path, above: tuple[Path, ...]) -> None:
     if file in above:
         circle = " -> ".join(path.name for path in (*above[above.index(file) :], file))
-        raise ModelError(f"{above[0]}: it includes itself: {circle}")
+        raise ModelError(f"{above[0]}: the file includes itself: {circle}")
     for name in sorted(set(re.findall(r"(?:package|model)://([^/\"'<>\s]+)/", file.read_text(errors="replace")))):
         location = None if packages.Contains(name) else package_above(file, name)
         if location is not None:
             packages.Add(name, str(location))
     for uri in included(file):
-        package = re.match(r"(?:package|model)://([^/]+)/(.*)", uri)
-        if package is None:
-            target = file.parent / uri.removeprefix("file://")
-        elif packages.Contains(package[1]):
-            target = Path(packages.GetPath(package[1]), package[2])
-        else:
-            continue
-        if target.is_file():
+        target = resolve_uri(uri, file, packages)
+        if target is not None and target.is_file():
             _add_packages_of(packages, target.resolve(), (*above, file))
 
 
@@ -279,9 +261,9 @@ def refusal(path: Path, message: str, xml: XmlText | None, notes: list[str]) -> 
     unknown = re.search(r"unknown package '([^']+)'", message)
     remedy = ""
     if unknown:
-        remedy = f". Say where it is: load_model(..., packages={{{unknown[1]!r}: folder}})"
+        remedy = f". Give its folder: load_model(..., packages={{{unknown[1]!r}: folder}})"
         if unknown[1] == DOWNLOADED:
-            remedy += "; drake_diff downloads nothing, pydrake's PackageMap().GetPath('drake_models') does"
+            remedy += "; drake_diff does not download it, but pydrake's PackageMap().GetPath('drake_models') does"
     elif xml is None and notes and notes[0].startswith(f"{path}, line"):
         remedy = f". Correct {notes[0].split(': only')[0]}"
     return f"{path}: expected a robot model that Drake can read; Drake says: {message}{remedy}"
@@ -298,20 +280,12 @@ OF_A_SPRING = re.compile(r"attribute '(?:stiffness|springref)' found in a 'joint
 logging.getLogger("drake").addFilter(lambda r: "not currently supported for deformable contact" not in r.getMessage())
 
 
-@dataclass(frozen=True)
-class FileRead:
-    """The notes for the user on a file that was read, and the facts in the file that Drake does not store."""
-
-    notes: tuple[str, ...]
-    facts: FileFacts
-
-
 def as_packages(value: Mapping[str, str | Path] | None) -> dict[str, str] | None:
     """Return the argument `packages` as strings; raise InputError if a folder does not exist."""
     if value is None:
         return None
     if not isinstance(value, Mapping):
-        raise InputError("packages", got=repr(value), expected="the folder of each package by its name")
+        raise InputError("packages", got=repr(value), expected="a mapping from names of packages to folders")
     for name, folder in value.items():
         if not Path(folder).is_dir():
             raise InputError(f"packages[{name!r}]", got=str(folder), expected="a folder that exists")
@@ -320,10 +294,11 @@ def as_packages(value: Mapping[str, str | Path] | None) -> dict[str, str] | None
 
 def read_into(
     plant: MultibodyPlant, path: Path, packages: Mapping[str, str] | None = None, meshes: str = "skip"
-) -> FileRead:
+) -> tuple[tuple[str, ...], FileFacts]:
     """Add the model in `path` to `plant`; `packages` maps names in package:// to folders.
 
-    `meshes` is the treatment of collision meshes, see `load_model`.
+    Returns notes for the user, and the facts in the file that Drake does not store. `meshes` is the treatment of
+    collision meshes, see `load_model`.
 
     Raises InputError if the file is missing or of an unknown type, and ModelError if Drake refuses it.
     """
@@ -347,7 +322,7 @@ def read_into(
             raise ModelError(f"{path}: expected text in UTF-8, got {got}") from error
         except DRAKES_REFUSALS as error:
             raise ModelError(refusal(path, reading.in_own_words(str(error)), reading.xml, notes)) from error
-    return FileRead(tuple(map(reading.in_own_words, notes)), reading.facts)
+    return tuple(map(reading.in_own_words, notes)), reading.facts
 
 
 @dataclass
@@ -403,10 +378,9 @@ class _Reading:
         before = len(self.facts.thrusters)
         read_facts(xml, instance, self.facts)
         names = [thruster["name"] for thruster in self.facts.thrusters[before:]]
-        if names:
-            self.notes.append(f"{len(names)} motors of sites became forces on bodies: {', '.join(names)}.")
-            if any(joint.get("actuatorfrcrange") for joint in xml.root.iter("joint")):
-                self.notes.append("In MuJoCo actuatorfrcrange limits motors of sites too, here it does not.")
+        self.notes += note(f"{len(names)} motors of sites became forces on bodies", names)
+        if names and any(joint.get("actuatorfrcrange") for joint in xml.root.iter("joint")):
+            self.notes.append("MuJoCo limits motors of sites by actuatorfrcrange, which is ignored for them.")
         read_meshes(self.meshes, xml, path, self.parser.package_map())
         masses = xml.root.tag == "mujoco" and compiler_changes_masses(xml)
         if xml.changed or masses:
@@ -429,17 +403,16 @@ class _Reading:
     def _corrected(self, xml: XmlText | None, instance: ModelInstanceIndex) -> None:
         """Correct the numbers of an MJCF file that Drake interprets differently from MuJoCo."""
         if xml is not None and xml.root.tag == "mujoco":
-            mjcf = Mjcf(xml)
-            self.notes += correct(self.parser.plant(), instance, mjcf)
+            mjcf, plant = Mjcf(xml), self.parser.plant()
+            self.notes += correct(plant, instance, mjcf)
             outdated = [OF_RANGES] + [OF_A_SPRING] * (not mjcf.has_other_springs)
-            plant = self.parser.plant()
             is_off = "gravity" in mjcf.disabled
             if (mjcf.weightless or is_off) and plant.num_model_instances() == 3:  # the world, Drake's, and this one
                 plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, 0.0])
-                why = "the file disables it" if is_off else "gravcomp compensates that of every body"
+                why = "the file disables it" if is_off else "gravcomp compensates the gravity of every body"
                 self.notes.append(f"{NO_GRAVITY} {why}.")
                 outdated.append(OF_GRAVITY)
-            self.notes[:] = [note for note in self.notes if not any(meant.search(note) for meant in outdated)]
+            self.notes[:] = [text for text in self.notes if not any(meant.search(text) for meant in outdated)]
 
     def in_own_words(self, message: str) -> str:
         """Replace the names of temporary input in a parser's message by the user's files."""

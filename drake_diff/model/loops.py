@@ -16,7 +16,7 @@ from pydrake.multibody.tree import JacobianWrtVariable, SpatialInertia, UnitIner
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ModelError
-from drake_diff.model.plant import joint_pose, joints
+from drake_diff.model.plant import joint_pose, joints, note
 from drake_diff.model.xml_text import Element, XmlText
 
 APART = 0.1  # [m] distance between the points of a loop: the constraints are nearly rigid at any distance
@@ -78,7 +78,7 @@ def loops_of_sdf(xml: XmlText, model: Element, instance: str) -> Iterator[HeldBo
         if xyz is not None and xyz.get("expressed_in"):
             raise ModelError(f"{where}: expected its axis in its own frame, got expressed_in")
         if effort is not None and float(effort.text) > 0:
-            raise ModelError(f"{where}, and has a motor: drive another joint of the loop, or let its effort be 0")
+            raise ModelError(f"{where}, and has a motor: drive another joint of the loop, or set its effort to 0")
         axis = np.array([float(word) for word in xyz.text.split()] if xyz is not None else [0.0, 0.0, 1.0])
         if not axis.any():
             raise ModelError(f"{where}: expected an axis, got 0 0 0")
@@ -171,11 +171,7 @@ def close_loops(plant: MultibodyPlant, loops: Sequence[HeldBodies], held: list[H
             held.append(HeldPoints(constraint, (body.index(), other.index()), points))
         lost = f" (joint {loop.frame}, without its limits, damping, spring and motor)" if loop.frame else ""
         names.append(f"{loop.body} and {loop.other}{lost}")
-    if not names:
-        return ()
-    return (
-        f"{len(names)} kinematic loops are closed by nearly rigid constraints (soft in MuJoCo): {', '.join(names)}.",
-    )
+    return note(f"{len(names)} kinematic loops are closed by nearly rigid constraints (soft in MuJoCo)", names)
 
 
 def _body(plant: MultibodyPlant, instance: str, name: str) -> Any:

@@ -7,7 +7,6 @@ placeholder, so that it reads pose, friction and filters as usual. The sphere is
 import re
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -20,6 +19,7 @@ from pydrake.multibody.parsing import PackageMap
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_diff.exceptions import ModelError
+from drake_diff.model.contact_geometry import add_spheres, exclude
 from drake_diff.model.file_facts import Mjcf
 from drake_diff.model.triangles import (
     OF_MUJOCO,
@@ -77,12 +77,12 @@ class FileMeshes:
         """Return a sentence for each kind of mesh that is not used."""
         sentences = {
             f"{len(self.skipped)} collision meshes skipped, Drake uses only {' '.join(USABLE_MESHES)}: "
-            f'{_listed(self.skipped)}. meshes="convex" or meshes="spheres" takes them.': self.skipped,
+            f'{_listed(self.skipped)}. meshes="convex" or meshes="spheres" uses them.': self.skipped,
             f"{len(self.missing)} meshes skipped, no file found: {_listed(self.missing)}. Links without a shape "
-            "are drawn as a skeleton; packages={name: folder} says where a package is.": self.missing,
+            "are drawn as a skeleton; packages={name: folder} gives the folder of a package.": self.missing,
             f"{len(self.unusable)} meshes skipped, they cannot be used: {_listed(self.unusable)}.": self.unusable,
-            f"{len(self.hollow)} inertias by the exact volume of a mesh, where MuJoCo's default rule has another: "
-            f'{_listed(self.hollow)}. inertia="exact" of the mesh, or an <inertial>, is the same in both.': self.hollow,
+            f"{len(self.hollow)} inertias use the exact volume of a mesh, unlike MuJoCo's default rule: "
+            f'{_listed(self.hollow)}. With inertia="exact" of the mesh, or an <inertial>, both agree.': self.hollow,
         }
         return [sentence for sentence, names in sentences.items() if names]
 
@@ -137,7 +137,7 @@ def _look_for_hollows(meshes: FileMeshes, xml: XmlText, path: Path) -> None:
     """Note each geom whose volume by MuJoCo's default rule for meshes differs from the exact volume, with both."""
     mjcf = Mjcf(xml)
     files = {mesh.get("name") or Path(mesh.get("file")).stem: mesh for mesh in assets_of(xml)}
-    for body in (body for section in xml.root.findall("worldbody") for body in section.iter("body")):
+    for body in xml.root.of_world("body"):
         for geom in body.findall("geom") if not body.findall("inertial") else ():
             name, density = mjcf.mesh_and_density(geom)
             mesh = files.get(name)
@@ -179,7 +179,7 @@ def volumes(mesh: Triangles) -> tuple[float, float]:
 
 def assets_of(xml: XmlText) -> list[Element]:
     """Return the meshes that an MJCF file declares."""
-    return [mesh for section in xml.root.findall("asset") for mesh in section.findall("mesh")]
+    return xml.root.findall("asset", "mesh")
 
 
 def asset_of(xml: XmlText, mesh: Element, path: Path) -> Path:
@@ -202,7 +202,7 @@ def _change(meshes: FileMeshes, xml: XmlText, element: Element, mesh: Element, l
     scale = _scale(mesh, label)
     ending = Path(uri).suffix.lower()
     if ending not in (*USABLE_MESHES, *READ_BY_TRIMESH):
-        meshes.unusable.append(f"{label} (a format that is not known)")
+        meshes.unusable.append(f"{label} (an unknown format)")
         xml.remove(element)
     elif file is None:
         meshes.missing.append(label)
@@ -322,12 +322,7 @@ def in_any_case(path: Path) -> Path | None:
 def _became(mesh: CollisionMesh, treatment: str) -> tuple[Hull, CoverSpheres | None]:
     """Return the hull of a mesh, with spheres inside it if requested; raise ModelError if there is no hull."""
     hull = hull_of_file(mesh.path, mesh.scale)
-    return hull, _spheres(hull, mesh.path.name) if treatment == "spheres" else None
-
-
-@lru_cache(maxsize=256)  # the hull itself is the key, so it stays in memory
-def _spheres(hull: Hull, label: str) -> CoverSpheres:
-    return fit_spheres(hull, label)
+    return hull, fit_spheres(hull, mesh.path.name) if treatment == "spheres" else None
 
 
 def put_meshes(plant: MultibodyPlant, scene_graph: pg.SceneGraph, meshes: FileMeshes) -> list[str]:
@@ -356,9 +351,7 @@ def put_meshes(plant: MultibodyPlant, scene_graph: pg.SceneGraph, meshes: FileMe
             became = [geometry]
         else:
             became = _put_spheres(plant, scene_graph, geometry, spheres)
-        if filtered:  # Drake stores filters by geometry, and drops them when a shape changes
-            between = pg.CollisionFilterDeclaration().ExcludeBetween(pg.GeometrySet(became), pg.GeometrySet(filtered))
-            scene_graph.collision_filter_manager().Apply(between)
+        exclude(scene_graph, became, filtered)  # Drake stores filters by geometry, and drops them when a shape changes
         known += became[1:]
     return [_describe_meshes(became_other, meshes.treatment)] if became_other else []
 
@@ -397,17 +390,11 @@ def _meant(plant: MultibodyPlant, inspector: Any, geometry: Any, meshes: FileMes
 
 def _put_spheres(plant: MultibodyPlant, scene_graph: pg.SceneGraph, geometry: Any, spheres: CoverSpheres) -> list[Any]:
     """Replace a placeholder by spheres, and return their ids, including the placeholder's."""
-    inspector = scene_graph.model_inspector()
-    body = plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))
-    X_BG = RigidTransform(inspector.GetPoseInFrame(geometry))
-    properties = pg.ProximityProperties(inspector.GetProximityProperties(geometry))
-    name = inspector.GetName(geometry).removeprefix(f"{plant.GetModelInstanceName(body.model_instance())}::")
-    first, *more = (X_BG @ RigidTransform(centre) for centre in spheres.centres)
-    scene_graph.ChangeShape(plant.get_source_id(), geometry, pg.Sphere(spheres.radius), first)
-    return [geometry] + [
-        plant.RegisterCollisionGeometry(body, pose, pg.Sphere(spheres.radius), f"{name}_{i}", properties)
-        for i, pose in enumerate(more, start=2)
-    ]
+    first, *more = spheres.centres
+    X_BG = RigidTransform(scene_graph.model_inspector().GetPoseInFrame(geometry))
+    added = add_spheres(plant, scene_graph, geometry, spheres.radius, {f"_{i}": p for i, p in enumerate(more, start=2)})
+    scene_graph.ChangeShape(plant.get_source_id(), geometry, pg.Sphere(spheres.radius), X_BG @ RigidTransform(first))
+    return [geometry, *added]
 
 
 def _describe_meshes(meshes: list[CollisionMesh], treatment: str) -> str:
@@ -417,12 +404,12 @@ def _describe_meshes(meshes: list[CollisionMesh], treatment: str) -> str:
         kinds.setdefault((mesh.path, mesh.scale), []).append(mesh.link)
     became = {kind: _became(CollisionMesh("", *kind), treatment) for kind in kinds}
     lost = max(hull.lost for hull, _ in became.values())
-    less = f" Of fine meshes only part of the corners is used: they reach up to {lost:.2g} m farther." if lost else ""
+    less = f" Hulls of fine meshes use only some vertices: meshes reach up to {lost:.2g} m farther." if lost else ""
     if treatment == "convex":
         corners = [len(hull.corners) for hull, _ in became.values()]
         return (
             f"{len(meshes)} collision meshes became their convex hulls, of {min(corners)} to {max(corners)} "
-            f"corners; what is hollow is filled. AutoDiffXd refuses point contact with them.{less}"
+            f"corners, which fills hollows. AutoDiffXd refuses point contact with them.{less}"
         )
     fits = sorted(((s, k) for k, (_, s) in became.items() if s is not None), key=lambda f: -f[0].ground_gap)
     count = sum(len(spheres.centres) * len(kinds[kind]) for spheres, kind in fits)

@@ -32,7 +32,14 @@ from drake_diff.model.contact_geometry import (
 from drake_diff.model.contract import Contract, read_contract
 from drake_diff.model.file_facts import FileFacts, Mimic
 from drake_diff.model.inputs import TIMES, BodyForce, add_body_forces, check_body_forces, read_inputs
-from drake_diff.model.load_file import DRAKES_REFUSALS, NO_GRAVITY, as_packages, read_into, warn_of_newer_versions
+from drake_diff.model.load_file import (
+    DRAKES_REFUSALS,
+    FORMATS,
+    NO_GRAVITY,
+    as_packages,
+    read_into,
+    warn_of_newer_versions,
+)
 from drake_diff.model.loops import close_loops, in_pose_of_files
 from drake_diff.model.meshes import TREATMENTS
 from drake_diff.model.plant import (
@@ -56,8 +63,6 @@ from drake_diff.model.repairs import (
     as_ground,
     as_names,
     check_contact,
-    check_mimic,
-    check_servos,
     couple,
     coupling_of,
     damp_servos,
@@ -75,8 +80,19 @@ from drake_diff.model.twin import AddedForce, OfThread, SharedPlant, Twin
 
 WITHOUT_EFFECT = (None, (), "skip")  # option values of `load_model` that change nothing
 T = TypeVar("T")
-CONTACT_APPROXIMATIONS = ("sap", "similar", "lagged")
+CHOICES = {
+    "contact_model": CONTACT_MODELS,
+    "contact_approximation": ("sap", "similar", "lagged"),
+    "contact_geometry": (None, *ROUTES),
+    "meshes": TREATMENTS,
+    "mimic": (None, "reduce", "fix"),
+    "inputs": (None, "position", "effort"),
+}
 OTHERS_KEPT = 128  # maximum number of cached variants of a model; a certificate for the time step needs 91
+EXAMPLES = (
+    Path(__file__).parents[1] / "models",
+    Path(__file__).parent / "robots",
+)  # in a clone, the first is a link to the top-level folder
 NAMES_SHOWN = 12  # in repr, enough for the whole state of a robot arm
 
 
@@ -203,12 +219,14 @@ class Model(ShowsItsRepr):
     @property
     def position_limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper limits (nq,) each [m or rad]; limits of joints that follow a coordinate also apply to it."""
-        return self.double.position_limits
+        limits = np.array(self.plant.GetPositionLowerLimits()), np.array(self.plant.GetPositionUpperLimits())
+        return limits if self.coupling is None else self.coupling.limits(*limits)
 
     @property
     def velocity_limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper limits (nv,) each [m/s or rad/s]."""
-        return self.double.velocity_limits
+        limits = np.array(self.plant.GetVelocityLowerLimits()), np.array(self.plant.GetVelocityUpperLimits())
+        return limits if self.coupling is None else self.coupling.limits(*limits, of_velocities=True)
 
     @property
     def whole(self) -> Model:
@@ -322,7 +340,7 @@ class Model(ShowsItsRepr):
 
     def with_contact(self, approximation: str) -> Model:
         """Return the model with another contact approximation (sap, similar, lagged); for errors see `at_time_step`."""
-        _check_choice("contact_approximation", approximation, CONTACT_APPROXIMATIONS)
+        _check_choice("contact_approximation", approximation)
         return self.changed(contact_approximation=approximation)
 
     def changed(self, **change: Any) -> Model:
@@ -338,7 +356,7 @@ class Model(ShowsItsRepr):
             0.002
         """
         if self._rebuild is None:
-            raise ModelError("a model made from a diagram cannot be changed: build the diagram again, changed")
+            raise ModelError("a model made from a diagram cannot be changed: build another diagram with the change")
         try:
             key = frozenset((option, _key(value)) for option, value in change.items())
         except (TypeError, ValueError):
@@ -374,11 +392,6 @@ class Model(ShowsItsRepr):
         ports = [plant.get_applied_generalized_force_input_port(), plant.get_applied_spatial_force_input_port()]
         reasons = [f"the diagram feeds {port.get_name()}" for port in ports if self.feeds(port)]
         return ", ".join(reasons + ["the diagram drives actuators"] * bool(self.inputs.fed_actuators))
-
-    @cached_property
-    def carriers(self) -> dict[Any, tuple[str, bool]]:
-        """A cache of the carrying body's name and whether it is fixed, by geometry."""
-        return {}
 
     @property
     def double(self) -> Twin:
@@ -428,14 +441,7 @@ class Model(ShowsItsRepr):
     @cached_property
     def contract(self) -> Contract:
         """The properties of the model: names, units, limits, masses, contact, time step."""
-        return read_contract(
-            self.double,
-            name=self.name,
-            source=str(self.source) if self.source else None,
-            coordinates=(self.position_names, self.velocity_names),
-            contact_geometry=self.contact_geometry,
-            notes=self.notes,
-        )
+        return read_contract(self)
 
     def cache(self, key: Hashable, make: Callable[[], T], *, of_structure: bool = False) -> T:
         """Return the result of `make` for `key`, cached in each thread for the lifetime of `key` and the model.
@@ -588,14 +594,9 @@ def load_model(
     options = {option: value for option, value in locals().items() if option not in ("path", "isolated")}
     warn_of_newer_versions()
     time_step = seconds("time_step [s]", time_step)
-    _check_choice("contact_model", contact_model, CONTACT_MODELS)
-    _check_choice("contact_approximation", contact_approximation, CONTACT_APPROXIMATIONS)
-    if contact_geometry is not None:
-        _check_choice("contact_geometry", contact_geometry, ROUTES)
-    _check_choice("meshes", meshes, TREATMENTS)
+    for option in CHOICES:
+        _check_choice(option, options[option])
     check_contact(contact)
-    check_mimic(mimic)
-    check_servos(inputs, gains)
     body_forces = check_body_forces(body_forces)
     source = _as_path(path)
     config = MultibodyPlantConfig(
@@ -618,13 +619,13 @@ def load_model(
         "fix_joints": as_names("fix_joints", fix_joints),
         "packages": as_packages(packages),
         "body_forces": body_forces,
-        "gains": as_gains(gains),
+        "gains": as_gains(gains, inputs),
     }
     if isolated:
         check_in_child_process(source, options)
-    read = read_into(plant, source, options["packages"], meshes)
-    repairs, mimics = _repaired(plant, scene_graph, source, read.facts, options)
-    notes = tuple(n for n in read.notes if gravity is None or not n.startswith(NO_GRAVITY)) + repairs
+    notes, facts = read_into(plant, source, options["packages"], meshes)
+    repairs, mimics = _repaired(plant, scene_graph, source, facts, options)
+    notes = tuple(n for n in notes if gravity is None or not n.startswith(NO_GRAVITY)) + repairs
     if notes:
         warnings.warn("\n  ".join([f"{source.name}:", *notes]), ModelWarning, stacklevel=2)
     notes += () if contact_geometry is None else replace_collision_geometry(plant, scene_graph, contact_geometry)
@@ -635,13 +636,13 @@ def load_model(
         plant.Finalize()
     except DRAKES_REFUSALS as error:
         raise ModelError(f"{source}: expected a model that Drake can finalize; Drake says: {error}") from error
-    notes += damp_servos(plant, read.facts)
+    notes += damp_servos(plant, facts)
     coupling = coupling_of(plant, mimics)
-    body_forces = check_body_forces([*read.facts.thrusters, *body_forces])
+    body_forces = check_body_forces([*facts.thrusters, *body_forces])
     add_body_forces(builder, plant, body_forces)
     diagram = builder.Build()
     if contact:
-        notes += touch_as_mujoco(plant, scene_graph, read.facts.touching, give=contact != "ground")
+        notes += touch_as_mujoco(plant, scene_graph, facts.touching, give=contact != "ground")
     if contact == "separable":
         notes += touch_what_can_separate(plant, scene_graph, diagram)
 
@@ -658,11 +659,43 @@ def load_model(
         rebuild=rebuild,
         coupling=coupling,
         body_forces=body_forces,
-        facts=read.facts,
+        facts=facts,
         servos=inputs != "effort",
     )
     model.options = options
     return model
+
+
+def example_files() -> dict[str, Path]:
+    """Return the file of each example by its name."""
+    files = [file for folder in EXAMPLES for file in folder.iterdir() if file.name.endswith(FORMATS)]
+    return {file.stem: file for file in sorted(files, key=lambda file: file.name)}
+
+
+def example_model(name: str, *, time_step: float = 0.01, **options: Any) -> Model:
+    """Load a robot that is included in drake_diff.
+
+    Args:
+        name: "panda", "cart_pole", "pendulum", "double_pendulum", "acrobot", "hopper", "box_push", ...: the name of a
+            file in `models/` without its extension, or the Panda.
+        time_step: The time step of the discrete plant [s].
+        options: Further arguments of `load_model`.
+
+    Returns:
+        The Model that `load_model` returns.
+
+    Raises:
+        UnknownNameError: The example does not exist; the message lists the existing examples.
+        InputError: An option is invalid.
+
+    Example:
+        >>> dd.example_model("panda").nu
+        7
+    """
+    files = example_files()
+    if name not in files:
+        raise UnknownNameError("example model", got=name, known=files)
+    return load_model(files[name], time_step=time_step, **options)
 
 
 def _as_path(path: Any) -> Path:
@@ -795,9 +828,9 @@ def _key(value: Any) -> Hashable:
     return type(value) is bool, value
 
 
-def _check_choice(subject: str, value: str, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise UnknownNameError(subject, got=value, known=known)
+def _check_choice(option: str, value: str | None) -> None:
+    if value not in CHOICES[option]:
+        raise UnknownNameError(option, got=value, known=filter(None, CHOICES[option]))
 
 
 def _repaired(
@@ -808,7 +841,7 @@ def _repaired(
     if base is not None and weld_base is not None:
         raise InputError("base", got=f"{base!r} and weld_base={weld_base!r}", expected="one of them")
     if options["ground"] is not None and not options["contact"]:
-        raise InputError("ground", got="contact=False", expected="contact, as a ground acts by contact")
+        raise InputError("ground", got="contact=False", expected="contact=True, as a ground acts only through contact")
     mimics: tuple[Mimic, ...] = ()
     try:
         loops = in_pose_of_files(plant, facts.loops, partial(position_in_file, plant, facts))
@@ -853,7 +886,7 @@ def _check_plant(model: Model) -> None:
         names = ", ".join(a.name() for a in actuators(plant) if a.joint().index() == index)
         raise ModelError(
             f"{where}expected one actuator on the joint {plant.get_joint(index).name()}, got {names}: Drake's step "
-            "applies the last alone"
+            "applies only the last"
         )
     if plant.num_velocities() == 0:
         raise ModelError(f"{where}the model cannot move: it has no joints and no free body")

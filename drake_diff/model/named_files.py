@@ -14,9 +14,9 @@ from pydrake.multibody.parsing import PackageMap
 
 from drake_diff._base.files import GIB, json_of
 from drake_diff.exceptions import ArtifactError, ModelError
-from drake_diff.model.file_facts import with_includes
 from drake_diff.model.load_file import FORMATS, add_packages, files_of_directives
 from drake_diff.model.meshes import asset_of, file_at, resolve_uri
+from drake_diff.model.mjcf_repairs import with_includes
 from drake_diff.model.xml_text import XmlText
 
 MESHES = (

@@ -46,7 +46,7 @@ from drake_diff._base.arrays import Array, finite_array, frozen, slices_of
 from drake_diff._base.autodiff import plain
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.model.model import Model
-from drake_diff.model.plant import PROXIMITY, actuators, bodies, joints, labelled, proximity_property
+from drake_diff.model.plant import PROXIMITY, actuators, bodies, central_inertia, joints, labelled, proximity_property
 from drake_diff.model.twin import GravityChange, SpringChange, Twin
 
 # Drake drops the derivative of a frame's pose whose value is exactly the identity. A translation of this
@@ -84,20 +84,16 @@ class Kind:
                 yield label, unit, value
 
 
-def _rebuildable(model: Model) -> dict[str, Any]:
-    return {"model": model} if model.can_rebuild else {}
+def _labelled(elements: Callable[[Any], list[Any]]) -> Elements:
+    return lambda model: labelled(elements(model.plant))
 
 
-def _taking_forces(model: Model) -> dict[str, Any]:
-    return {"model": model} if model.takes_forces else {}
+def _model_if(holds: Callable[[Model], Any]) -> Elements:
+    return lambda model: {"model": model} if holds(model) else {}
 
 
-def _bodies(model: Model) -> dict[str, Any]:
-    return labelled(bodies(model.plant))
-
-
-def _joints(model: Model) -> dict[str, Any]:
-    return labelled(joints(model.plant))
+_bodies, _joints, _actuators = map(_labelled, (bodies, joints, actuators))
+_rebuildable, _taking_forces = map(_model_if, (attrgetter("can_rebuild"), attrgetter("takes_forces")))
 
 
 def _springs(plant: Any, kind: Any) -> dict[str, Any]:
@@ -115,10 +111,6 @@ def _hinge_springs(model: Model) -> dict[str, Any]:
 
 def _slide_springs(model: Model) -> dict[str, Any]:
     return _springs(model.plant, tree.PrismaticSpring_[float]) if model.takes_forces else {}
-
-
-def _actuators(model: Model) -> dict[str, Any]:
-    return labelled(actuators(model.plant))
 
 
 def geometries_of(twin: Twin) -> dict[str, list[Any]]:
@@ -139,9 +131,7 @@ def geometries_of(twin: Twin) -> dict[str, list[Any]]:
 def _read_inertia(body: Any) -> list[float] | None:
     if not body.default_mass() > 0:
         return None  # a frame without mass has no inertia, and setting one would end the process
-    inertia = body.default_spatial_inertia()
-    about_com = inertia.Shift(inertia.get_com()).CalcRotationalInertia()
-    return [*about_com.get_moments(), *about_com.get_products()]
+    return central_inertia(body.default_spatial_inertia())
 
 
 def _write_inertia(twin: Twin, label: str, value: Values) -> None:
@@ -515,7 +505,7 @@ def _check_value(p: Parameter, given: Any) -> Array:
     if np.any(value < p.lower):
         raise InputError(p.name, got=given, expected=f"at least {p.lower:g} {p.unit}")
     if p.kind.quantity == "inertia" and room_of_inertia(value) < 0:
-        raise InputError(p.name, got=given, expected="an inertia that a distribution of mass can have")
+        raise InputError(p.name, got=given, expected="a physically valid inertia of a distribution of mass")
     return value
 
 

@@ -1,5 +1,6 @@
 """Access to a plant's bodies, joints and actuators by index or name, and to the plant in a diagram."""
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -75,12 +76,23 @@ def joint_pose(joint: Any, q: float = 0.0) -> RigidTransform:
 def labelled(elements: list[Any]) -> dict[str, Any]:
     """Return the elements by name, or by "instance::name" if two model instances use the same name."""
     names = [element.name() for element in elements]
-    by_label = {}
-    for element, name in zip(elements, names, strict=True):
-        if names.count(name) > 1:
-            name = f"{element.GetParentPlant().GetModelInstanceName(element.model_instance())}::{name}"
-        by_label[name] = element
-    return by_label
+    return {n if names.count(n) == 1 else "::".join(key_of(e)): e for e, n in zip(elements, names, strict=True)}
+
+
+def key_of(element: Any) -> tuple[str, str]:
+    """Return the names of an element's model instance and of the element."""
+    return str(element.GetParentPlant().GetModelInstanceName(element.model_instance())), str(element.name())
+
+
+def note(what: str, names: Collection[str]) -> tuple[str, ...]:
+    """Return a sentence for the user that lists names, or nothing without names."""
+    return (f"{what}: {', '.join(names)}.",) if names else ()
+
+
+def central_inertia(inertia: Any) -> list[float]:
+    """Return xx yy zz xy xz yz [kg m^2] of a spatial inertia about its centre of mass."""
+    about_com = inertia.Shift(inertia.get_com()).CalcRotationalInertia()
+    return [*about_com.get_moments(), *about_com.get_products()]
 
 
 def radius_of_gyration(body: Any) -> float:

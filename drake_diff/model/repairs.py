@@ -43,14 +43,14 @@ from scipy.sparse.csgraph import connected_components
 
 from drake_diff._base.arrays import LARGEST, Array, finite_array
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.model.contact_geometry import collision_geometries
+from drake_diff.model.contact_geometry import collision_geometries, exclude
 from drake_diff.model.file_facts import FileFacts, Mimic
 from drake_diff.model.load_file import DRAKES_REFUSALS
-from drake_diff.model.plant import ARMATURE, actuators, bodies, joint_pose, joints, labelled, named
+from drake_diff.model.plant import ARMATURE, actuators, bodies, joint_pose, joints, key_of, labelled, named, note
 
 GROUND_FRICTION = 0.5  # for ground=True: the default friction of Drake's SceneGraph
 Actuated = str | tuple[str, ...] | dict[str, float | None] | None
-INPUTS = ("position", "effort")
+
 Gains = tuple[float, float]
 
 
@@ -100,11 +100,11 @@ def add_actuators(plant: MultibodyPlant, asked: Actuated, facts: FileFacts) -> t
     given_here = isinstance(asked, dict)
     added, opened, notes = dict[str, float](), list[str](), list[str]()
     for name, joint in _chosen(plant, asked, facts).items():
-        says = facts.joints.get(_key(plant, joint))
+        says = facts.joints.get(key_of(joint))
         given = asked[name] if isinstance(asked, dict) else None if says is None else says.effort
         limit = given if given is not None and given > 0 else np.inf
         if given_here and says is not None:
-            facts.joints[_key(plant, joint)] = replace(says, sides=None)
+            facts.joints[key_of(joint)] = replace(says, sides=None)
         if joint.index() in driven:
             notes += _limit_again(driven[joint.index()], limit) if given_here else []
             continue
@@ -115,39 +115,34 @@ def add_actuators(plant: MultibodyPlant, asked: Actuated, facts: FileFacts) -> t
         added[name] = limit
     limited = [f"{name} ({limit:g})" for name, limit in added.items() if np.isfinite(limit)]
     unlimited = [name for name, limit in added.items() if not np.isfinite(limit)]
-    if limited:
-        whose = "given" if given_here else "that the file gives"
-        notes.append(f"{len(limited)} actuators added, with the effort limits {whose}: {', '.join(limited)}.")
-    if unlimited:
-        why = "as asked" if given_here else "as the file gives none or 0"
-        notes.append(f"{len(unlimited)} actuators added without an effort limit, {why}: {', '.join(unlimited)}.")
-    if opened:
-        notes.append(f"Limits of 0 of driven joints removed: {', '.join(opened)}.")
-    return tuple(notes)
+    whose, why = ("given", "as requested") if given_here else ("of the file", "as the file has no limit or 0")
+    return (
+        *notes,
+        *note(f"{len(limited)} actuators added, with the effort limits {whose}", limited),
+        *note(f"{len(unlimited)} actuators added without an effort limit, {why}", unlimited),
+        *note("Limits of 0 of driven joints removed", opened),
+    )
 
 
 def add_armatures(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
     """Add MJCF's armature to joints without an actuator, since Drake supports it only on actuators."""
     driven, added = {actuator.joint().index() for actuator in actuators(plant)}, []
     for joint in joints(plant):
-        says = facts.joints.get(_key(plant, joint))
+        says = facts.joints.get(key_of(joint))
         if says is not None and says.armature and joint.index() not in driven and can_be_driven(joint):
             rotor = plant.AddJointActuator(ARMATURE + joint.name(), joint)
             rotor.set_default_rotor_inertia(says.armature)
             added.append(f"{joint.name()} ({says.armature:g})")
-    return (f"Armature of joints that nothing drives: {', '.join(added)}.",) if added else ()
+    return note("Armature of joints without an actuator", added)
 
 
-def check_servos(inputs: str | None, gains: Any) -> None:
-    """Raise UnknownNameError if `inputs` is not in INPUTS or None, or InputError if gains are given without servos."""
-    if inputs is not None and inputs not in INPUTS:
-        raise UnknownNameError("inputs", got=inputs, known=INPUTS)
-    if gains is not None and inputs != "position":
+def as_gains(value: Any, inputs: str | None) -> Gains | dict[str, Gains] | None:
+    """Normalize the argument `gains`.
+
+    Raises InputError for a pair without kp above 0 and kd of at least 0, or if the inputs are not commanded positions.
+    """
+    if value is not None and inputs != "position":
         raise InputError("inputs", got=f"{inputs!r} and gains", expected='inputs="position" with gains')
-
-
-def as_gains(value: Any) -> Gains | dict[str, Gains] | None:
-    """Normalize the argument `gains`; raise InputError for a pair without kp above 0 and kd of at least 0."""
     if isinstance(value, Mapping):
         return {str(name): _pair(f"gains[{name!r}]", pair) for name, pair in value.items()}
     return None if value is None else _pair("gains", value)
@@ -181,8 +176,8 @@ def add_servos(
     for name, joint in chosen.items():
         kp, kd = gains[name] if isinstance(gains, dict) else gains
         by_joint[joint.index()].set_controller_gains(PdControllerGains(p=kp, d=kd))
-        if says := facts.joints.get(_key(plant, joint)):
-            facts.joints[_key(plant, joint)] = replace(says, damping_ratio=0.0)
+        if says := facts.joints.get(key_of(joint)):
+            facts.joints[key_of(joint)] = replace(says, damping_ratio=0.0)
     return (*notes, f"{len(chosen)} inputs are commanded positions, with the gains given: {', '.join(chosen)}.")
 
 
@@ -195,13 +190,13 @@ def damp_servos(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
     with_ratio = {key: says.damping_ratio for key, says in facts.joints.items() if says.damping_ratio}
     inverse = np.linalg.pinv(plant.CalcMassMatrix(plant.CreateDefaultContext())) if with_ratio else np.zeros((0, 0))
     for actuator in actuators(plant):
-        ratio, i = with_ratio.get(_key(plant, actuator.joint())), actuator.joint().velocity_start()
+        ratio, i = with_ratio.get(key_of(actuator.joint())), actuator.joint().velocity_start()
         if ratio and actuator.has_controller():
             kp = actuator.get_controller_gains().p
             kd = 2 * ratio * float(np.sqrt(kp / inverse[i, i]))
             actuator.set_controller_gains(PdControllerGains(p=kp, d=kd))
             damped.append(f"{actuator.name()} ({kd:.4g})")
-    return (f"Gains kv of servos by their damping ratios: {', '.join(damped)}.",) if damped else ()
+    return note("Gains kv of servos from their damping ratios", damped)
 
 
 def _chosen(
@@ -209,7 +204,7 @@ def _chosen(
 ) -> dict[str, Any]:
     """Return the requested joints by name; raise UnknownNameError or InputError for a joint that cannot be driven."""
     possible = {name: joint for name, joint in labelled(joints(plant)).items() if can_be_driven(joint)}
-    copies = {name for name, joint in possible.items() if _key(plant, joint) in facts.followers}
+    copies = {name for name, joint in possible.items() if key_of(joint) in facts.followers}
     if asked == "all":
         driven = [actuator.joint().index() for actuator in actuators(plant)]
         return {name: j for name, j in possible.items() if j.index() not in driven and name not in copies}
@@ -231,13 +226,9 @@ def _open(joint: Any) -> Iterator[str]:
         yield "position"
 
 
-def _key(plant: MultibodyPlant, joint: Any) -> tuple[str, str]:
-    return str(plant.GetModelInstanceName(joint.model_instance())), str(joint.name())
-
-
 def position_in_file(plant: MultibodyPlant, facts: FileFacts, joint: Any) -> float:
     """Return the position of a hinge or slide [rad or m] in its file's pose, which a .dmd.yaml does not change."""
-    says = facts.joints.get(_key(plant, joint))
+    says = facts.joints.get(key_of(joint))
     if says is not None or joint.num_velocities() != 1:
         return 0.0 if says is None else says.start
     return float(joint.default_positions()[0])
@@ -248,7 +239,7 @@ def _limit_again(actuator: Any, limit: float) -> list[str]:
     if was == limit:
         return []
     actuator.set_effort_limit(limit)
-    return [f"The effort limit of {actuator.name()} became {limit:g}; the file says {was:g}."]
+    return [f"The effort limit of {actuator.name()} became {limit:g}; the file has {was:g}."]
 
 
 def hold_base(plant: MultibodyPlant, base: str | None) -> tuple[str, ...]:
@@ -263,14 +254,14 @@ def hold_base(plant: MultibodyPlant, base: str | None) -> tuple[str, ...]:
     trees = floating_trees(plant)
     if base == "free":
         if not trees:
-            raise ModelError('base="free": nothing floats, ' + _what_holds(plant))
+            raise ModelError('base="free": expected a floating body; ' + _what_holds(plant))
         return ()
     if base == "weld":
         with_joints = [tree for tree in trees if _can_move(plant, tree)]
         if trees and not with_joints:
             names = ", ".join(tree[0].name() for tree in trees)
             raise ModelError(
-                f'base="weld": no joint would be left to move, as the floating bodies carry no joints: {names}'
+                f'base="weld": expected floating bodies with joints, so that the robot can still move, got {names}'
             )
         notes = []
         for root, *_ in with_joints:
@@ -284,7 +275,7 @@ def hold_base(plant: MultibodyPlant, base: str | None) -> tuple[str, ...]:
     except DRAKES_REFUSALS as error:
         raise ModelError(f"base={base!r}: {_plain(error)}") from error
     if not any(frame.body() in tree for tree in trees):
-        raise ModelError(f"base={base!r}: expected a frame of something that floats; " + _what_holds(plant))
+        raise ModelError(f"base={base!r}: expected a frame of a floating body; " + _what_holds(plant))
     return (f"The frame {base} was welded to the world.",)
 
 
@@ -329,8 +320,8 @@ def _can_move(plant: MultibodyPlant, tree: list[Any]) -> bool:
 def _what_holds(plant: MultibodyPlant) -> str:
     world = plant.world_body().index()
     held = [j for j in joints(plant) if world in (j.parent_body().index(), j.child_body().index())]
-    holders = ", ".join(f"{j.name()} ({j.type_name()}) holds {j.child_body().name()}" for j in held)
-    return f"as the file ties it to the world: {holders or 'there is no body'}"
+    holders = ", ".join(f"{j.name()} ({j.type_name()}) of {j.child_body().name()}" for j in held)
+    return f"joints to the world: {holders or 'none, as there is no body'}"
 
 
 def fix(plant: MultibodyPlant, names: tuple[str, ...]) -> tuple[str, ...]:
@@ -346,8 +337,8 @@ def fix(plant: MultibodyPlant, names: tuple[str, ...]) -> tuple[str, ...]:
             raise InputError("fix_joints", got=kind, expected="revolute or prismatic joints")
         if plant.num_constraints():
             raise ModelError(
-                f"fix_joints={name!r}: Drake cannot take a joint out of a model with constraints, and this one has "
-                f"{plant.num_constraints()} that are no mimic joints: fix the joint in the file"
+                f"fix_joints={name!r}: Drake cannot remove a joint from a model with constraints, and this one has "
+                f"{plant.num_constraints()} besides mimic joints: fix the joint in the file"
             )
         low, high = float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
         q = float(np.clip(joint.default_positions()[0], low, high))
@@ -356,7 +347,7 @@ def fix(plant: MultibodyPlant, names: tuple[str, ...]) -> tuple[str, ...]:
         except DRAKES_REFUSALS as error:
             raise ModelError(f"fix_joints={name!r}: {_plain(error)}") from error
         fixed_at.append(f"{name} at {q:g}")
-    return (f"{len(fixed_at)} joints fixed: {', '.join(fixed_at)}.",) if fixed_at else ()
+    return note(f"{len(fixed_at)} joints fixed", fixed_at)
 
 
 def weld(plant: MultibodyPlant, joint: Any, q: float) -> None:
@@ -373,7 +364,7 @@ def add_springs(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
     """Add the joint springs of a file that Drake's parser ignores, which are those of MJCF."""
     sentences = []
     for name, joint in labelled(joints(plant)).items():
-        says = facts.joints.get(_key(plant, joint))
+        says = facts.joints.get(key_of(joint))
         if says is None or says.spring is None or not can_be_driven(joint):
             continue
         stiffness, rest = says.spring
@@ -384,8 +375,7 @@ def add_springs(plant: MultibodyPlant, facts: FileFacts) -> tuple[str, ...]:
         spring = RevoluteSpring if isinstance(joint, RevoluteJoint) else PrismaticSpring
         plant.AddForceElement(spring(joint, rest, stiffness))
         sentences.append(f"{name} ({stiffness:g} about {rest:g})")
-    text = f"{len(sentences)} springs of joints, which Drake's parser does not read: {', '.join(sentences)}."
-    return (text,) if sentences else ()
+    return note(f"{len(sentences)} springs of joints, which Drake's parser does not read", sentences)
 
 
 def check_contact(value: Any) -> None:
@@ -404,12 +394,10 @@ def take_away_contact(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tupl
 
 def touch_the_world_alone(plant: MultibodyPlant, scene_graph: pg.SceneGraph) -> tuple[str, ...]:
     """Exclude contact between moving bodies, except with the world; call it after all shapes are registered."""
-    fixed = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
-    moving = [geometry for body, geometry in collision_geometries(plant, scene_graph) if int(body.index()) not in fixed]
-    if moving:
-        apart = pg.CollisionFilterDeclaration().ExcludeWithin(pg.GeometrySet(moving))
-        scene_graph.collision_filter_manager().Apply(apart)
-    return (f"{len(moving)} collision shapes touch only what is fixed to the world, not each other.",) if moving else ()
+    fixed = {body.index() for body in plant.GetBodiesWeldedTo(plant.world_body())}
+    moving = [geometry for body, geometry in collision_geometries(plant, scene_graph) if body.index() not in fixed]
+    exclude(scene_graph, moving, moving)
+    return (f"{len(moving)} collision shapes touch only bodies fixed to the world, not each other.",) if moving else ()
 
 
 def as_ground(value: Any) -> float | bool | None:
@@ -441,7 +429,6 @@ def _plain(error: BaseException) -> str:
     return str(error).split("(): ", 1)[-1].strip()
 
 
-CHOICES = ("reduce", "fix")
 SLACK = 1e-9  # [m or rad] tolerance for limits that meet in one point up to rounding
 
 
@@ -513,12 +500,6 @@ class JointCoupling:
         solution = np.linalg.solve(mass, E.T @ (value @ ExtractValue(v.reshape(-1, 1)).ravel()))
         missing = self.forces(A @ (v - self.velocities(solution)))  # 0 with nonzero derivatives: a Newton step
         return solution + np.linalg.inv(mass) @ missing
-
-
-def check_mimic(choice: str | None) -> None:
-    """Raise UnknownNameError if the choice is not in CHOICES or None."""
-    if choice is not None and choice not in CHOICES:
-        raise UnknownNameError("mimic", got=choice, known=CHOICES)
 
 
 def _called(plant: MultibodyPlant, mimic: Mimic, name: str) -> list[Any]:
@@ -601,8 +582,6 @@ def fix_mimics(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> tuple[str, .
 
     The leader is at its default position, or at the nearest position that all joints' limits allow.
     """
-    if not mimics:
-        return ()
     followers = _resolved(joints_of_mimics(plant, mimics))
     by_index = {j.index(): j for j in joints(plant)}
     welds: list[tuple[Any, float]] = []
@@ -617,10 +596,10 @@ def fix_mimics(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> tuple[str, .
         _check_limits(leader.name(), low, high)
         q = float(np.clip(leader.default_positions()[0], low, max(low, high)))
         welds += [(joint, ratio * q + offset) for joint, ratio, offset in moving]
-    positions = ", ".join(f"{joint.name()} at {q:.6g}" for joint, q in welds)  # before the joints are removed
+    positions = [f"{joint.name()} at {q:.6g}" for joint, q in welds]  # before the joints are removed
     for joint, q in welds:
         weld(plant, joint, q)
-    return (f"{len(welds)} mimic joints and those that they follow were fixed: {positions}.",)
+    return note(f"{len(welds)} mimic joints and the joints that they follow were fixed", positions)
 
 
 def _check_limits(leader: str, low: float, high: float) -> None:
@@ -632,8 +611,7 @@ def couple(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> tuple[str, ...]:
     """Add the constraints of mimic joints to Drake again, and return a note on the reduction."""
     for mimic, follower, leader in joints_of_mimics(plant, mimics):
         plant.AddCouplerConstraint(follower, leader, mimic.ratio, mimic.offset)
-    listing = ", ".join(map(str, mimics))
-    return (f"{len(mimics)} mimic joints were reduced: {listing}.",) if mimics else ()
+    return note(f"{len(mimics)} mimic joints were reduced", [str(mimic) for mimic in mimics])
 
 
 def coupling_of(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> JointCoupling | None:

@@ -161,7 +161,7 @@ def _read_msh(path: Path) -> Triangles:
     corners = np.frombuffer(data, dtype="<f4", count=3 * vertices, offset=16).reshape(-1, 3).astype(float)
     indices = np.frombuffer(data, dtype="<i4", count=3 * faces, offset=begin).reshape(-1, 3).astype(np.int64)
     if np.any(indices < 0) or np.any(indices >= vertices) or not np.all(np.isfinite(corners)):
-        raise ModelError(f"{path}: expected faces whose indices are those of finite vertices of the mesh")
+        raise ModelError(f"{path}: expected finite vertices, and faces with indices of these vertices")
     return _joined(corners, indices, None)
 
 
@@ -174,7 +174,7 @@ class _Materials:
     def get(self, name: str) -> bytes:
         path = self._folder / Path(name).name
         if path.suffix.lower() != ".mtl" or not path.is_file():
-            raise ValueError(f"{name} is not opened")
+            raise ValueError(f"{name} is not opened, only .mtl files are")
         return path.read_bytes()
 
 
@@ -418,6 +418,7 @@ class CoverSpheres:
     open_gap: float
 
 
+@lru_cache(maxsize=256)  # the hull itself is the key, so it stays in memory
 def fit_spheres(hull: Hull, label: str) -> CoverSpheres:
     """Fit at most MOST_SPHERES spheres to a hull by the rule above; `label` names the hull in a ModelError."""
     size = float(np.max(np.ptp(hull.corners, axis=0)))  # the solver's tolerances require numbers near 1
@@ -463,7 +464,7 @@ class _Shape:
         result = ClarabelSolver().Solve(program)
         if not result.is_success():
             why = result.get_solution_result()
-            raise ModelError(f"{self.label}: no place for a sphere in its hull was found: {why}")
+            raise ModelError(f"{self.label}: found no place for a sphere in its convex hull: {why}")
         return np.asarray(result.GetSolution(x), dtype=float)
 
     def filled(self, radius: float) -> CoverSpheres:

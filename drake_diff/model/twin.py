@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.multibody.tree import MultibodyForces_
 
-from drake_diff._base.arrays import Array
 from drake_diff._base.clock import check_time
 from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.model.inputs import Inputs
@@ -168,18 +167,6 @@ class Twin:
         every = enumerate(actuators(self.plant))
         return [(i, a, int(a.joint().velocity_start())) for i, a in every if a.has_controller()]
 
-    @property
-    def position_limits(self) -> tuple[Array, Array]:
-        """Lower and upper limits (nq,) each; for independent coordinates, the limits of all their joints."""
-        limits = np.array(self.plant.GetPositionLowerLimits()), np.array(self.plant.GetPositionUpperLimits())
-        return limits if self.coupling is None else self.coupling.limits(*limits)
-
-    @property
-    def velocity_limits(self) -> tuple[Array, Array]:
-        """Lower and upper limits (nv,) each."""
-        limits = np.array(self.plant.GetVelocityLowerLimits()), np.array(self.plant.GetVelocityUpperLimits())
-        return limits if self.coupling is None else self.coupling.limits(*limits, of_velocities=True)
-
     def set_state(self, x: Any) -> None:
         """Set the state x (nx,) in the context; raise ModelError in a thread other than the context's owner.
 
@@ -291,18 +278,15 @@ class Twin:
     def _driven_force(self) -> Any:
         """Return the force (nv,) of the actuators that the diagram's systems drive."""
         total, plant, fed = np.zeros(self.plant.num_velocities()).astype(self.scalar), self.plant, self.inputs.fed
-        whole = plant.get_actuation_input_port()
-        parts = {i: plant.get_actuation_input_port(i) for i in instances(plant)}
-        driven = set(self.inputs.fed_actuators)
-        for i, actuator in enumerate(actuators(plant) if driven else ()):
-            if i not in driven:
-                continue
-            effort, port = 0.0, parts[actuator.model_instance()]
+        whole, every = plant.get_actuation_input_port(), actuators(plant) if self.inputs.fed_actuators else []
+        for i in self.inputs.fed_actuators:
+            actuator, effort = every[i], 0.0
+            port = plant.get_actuation_input_port(actuator.model_instance())
             if int(whole.get_index()) in fed:
                 effort = effort + whole.Eval(self.context)[i]
             if int(port.get_index()) in fed:
-                motors = [a for a in actuators(plant) if a.model_instance() == actuator.model_instance()]
-                effort = effort + port.Eval(self.context)[[a.index() for a in motors].index(actuator.index())]
+                motors = [a.index() for a in every if a.model_instance() == actuator.model_instance()]
+                effort = effort + port.Eval(self.context)[motors.index(actuator.index())]
             limit = float(actuator.effort_limit())
             total[actuator.joint().velocity_start()] += max(-limit, min(limit, effort))
         return self.own_force(total)
@@ -339,7 +323,7 @@ class Twin:
             port.FixValue(self.context, np.zeros(self.plant.num_velocities()).astype(self.scalar))
 
 
-REMEDY = "which Drake keeps in the plant, not in a context: load a model of its own for each thread"
+REMEDY = "which Drake stores in the plant, not in a context: load a separate model for each thread"
 
 
 class OfThread(threading.local):

@@ -43,8 +43,16 @@ class Element:
             element = None if element is None else next((c for c in element.children if c.tag == tag), None)
         return element
 
-    def findall(self, tag: str) -> "list[Element]":
-        return [child for child in self.children if child.tag == tag]
+    def findall(self, *path: str) -> "list[Element]":
+        """Return the children with the first tag, all their children with the next tag, and so on; "*" is any tag."""
+        elements = [self]
+        for tag in path:
+            elements = [child for element in elements for child in element.children if tag in (child.tag, "*")]
+        return elements
+
+    def of_world(self, *tags: str) -> "list[Element]":
+        """Return the elements with these tags, or all elements, in the <worldbody>s of an MJCF file's root."""
+        return [element for world in self.findall("worldbody") for element in world.iter(*tags)]
 
     def iter(self, *tags: str) -> "Iterator[Element]":
         """Yield this element and its descendants in the order of the file, or only those with the given tags."""
@@ -77,7 +85,7 @@ class XmlText:
         try:
             parser.Parse(self._tags, True)
         except expat.ExpatError as error:
-            raise ModelError(f"line {error.lineno}: no XML: {expat.ErrorString(error.code)}") from error
+            raise ModelError(f"line {error.lineno}: invalid XML: {expat.ErrorString(error.code)}") from error
         except LookupError as error:
             raise ModelError(f"line 1: {error}") from error
         self.root: Element = self._roots[0]
@@ -87,7 +95,7 @@ class XmlText:
 
     def _begin(self, parser: Any, tag: str, attributes: dict[str, str]) -> None:
         if len(self._open) >= DEEPEST:
-            raise ModelError(f"line {parser.CurrentLineNumber}: expected at most {DEEPEST} elements inside one another")
+            raise ModelError(f"line {parser.CurrentLineNumber}: expected at most {DEEPEST} levels of nested elements")
         parent = self._open[-1] if self._open else None
         start = parser.CurrentByteIndex
         element = Element(tag, attributes, parent, parser.CurrentLineNumber, start, self._behind_tag(start))
@@ -200,3 +208,17 @@ class XmlText:
                 parts += [self.data[end_of_last:start], new]
                 end_of_last = end
         return (b"".join(parts) + self.data[end_of_last:]).decode()
+
+
+def numbers_in(text: str) -> list[float]:
+    """Return the numbers of an attribute, or [] if it has other text, which Drake refuses when it reads it."""
+    try:
+        return [float(word) for word in text.split()]
+    except ValueError:
+        return []
+
+
+def first_number(attributes: Element | dict[str, str], name: str, default: float = 0.0) -> float:
+    """Return the first number of an attribute, or the default if there is no number."""
+    numbers = numbers_in(attributes.get(name, ""))
+    return numbers[0] if numbers else default

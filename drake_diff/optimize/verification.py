@@ -250,12 +250,11 @@ def _remedies(solution: Solution, arguments: dict[str, Any], other_methods: Sequ
         yield "a smaller time step"
     if status is not Status.NO_GRADIENT:
         yield from (f'method="{method}"' for method in other_methods)
-    if status is Status.NO_GRADIENT and touching:
-        yield "an initial_guess in which the bodies touch"
-    elif solution.certificates and solution.certificates[0].verdict == "discontinuous":
+    if solution.certificates and solution.certificates[0].verdict == "discontinuous":
         yield "an x0 that is not exactly at a contact or joint limit"
     else:
-        yield "another initial_guess"
+        blind = status is Status.NO_GRADIENT and touching
+        yield "an initial_guess in which the bodies touch" if blind else "another initial_guess"
 
 
 def _nearer_goals(solution: Solution) -> Iterator[str]:

@@ -16,7 +16,7 @@ from pydrake.geometry import Box, Cylinder, Mesh, Role, Sphere
 from trust import Figure
 
 import drake_diff as dd
-from drake_diff.model.example import example_files
+from drake_diff.model.model import example_files
 from drake_diff.planning import plan
 from drake_diff.planning.robot import load_robot
 

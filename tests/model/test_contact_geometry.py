@@ -216,7 +216,7 @@ def test_what_stays_refused_is_said(shapes, kind):
     (note,) = replaced(plant)
     assert kind in note
     assert "refuses" in note
-    assert "hydroelastic or differences" in note
+    assert 'use contact_geometry="hydroelastic" or "differences"' in note
     assert collision_names(plant) == ["box_shape"]
 
 

@@ -8,7 +8,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 import drake_diff as dd
 from drake_diff.exceptions import UnknownNameError
-from drake_diff.model.example import example_files
+from drake_diff.model.model import example_files
 
 LARGEST = 100_000  # [bytes] maximum size of one file
 

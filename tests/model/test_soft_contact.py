@@ -157,3 +157,13 @@ def tangent(gradient, q):
     """Return the gradient without the part that changes the quaternion's norm, which no motion changes."""
     along = np.concatenate([q[:4], np.zeros(3)])
     return gradient - along * (gradient @ along)
+
+
+def test_the_inputs_of_servos_stay_commanded_positions(load):
+    model = load("two_fingers.sdf", inputs="position", gains=(200.0, 5.0))
+    soft = dd.model.softened(model, SOFT)
+    x, u = model.default_state, np.full(model.nu, 0.01)
+    assert soft.inputs.units == model.inputs.units
+    far = dd.model.softened(model, dd.model.SoftContact(1e-6, 1e-6))  # a negligible force
+    np.testing.assert_allclose(dd.step(far, x, u), dd.step(model, x, u), atol=1e-6)
+    assert np.abs(dd.step(model, x, u) - dd.step(model, x, 0 * u)).max() > 1e-4

@@ -106,7 +106,7 @@ def test_no_thread_begins_to_use_a_model_whose_plant_another_one_has_changed(loa
     model = load("pendulum.urdf")
     with dd.model.parameters.applied(dd.model.parameters.select(model, {"model.gravity": [0, 0, -1.62]})):
         with pytest.raises(
-            ModelError, match=r"another thread \(MainThread\) has set model.gravity of this model.*its own"
+            ModelError, match=r"another thread \(MainThread\) has set model.gravity of this model.*a separate model"
         ):
             elsewhere(lambda: dd.step(model, [0.3, 0.0], [0.0]))
         assert dd.step(model, [0.3, 0.0], [0.0]).shape == (2,)

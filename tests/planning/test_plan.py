@@ -11,7 +11,7 @@ from helpers.table import each_row
 import drake_diff as dd
 from drake_diff.cli.main import main
 from drake_diff.exceptions import ModelError
-from drake_diff.model.example import example_files
+from drake_diff.model.model import example_files
 from drake_diff.planning import plan
 from drake_diff.planning.guesses import PostureLine, along
 from drake_diff.planning.robot import load_robot

@@ -130,10 +130,10 @@ CONSTANTS = {
     },
     "docs/limitations.md": {
         "1e-6": SAP,
-        "3": "drake_diff.optimize.replay:FEEDBACK_TOLERANCE",
-        "5": "drake_diff.optimize.replay:STATE_TOLERANCE",
     },
     "docs/verification.md": {
+        "3": "drake_diff.optimize.replay:FEEDBACK_TOLERANCE",
+        "5": "drake_diff.optimize.replay:STATE_TOLERANCE",
         "1e-6": "drake_diff.runs.differences:RELATIVE",
         "1e-9": "drake_diff.runs.differences:ABSOLUTE",
     },
