@@ -24,7 +24,7 @@ from drake_diff.comparison.recordings import Recording
 from drake_diff.engines.contract import NOT_TOLD, SAME_NUMBER, ContractLine, match_contracts
 from drake_diff.engines.drake import DrakeEngine
 from drake_diff.engines.equations import ClosedForm
-from drake_diff.engines.interface import Engine, EngineContract, Precision
+from drake_diff.engines.interface import Engine, Precision
 from drake_diff.exceptions import GradientError, InputError, NotOfferedError, SimulationError
 from drake_diff.mechanics.coordinates import Coordinates, euler_acceleration, exponential_turn
 from drake_diff.mechanics.description import coordinates_of
@@ -93,7 +93,6 @@ def move(engine: Engine, x0: Array, us: Array) -> EngineMotion:
 
 def measured(engine: Engine, times: Array, xs: Array, us: Array, status: str = "ok") -> EngineMotion:
     """Return the motion `xs` (n, nx) with the energies and penetration depths that `engine` computes."""
-
     energy, depth = ([_offered_by(ask, x) for x in xs] for ask in (engine.energy, engine.contact_depth))
     energies, depths = (None if None in values else frozen(np.array(values)) for values in (energy, depth))
     return EngineMotion(frozen(times), frozen(xs), frozen(us), energies, depths, status)
@@ -156,9 +155,8 @@ def jacobian_at(
     jacobian = space.jacobian(x, engine.step(x, u), derivatives.A, derivatives.B)
     if precision == "float32":
         gap = np.abs(jacobian - quotients()).max() / np.abs(jacobian).max()
-        return JacobianAt(
-            state, frozen(jacobian), derivatives.method, AGREES if gap <= COMPARE.single else "undecided", None
-        )
+        verdict = AGREES if gap <= COMPARE.single else "undecided"
+        return JacobianAt(state, frozen(jacobian), derivatives.method, verdict, None)
     # The relative residual that the engine's solver leaves for a step in contact.
     unsolved = (engine.contract.solver_tolerance or 0.0) if engine.contact_depth(x) else 0.0
     by_differences = COMPARE.differences_leave if "differences" in derivatives.method else 0.0
@@ -236,23 +234,23 @@ def attribute(
     coordinates: Coordinates, first: Engine, second: Engine, x: Array, u: Array, steps: tuple[Array, Array]
 ) -> Attribution:
     """Attribute the difference of the `steps` (nx,) of `first` and `second` from `x` (nx,) under `u` (nu,)."""
-    q, v = x[: coordinates.nq], x[coordinates.nq :]
+    q, v, contracts = x[: coordinates.nq], x[coordinates.nq :], (first.contract, second.contract)
     masses, no_mass = _offered((first, second), "M(q)", lambda engine: engine.mass_matrix(q), np.eye(len(v)))
     biases, no_bias = _offered((first, second), "bias(q, v)", lambda engine: engine.bias(q, v), np.zeros(len(v)))
     a, b = (
         Terms(
             M,  # a closed form has no forces, so they are M times its accelerations
-            *(engine.terms(M, x, u) if isinstance(engine, ClosedForm) else (bias, *forces(engine.contract, u))),
-            engine.contract.time_step,
+            *(engine.terms(M, x, u) if isinstance(engine, ClosedForm) else (bias, facts.effort(u), facts.damping)),
+            facts.time_step,
         )
-        for M, bias, engine in zip(masses, biases, (first, second), strict=True)
+        for M, bias, engine, facts in zip(masses, biases, (first, second), contracts, strict=True)
     )
     after_a, after_b = (of_norm_one(coordinates, after, x) for after in steps)
     schemes = []
-    for engine, terms, after in ((first, a, after_a), (second, b, after_b)):
+    for facts, terms, after in zip(contracts, (a, b), (after_a, after_b), strict=True):
         misfits = {scheme: _size(after - euler(coordinates, x, terms, scheme)) for scheme in SCHEMES}
         best = min(misfits, key=lambda scheme: misfits[scheme])
-        fits = misfits[best] <= FITS[engine.contract.precision] * max(1.0, _size(after))
+        fits = misfits[best] <= FITS[facts.precision] * max(1.0, _size(after))
         schemes.append(best if fits else SCHEMES[0])  # if none fits, the cause is something else
     scheme_a, scheme_b = schemes
     base = euler(coordinates, x, a, scheme_a)
@@ -302,14 +300,6 @@ def _offered(
     return [known if value is None else value for value in answers], missing
 
 
-def forces(contract: EngineContract, u: Array) -> tuple[Array, Array]:
-    """Return B u and the joints' damping, (nv,) each."""
-    limits = np.array(contract.effort_limits)
-    actuation = np.array(contract.actuation, dtype=float).reshape(len(contract.actuation), len(u))
-    damping = [[0.0] * 6 if joint.kind == "quaternion_floating" else [joint.damping] for joint in contract.joints]
-    return actuation @ np.clip(u, -limits, limits), np.array([number for joint in damping for number in joint])
-
-
 def what_is_left(
     coordinates: Coordinates,
     first: Engine,
@@ -339,8 +329,8 @@ def _push(coordinates: Coordinates, engine: Engine, x: Array, left: Array, after
     change = left[coordinates.nq :]
     if _size(change) <= FITS[engine.contract.precision] * max(1.0, _size(after)):
         return set()
-    _, damping = forces(engine.contract, np.zeros(len(engine.contract.inputs)))  # implicit in Drake's step
-    force = np.abs((engine.mass_matrix(x[: coordinates.nq]) + engine.contract.time_step * np.diag(damping)) @ change)
+    damping = engine.contract.time_step * np.diag(engine.contract.damping)  # implicit in Drake's step
+    force = np.abs((engine.mass_matrix(x[: coordinates.nq]) + damping) @ change)
     return {int(j) for j in np.flatnonzero(force > COMPARE.pushed * np.max(force))}
 
 
@@ -369,8 +359,6 @@ def _size(difference: Array) -> float:
 
 
 PRECISIONS: dict[str, Precision] = {"float64": "float64", "float32": "float32"}
-
-
 LAWS_OF_STEPS: Mapping[str, EulerScheme] = {
     "as if joint damping were explicit": EulerScheme(damping="explicit"),
     "as if positions moved with the velocity before the step": EulerScheme(position="v"),
@@ -389,26 +377,24 @@ def precision_of(recording: Recording) -> Precision:
 def told_lines(recording: Recording, reference: DrakeEngine) -> tuple[ContractLine, ...]:
     """Return one line per quantity of a contract; a quantity without a fact is "different" because it is unknown."""
     ours, lines = reference.contract, []
-    texts = {"integrator": ours.integrator, "contact law": ours.contact_law, "limit law": ours.limit_law}
-    numbers = {"time step": (ours.time_step,), "gravity": ours.gravity}
+    values: dict[str, str | tuple[float, ...]] = {
+        "integrator": ours.integrator, "contact law": ours.contact_law, "limit law": ours.limit_law,
+        "time step": (ours.time_step,), "gravity": ours.gravity,
+    }  # fmt: skip
     quantities = [line.quantity for line in match_contracts(reference, reference)]
     for quantity in (*quantities, "seeds", "reset distribution"):
-        fact = recording.facts.get(quantity)
+        fact, value = recording.facts.get(quantity), values.get(quantity)
         if fact is None:
             lines.append(ContractLine(quantity, "different", NOT_TOLD, NOT_TOLD))
-            continue
-        if quantity in texts:
-            value: object = texts[quantity]
-            same = fact == value
-        elif quantity in numbers:
-            value = numbers[quantity]
-            theirs = _numbers(recording, quantity, fact, len(numbers[quantity]))
-            same = np.allclose(theirs, np.array(value), rtol=SAME_NUMBER[precision_of(recording)], atol=0.0)
-        else:
+        elif value is None:
             lines.append(ContractLine(quantity, "mapped", f"{fact}; here each step starts from the recorded state"))
-            continue
-        detail = fact if same else f"{ours.engine}: {value}; {recording.name}: {fact}"
-        lines.append(ContractLine(quantity, "equal" if same else "different", detail))
+        else:
+            same = fact == value
+            if not isinstance(value, str):
+                theirs = _numbers(recording, quantity, fact, len(value))
+                same = np.allclose(theirs, value, rtol=SAME_NUMBER[precision_of(recording)], atol=0.0)
+            detail = fact if same else f"{ours.engine}: {value}; {recording.name}: {fact}"
+            lines.append(ContractLine(quantity, "equal" if same else "different", detail))
     return tuple(lines)
 
 
@@ -436,16 +422,13 @@ def attribute_recorded(
     """Attribute the difference of the recorded state `after` (nx,) from that after `count` reference steps."""
     coordinates = coordinates_of(reference.model)
     theirs, ours = (of_norm_one(coordinates, state, x) for state in (after, advanced(reference, x, u, count)))
-    gap, schemes = float(np.abs(theirs - ours).max()), (SCHEMES[0], SCHEMES[0])
+    gap, schemes = _size(theirs - ours), (SCHEMES[0], SCHEMES[0])
     if gap <= tolerance:
         return Attribution(gap, {}, "", schemes)
     law = what_is_left(coordinates, reference, reference, x, (ours, theirs))
     if law != UNEXPLAINED:
         return Attribution(gap, {law: gap}, law, schemes)
-    misfits = {
-        name: float(np.abs(theirs - _stepped(reference, x, u, count, scheme)).max())
-        for name, scheme in LAWS_OF_STEPS.items()
-    }
+    misfits = {name: _size(theirs - _stepped(reference, x, u, count, scheme)) for name, scheme in LAWS_OF_STEPS.items()}
     best = min(misfits, key=lambda name: misfits[name])
     if not misfits[best] <= COMPARE.closes * gap:
         return Attribution(gap, {UNEXPLAINED: gap}, UNEXPLAINED, schemes)
@@ -456,9 +439,9 @@ def attribute_recorded(
 def _stepped(reference: DrakeEngine, x: Array, u: Array, count: int, scheme: EulerScheme) -> Array:
     """Return the state (nx,) after `count` Euler steps with the reference's terms and another scheme."""
     nq, contract = reference.model.nq, reference.contract
-    actuation, damping = forces(contract, u)
+    given = contract.effort(u), contract.damping, contract.time_step
     for _ in range(count):
         q, v = x[:nq], x[nq:]
-        terms = Terms(reference.mass_matrix(q), reference.bias(q, v), actuation, damping, contract.time_step)
-        x = euler(reference.description.coordinates, x, terms, scheme)
+        terms = Terms(reference.mass_matrix(q), reference.bias(q, v), *given)
+        x = euler(coordinates_of(reference.model), x, terms, scheme)
     return x

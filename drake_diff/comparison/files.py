@@ -89,29 +89,26 @@ def write_comparison(
     names = [recording.name for recording in comparison.recordings]
     twice = [name for name in names if names.count(name) > 1 and name in causes]
     if twice:
-        raise InputError("recordings with causes", got=f"two called {twice[0]}", expected="a name for each")
+        raise InputError("recordings with causes", got=f"two called {twice[0]}", expected="distinct names")
     _begun(name_of(folder), comparison.model).begin(folder)
     record = record_of(comparison, name_of(folder), causes)
-    _keep(folder, comparison)
+    recordings, source = _saved_recordings(comparison), comparison.model.source
+    for i, recording in enumerate(recordings):
+        write_arrays(folder / place_of(i), recording)
+    if recordings and source is not None:
+        write_whole(folder / source.name, source.read_bytes())
+        write_bundle(folder, comparison.model)
     write_comparison_trace(folder / TRACE, comparison)
     write_replay(folder / REPLAY, _scene(comparison), title=f"{record.name}: {record.verdict}")
-    write_comparison_page(folder / PAGE, comparison, record, folder / REPLAY)
+    view = (folder / REPLAY).read_text(encoding="utf-8")  # shows the engines as ghosts
+    fields, data = _fields_of(record), comparison_data(comparison)
+    write_page(folder / PAGE, TEMPLATE, record=fields, data=data, view=view, most_plots=MOST_PLOTS)
     return record.write(folder)
 
 
 def _saved_recordings(comparison: Comparison) -> tuple[Recording, ...]:
     """Return all recordings, or none if their total size is too large."""
     return comparison.recordings if sum(map(size_of, comparison.recordings)) <= LARGEST else ()
-
-
-def _keep(folder: Path, comparison: Comparison) -> None:
-    recordings = _saved_recordings(comparison)
-    for i, recording in enumerate(recordings):
-        write_arrays(folder / place_of(i), recording)
-    source = comparison.model.source
-    if recordings and source is not None:
-        write_whole(folder / source.name, source.read_bytes())
-        write_bundle(folder, comparison.model)
 
 
 def record_of(
@@ -258,14 +255,6 @@ SAME_TIME = 1e-6  # [s] tolerance for clocks in single precision
 MOST_PLOTS = 12  # plots of the coordinates with the largest differences
 
 
-def write_comparison_page(path: Path, comparison: Comparison, record: ComparisonRecord, replay: Path) -> None:
-    """Write the page of `comparison` with its `record` and the page `replay`, which shows the engines as ghosts."""
-    write_page(
-        path, TEMPLATE, record=_fields_of(record), data=comparison_data(comparison),
-        view=replay.read_text(encoding="utf-8"), most_plots=MOST_PLOTS,
-    )  # fmt: skip
-
-
 def _fields_of(record: ComparisonRecord) -> dict[str, Any]:
     fields: dict[str, Any] = json.loads(canonical(record.model_dump(mode="json")))
     return fields  # in the order of the written record
@@ -300,8 +289,7 @@ def _gap_plots(comparison: Comparison) -> Iterator[Plot]:
     steps, distances = [reference], [reference]
     for e in comparison.engines[1:]:
         steps.append(Line(e.engine, _on(ours.times, e.motion, np.append(e.step_gaps, np.nan))))
-        columns = [_on(e.motion.times, ours, x) for x in ours.xs.T]
-        distance = np.abs(e.motion.xs - np.array(columns).T).max(axis=1)
+        distance = np.abs(e.motion.xs - _on(e.motion.times, ours, ours.xs)).max(axis=1)
         distances.append(Line(e.engine, _on(ours.times, e.motion, distance)))
     note = "difference of one step from Drake's, relative to the state, from the same state; a log scale omits 0"
     yield Plot("gap of each step", "1", ours.times, steps, log=True, note=note, group="Gaps")
@@ -311,12 +299,9 @@ def _gap_plots(comparison: Comparison) -> Iterator[Plot]:
 
 def _measure_plots(comparison: Comparison) -> Iterator[Plot]:
     """Yield plots of the energy and penetration that each engine computes."""
-    times, energies, depths = comparison.reference.motion.times, [], []
-    for e in comparison.engines:
-        if e.motion.energy is not None:
-            energies.append(Line(e.engine, _on(times, e.motion, e.motion.energy - e.motion.energy[0])))
-        if e.motion.depth is not None:
-            depths.append(Line(e.engine, _on(times, e.motion, e.motion.depth)))
+    times, motions = comparison.reference.motion.times, [(e.engine, e.motion) for e in comparison.engines]
+    energies = [Line(name, _on(times, m, m.energy - m.energy[0])) for name, m in motions if m.energy is not None]
+    depths = [Line(name, _on(times, m, m.depth)) for name, m in motions if m.depth is not None]
     note = "kinetic and potential energy, minus their sum at the start; inputs, damping and contact change it too"
     yield Plot("energy", "J", times, energies, note=note, group="Energy and contact")
     note = "the deepest overlap that the engine finds"
@@ -327,16 +312,16 @@ def _coordinate_plots(comparison: Comparison) -> Iterator[Plot]:
     """Yield plots of the coordinates with the largest differences, in the order of the state."""
     model, times = comparison.model, comparison.reference.motion.times
     units = [c.unit for c in (*model.contract.positions, *model.contract.velocities)]
-    motions = [[_on(times, e.motion, e.motion.xs[:, i]) for e in comparison.engines] for i in range(model.nx)]
-    spread = [float(np.nanmax(np.nanmax(xs, axis=0) - np.nanmin(xs, axis=0))) for xs in motions]
+    motions = np.array([_on(times, e.motion, e.motion.xs) for e in comparison.engines])
+    spread = np.nanmax(np.nanmax(motions, axis=0) - np.nanmin(motions, axis=0), axis=0)
     for i in sorted(np.argsort(spread)[::-1][:MOST_PLOTS]):
-        lines = [Line(e.engine, x) for e, x in zip(comparison.engines, motions[i], strict=True)]
+        lines = [Line(e.engine, x) for e, x in zip(comparison.engines, motions[:, :, i], strict=True)]
         yield Plot(model.state_names[i], units[i], times, lines, group="Coordinates")
 
 
 def _on(times: Array, motion: EngineMotion, values: Array) -> Array:
-    """Return `values` (n,) of a motion at `times`, NaN where it has no sample."""
-    sampled = np.full(len(times), np.nan)
+    """Return `values` (n, ...) of a motion at `times`, NaN where it has no sample."""
+    sampled = np.full((len(times), *np.shape(values)[1:]), np.nan)
     indices = np.searchsorted(times, motion.times - SAME_TIME)
     known = (indices < len(times)) & (np.abs(times[np.minimum(indices, len(times) - 1)] - motion.times) < SAME_TIME)
     sampled[indices[known]] = np.asarray(values)[known]

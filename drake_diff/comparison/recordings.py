@@ -16,7 +16,7 @@ import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from itertools import islice
+from itertools import chain, count, islice
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +82,7 @@ def _messages(path: Path) -> tuple[list[tuple[str, str, bytes]], Mapping[str, st
         with closing(sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro", uri=True)) as base:
             (others,) = base.execute("SELECT count(*) FROM sqlite_master WHERE type IN ('view', 'trigger')").fetchone()
         if others:  # views and triggers can generate endless rows
-            raise ArtifactError(f"{file}: expected tables of messages alone, got {others} views and triggers")
+            raise ArtifactError(f"{file}: expected only tables of messages, got {others} views and triggers")
     with Reader(path) as bag:
         wanted = [c for c in bag.connections if c.msgtype in USED]
         return [(c.topic, c.msgtype, data) for c, _, data in bag.messages(wanted)] if wanted else [], {}
@@ -101,33 +101,25 @@ class _Found:
 
     def motion(self) -> tuple[Array, Array, Array]:
         model = self.model
-        joints = self._only(JOINTS, "/joint_states") if self.singles else {}
+        messages = self._only(JOINTS, "/joint_states") if self.singles else {}
         bases = {link.body: self._base_of(link) for link in self.free}
-        stamps = self._common({"the joints": joints, **bases} if self.singles else bases)
+        stamps = self._common({"the joints": messages, **bases} if self.singles else bases)
         xs, us = np.zeros((len(stamps), model.nx)), np.zeros((max(len(stamps) - 1, 0), model.nu))
-        places = {link.joint: self._places(link) for link in (*self.singles, *self.free)}
+        places = {label: model.places(joint) for label, joint in labelled(joints(model.plant)).items()}
         for k, time in enumerate(stamps):
             for link in self.singles:
-                i, j = places[link.joint]
-                xs[k, i] = self._joint(joints[time], time, link.joint, "position")
-                xs[k, model.nq + j] = self._joint(joints[time], time, link.joint, "velocity")
+                q, v = places[link.joint]
+                xs[k, q.start] = self._joint(messages[time], time, link.joint, "position")
+                xs[k, model.nq + v.start] = self._joint(messages[time], time, link.joint, "velocity")
             for link in self.free:
-                i, j = places[link.joint]
-                xs[k, i : i + 7] = bases[link.body][time][:7]
-                xs[k, model.nq + j : model.nq + j + 6] = bases[link.body][time][7:]
+                q, v = places[link.joint]
+                xs[k, [*q, *(model.nq + j for j in v)]] = bases[link.body][time]
             for i, joint in enumerate(self.description.actuated if k < len(us) else ()):
                 if self.description.actuated.count(joint) > 1:
                     expected = "a joint with one actuator"
                     raise InputError(f"joint {joint}", got="several actuators", expected=expected)
-                us[k, i] = self._joint(joints[time], time, joint, "effort")
+                us[k, i] = self._joint(messages[time], time, joint, "effort")
         return np.array([time - stamps[0] for time in stamps]) / 1e9, xs, us
-
-    def _places(self, link: Link) -> tuple[int, int]:
-        """Return the first indices of a joint in q and v of the model."""
-        coupling = self.model.coupling
-        if coupling is None:
-            return link.q_start, link.v_start
-        return int(np.searchsorted(coupling.own_q, link.q_start)), int(np.searchsorted(coupling.own_v, link.v_start))
 
     def _common(self, parts: Mapping[str, Mapping[int, Any]]) -> list[int]:
         """Return the times of all parts. Raises InputError for a time that a part lacks."""
@@ -136,8 +128,8 @@ class _Found:
             there = [name for name, messages in parts.items() if time in messages]
             if len(there) < len(parts):
                 raise InputError(
-                    f"{self.path}: t = {time} ns", got=f"{', '.join(there)} alone",
-                    expected=f"{', '.join(parts)} at each time",
+                    f"{self.path}: t = {time} ns", got=f"only {', '.join(there)}",
+                    expected=f"messages of {', '.join(parts)} at each time",
                 )  # fmt: skip
         return every
 
@@ -145,7 +137,7 @@ class _Found:
         names, values = list(message.name), getattr(message, what)
         subject = f"{self.path}: JointState at {time} ns, {what} of {joint}"
         if joint not in names or len(values) != len(names):
-            raise InputError(subject, got=f"{len(values)} of {', '.join(names)}", expected="one value for each joint")
+            raise InputError(subject, got=f"{len(values)} values for {', '.join(names)}", expected="one for each joint")
         value = float(values[names.index(joint)])
         if not np.isfinite(value):
             raise InputError(subject, got=value, expected="a finite number")
@@ -157,7 +149,7 @@ class _Found:
             if topic == preferred:
                 return messages
         if len(sources) != 1:
-            raise InputError(f"{self.path}: topics of {kind}", got=_listed(sources), expected=preferred or "one")
+            raise InputError(f"{self.path}: topics of {kind}", got=_listed(sources), expected=preferred or "one topic")
         return next(iter(sources.values()))
 
     def _of_body(self, kind: str, link: Link) -> Stamped:
@@ -172,12 +164,12 @@ class _Found:
             return self._only(kind)
         raise InputError(
             f"{self.path}: topics of {kind} of the free body {link.body}", got=_listed(sources),
-            expected=f"one of the frame {link.body}, or with {link.body} as a part of its name",
+            expected=f"one topic with the frame {link.body}, or with {link.body} in its name",
         )  # fmt: skip
 
     def _base_of(self, link: Link) -> dict[int, Array]:
         if not all(X.IsExactlyIdentity() for X in (link.on_parent, link.on_child)):
-            raise InputError("free bodies", got=link.joint, expected="by its own frame in the world")
+            raise InputError("free body", got=link.joint, expected="a joint of its own frame to the world")
         if self.sources[ODOMETRY]:
             odometry = self._of_body(ODOMETRY, link)
             return {t: _base(m.pose.pose, m.twist.twist, in_body=True) for t, m in odometry.items()}
@@ -259,10 +251,8 @@ def check_recording(recording: Recording, model: Model) -> None:
     times = finite_array(f"{subject}: times", recording.times, ("n",))
     if len(times) < 2:
         raise InputError(f"{subject}: times", got=f"{len(times)}", expected="two or more")
-    late = np.flatnonzero(np.diff(times) <= 0)
-    if len(late):
-        k = int(late[0]) + 1
-        before = f"more than {times[k - 1]} s before it"
+    for k in np.flatnonzero(np.diff(times) <= 0)[:1] + 1:
+        before = f"more than {times[k - 1]} s, the time of the sample before"
         raise InputError(f"{subject}: time of sample {k}", got=f"{times[k]} s", expected=before)
     xs = finite_array(f"{subject}: xs", recording.xs, (len(times), model.nx))
     us = finite_array(f"{subject}: us", recording.us, (len(times) - 1, model.nu))
@@ -294,14 +284,10 @@ def steps_between(recording: Recording, time_step: float) -> int:
     """
     periods = np.diff(recording.times)
     count = max(1, round(float(periods[0]) / time_step))
-    wrong = np.flatnonzero(np.abs(periods - count * time_step) > CLOCK_TOLERANCE * time_step)
-    if len(wrong):
-        k = int(wrong[0])
-        raise InputError(
-            f"recording {recording.name}: period from sample {k} to {k + 1}",
-            got=f"{periods[k]:.9g} s",
-            expected=f"{count * time_step:g} s throughout, a whole multiple of the model's time step, {time_step:g} s",
-        )
+    for k in np.flatnonzero(np.abs(periods - count * time_step) > CLOCK_TOLERANCE * time_step)[:1]:
+        subject = f"recording {recording.name}: period from sample {k} to {k + 1}"
+        whole = f"{count * time_step:g} s throughout, a whole multiple of the model's time step, {time_step:g} s"
+        raise InputError(subject, got=f"{periods[k]:.9g} s", expected=whole)
     return count
 
 
@@ -311,8 +297,8 @@ LONGEST_LINE = 2**20  # characters of a line of a CSV file
 MOST_NUMBERS = 2**25  # of a recording: 256 MiB
 BLOCK = 10_000  # number of rows that are read at once
 PACKED = {
-    b"\x1f\x8b": "a file packed by gzip", b"PK\x03\x04": "a zip archive", b"\x28\xb5\x2f\xfd": "a file packed by zstd",
-    b"\xfd7zXZ": "a file packed by xz", b"BZh": "a file packed by bzip2", b"\xff\xfe": "text in UTF-16",
+    b"\x1f\x8b": "a gzip file", b"PK\x03\x04": "a zip archive", b"\x28\xb5\x2f\xfd": "a zstd file",
+    b"\xfd7zXZ": "an xz file", b"BZh": "a bzip2 file", b"\xff\xfe": "text in UTF-16",
     b"\xfe\xff": "text in UTF-16", b"\x89MCAP": "an MCAP file", b"SQLite": "an SQLite file",
 }  # fmt: skip
 SUFFIXES = "a .csv file, an .mcap file or the directory of a ROS 2 bag"
@@ -379,15 +365,12 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None, g
 
 def with_own_names(recordings: Sequence[Recording]) -> list[Recording]:
     """Return the recordings with unique names: a number is appended to a repeated name, as from files of one name."""
-    renamed: list[Recording] = []
+    renamed: dict[str, Recording] = {}
     for recording in recordings:
-        names, count = [previous.name for previous in renamed], 1
-        name = recording.name
-        while name in names:
-            count += 1
-            name = f"{recording.name} {count}"
-        renamed.append(replace(recording, name=name))
-    return renamed
+        numbered = chain([recording.name], (f"{recording.name} {i}" for i in count(2)))
+        name = next(name for name in numbered if name not in renamed)
+        renamed[name] = replace(recording, name=name)
+    return list(renamed.values())
 
 
 def write_csv(recording: Recording, model: Model, path: Path) -> None:
@@ -452,7 +435,7 @@ def _rows_of_csv(path: Path) -> Iterator[tuple[int, list[str]]]:
     with plain_file(path, links=True) as file:
         start = file.peek(len(max(PACKED, key=len)))
         for kind in (kind for first, kind in PACKED.items() if start.startswith(first)):
-            raise InputError(str(path), got=kind, expected="a CSV file: text in UTF-8, not packed")
+            raise InputError(str(path), got=kind, expected="a CSV file: text in UTF-8, not compressed")
         rows = csv.reader(_lines(path, io.TextIOWrapper(file, encoding="utf-8-sig", newline="")))
         try:
             yield from ((rows.line_num, row) for row in rows if row)
@@ -533,20 +516,17 @@ def _columns(path: Path, model: Model, header: list[str], wanted: Sequence[str],
             raise InputError(f"{path} line 1, column {column}", got="twice", expected="once")
     for column in wanted:
         if column not in names and column not in spared:
-            raise InputError(
-                f"{path} line 1, column {column}", got=f"none, of {', '.join(header):.200}", expected="one"
-            )
+            got = f"only {', '.join(header):.200}"
+            raise InputError(f"{path} line 1, column {column}", got=got, expected="a column")
     return [names.index(column) if column in names else -1 for column in wanted]
 
 
 def _read_mcap(path: Path, model: Model) -> tuple[Motion, Mapping[str, str]]:
     log = read_mcap(path)
     state, given = log.arrays("/state"), log.arrays("/input")
-    for topic, key, names in (
-        ("/state", "q", model.position_names),
-        ("/state", "v", model.velocity_names),
-        ("/input", "u", model.input_names),
-    ):
+    wanted = {"q": model.position_names, "v": model.velocity_names, "u": model.input_names}
+    for key, names in wanted.items():
+        topic = "/input" if key == "u" else "/state"
         labels: Any = log.channel_metadata[topic].get("names", {}).get(key, [])
         if tuple(labels) != names:
             raise InputError(f"{path}: names of {key} in {topic}", got=labels, expected=str(list(names)))
@@ -589,7 +569,7 @@ def read_arrays(path: Path, name: str, version: str, facts: Mapping[str, str]) -
     missing = {"times", "xs", "us"} - arrays.keys()
     if missing:
         tail = "/".join(path.parts[-3:])
-        raise ArtifactError(f"{tail} is not a recording: it has no {', '.join(sorted(missing))}")
+        raise ArtifactError(f"{tail} is not a recording: it lacks the arrays {', '.join(sorted(missing))}")
     times, xs, us = (arrays.pop(key) for key in ("times", "xs", "us"))
     outputs = {key.removeprefix(OUTPUT): values for key, values in arrays.items() if key.startswith(OUTPUT)}
     return Recording(name, version, times, xs, us, dict(facts), outputs)

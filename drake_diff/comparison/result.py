@@ -112,7 +112,7 @@ class Compared:
         They differ for no reason of the engine, or the engine lacks a contact quantity and contact occurs.
         """
         at_work = {self.first.responsible, self.largest.responsible, *(self.laws[i] for i in self.other_states)}
-        return tuple(line for line in self.different if _breaks(line, "contact law" in at_work))
+        return tuple(line for line in self.different if is_another_model(line, "contact law" in at_work))
 
     @cached_property
     def first_apart(self) -> int | None:
@@ -265,11 +265,6 @@ def sentence_of(engines: Sequence[Compared | EngineEvidence]) -> str:
     )
     note = " After the first contact a state is only as accurate as the contact law: examples/studies/contact_table.py."
     return f"{'; '.join(parts)}.{note if after_contact else ''}"
-
-
-def _breaks(line: ContractLine, touched: bool) -> bool:
-    """Return whether a differing line makes it another model; `touched` tells whether contact occurs."""
-    return line.reason not in UNKNOWN and is_another_model(line, touched)
 
 
 def first_above(gaps: Array, precision: Precision) -> int | None:

@@ -7,6 +7,7 @@ from the same state, so that a gap shows where it arises and does not accumulate
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,15 +15,7 @@ from numpy.typing import ArrayLike
 from drake_diff._base.arrays import Array, frozen, number_of_steps
 from drake_diff._base.values import Refusal
 from drake_diff.comparison import attribution
-from drake_diff.comparison.attribution import (
-    EngineMotion,
-    JacobianAt,
-    jacobian_at,
-    measured,
-    move,
-    rollout_jacobian,
-    seconds,
-)
+from drake_diff.comparison.attribution import EngineMotion, JacobianAt, measured, move, rollout_jacobian, seconds
 from drake_diff.comparison.recordings import Recording, check_recording, steps_between
 from drake_diff.comparison.result import STEP_TOLERANCE, Compared, Comparison, Refused, StateProbe, first_above
 from drake_diff.engines.contract import MUST_HAVE, Match, contact_lines, match_contracts
@@ -105,14 +98,9 @@ def compare(
             refused.append(Refused(str(wanted), str(error), isinstance(error, ModelError)))
     panel = _Panel(model, reference, start, inputs)
     panel.look(seed)
-    compared = []
-    sources: tuple[Engine | Recording, ...] = (reference, *loaded, *recordings)
-    for source in sources:
-        try:
-            compared.append(panel.recorded(source) if isinstance(source, Recording) else panel.compared(source))
-        except SimulationError as error:
-            refused.append(_stuck(source, error))
-    return Comparison(model, start, inputs, tuple(panel.probes), tuple(compared), tuple(refused), tuple(recordings))
+    results, stuck = panel.all([reference, *loaded, *recordings])
+    compared = tuple(result for _, result in results)
+    return Comparison(model, start, inputs, tuple(panel.probes), compared, (*refused, *stuck), tuple(recordings))
 
 
 def compare_recordings(model: Model, recordings: Sequence[Recording]) -> Comparison:
@@ -124,24 +112,14 @@ def compare_recordings(model: Model, recordings: Sequence[Recording]) -> Compari
         check_recording(recording, model)
     start, us = _motion_of(recordings[0], model)
     inputs = check_inputs(model, us, None)
-    panel = _Panel(model, DrakeEngine(model), start, inputs)
-    compared, refused, accepted = [], [], []
-    for recording in recordings:
-        try:
-            compared.append(panel.recorded(recording))
-            accepted.append(recording)
-        except SimulationError as error:
-            refused.append(_stuck(recording, error))
-    return Comparison(model, start, inputs, (), tuple(compared), tuple(refused), tuple(accepted))
+    results, stuck = _Panel(model, DrakeEngine(model), start, inputs).all(recordings)
+    compared, accepted = tuple(result for _, result in results), tuple(recording for recording, _ in results)
+    return Comparison(model, start, inputs, (), compared, tuple(stuck), accepted)
 
 
 def _motion_of(recording: Recording, model: Model) -> tuple[Array, Array]:
     """Return a recording's first state (nx,), and its inputs (N, nu) at each step of the model."""
     return recording.xs[0], np.repeat(recording.us, steps_between(recording, model.time_step), axis=0)
-
-
-def _stuck(source: Engine | Recording, error: SimulationError) -> Refused:
-    return Refused(source.name, f"it cannot take a step from one of the states: {error}", True)
 
 
 def default_engines(model: Model) -> tuple[str, ...]:
@@ -185,14 +163,24 @@ class _Panel:
         """Choose the states at which Jacobians are compared, and compute the reference's Jacobians."""
         motion = self.motion
         self.probes = [StateProbe("start", motion.xs[0], motion.us[0])]
-        self.probes += [
-            StateProbe(sample.kind, sample.x, sample.u) for sample in sample_states(self.model, 2, seed + 1)
-        ]
+        self.probes += [StateProbe(s.kind, s.x, s.u) for s in sample_states(self.model, 2, seed + 1)]
         if motion.depth is not None and np.max(motion.depth[:-1], initial=0.0) > 0:
             k = int(np.argmax(motion.depth[:-1]))
             self.probes.append(StateProbe("deepest", motion.xs[k], motion.us[k]))
         self.jacobians = self._jacobians(self.reference)
         self.product = rollout_jacobian(self.reference, self.space, motion)
+
+    def all(self, sources: Sequence[Engine | Recording]) -> tuple[list[tuple[Any, Compared]], list[Refused]]:
+        """Return each source with its comparison, and the refusals of those that cannot take a step."""
+        results, stuck = list[tuple[Any, Compared]](), list[Refused]()
+        for source in sources:
+            try:
+                result = self.recorded(source) if isinstance(source, Recording) else self.compared(source)
+                results.append((source, result))
+            except SimulationError as error:
+                reason = f"it cannot take a step from one of the states: {error}"
+                stuck.append(Refused(source.name, reason, True))
+        return results, stuck
 
     def compared(self, engine: Engine) -> Compared:
         is_reference = engine is self.reference
@@ -244,7 +232,7 @@ class _Panel:
         return float(np.abs(self.space.minus(xs[k], ours[k])).max())
 
     def _jacobians(self, engine: Engine) -> tuple[JacobianAt, ...]:
-        return tuple(jacobian_at(engine, self.space, self.names, *probe) for probe in self.probes)
+        return tuple(attribution.jacobian_at(engine, self.space, self.names, *probe) for probe in self.probes)
 
     def _step_gaps(self, motion: EngineMotion, count: int = 1) -> Array:
         """Return the gap of each step, relative to max(1, state after it); states are `count` steps apart."""

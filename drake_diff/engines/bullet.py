@@ -4,8 +4,10 @@ Bullet has no armature. The engine applies spring forces together with actuator 
 per link and combined per pair: mu = mu_a mu_b and 1/k = 1/k_a + 1/k_b. The contract lists the differences to Drake.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from importlib.metadata import version
+from itertools import permutations
 from tempfile import NamedTemporaryFile
 from typing import Any
 from weakref import finalize
@@ -20,9 +22,9 @@ from drake_diff.engines.interface import (
     DRAKES_STEP,
     EngineContract,
     RigidEngine,
-    StepJacobian,
     geometry_contracts,
     limit,
+    not_offered,
     shape_of,
     silent,
 )
@@ -78,13 +80,13 @@ class PybulletEngine(RigidEngine):
             self._build(tree)
         for geometry in (g for number, g in self.tree.geometries if number < 0):
             shape = self.bullet.createCollisionShape(**_shape(geometry))
-            pose = (list(geometry.pose.translation()), list(_turn(geometry.pose.rotation().matrix())))
+            pose = (list(geometry.pose.translation()), _turn(geometry.pose.rotation().matrix()))
             self.owners[geometry.name] = (self.bullet.createMultiBody(0, shape, -1, *pose), -1)
         self._set_contacts()
         bodies = {x.joint.v_start: self.places[i] for i, x in enumerate(self.tree.links) if x.free}
         moving_dofs = [self.bullet.getDynamicsInfo(*bodies[v]) for _, v in self.coordinates.free]
         self.centers = Centers(self.coordinates, tuple(np.array(info[3]) for info in moving_dofs))
-        axes = [rotation(np.array(info[4])[[3, 0, 1, 2]]) for info in moving_dofs]
+        axes = [_matrix(info[4]) for info in moving_dofs]
         bases = [bodies[v][0] for _, v in self.coordinates.free]
         # For each free body, its indices in q and v, and its base, centre of mass and principal axes in Bullet.
         self.free = tuple(zip(self.coordinates.free, bases, self.centers.centers, axes, strict=True))
@@ -105,7 +107,7 @@ class PybulletEngine(RigidEngine):
             q[link.joint.q_start], v[link.joint.v_start] = self.bullet.getJointState(*owner)[:2]
         for (i, j), base, center, turned in self.free:
             position, turn = self.bullet.getBasePositionAndOrientation(base)
-            R = rotation(np.array(turn)[[3, 0, 1, 2]]) @ turned.T
+            R = _matrix(turn) @ turned.T
             q[i : i + 4] = RotationMatrix(R).ToQuaternion().wxyz()
             q[i : i + 4] *= np.sign(q[i : i + 4] @ x[i : i + 4])  # the sign for which q is continuous
             q[i + 4 : i + 7] = np.array(position) - R @ center
@@ -114,8 +116,7 @@ class PybulletEngine(RigidEngine):
         self.status = "ok" if used < room else f"the solver used all of its {room} iterations"
         return x_next
 
-    def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
-        raise NotOfferedError("Bullet has no derivatives of its step")
+    differentiate_step = not_offered("Bullet has no derivatives of its step")
 
     def energy(self, x: ArrayLike) -> float:
         x, q, v = self._state(x)
@@ -229,11 +230,10 @@ class PybulletEngine(RigidEngine):
         """Return all pairs of geometries whose links can collide in Bullet: Drake's pairs first, then others."""
         owners, links = self.owners, {self._owners_of(pair) for pair in self.tree.pairs}
         pairs = [pair.names for pair in self.tree.pairs]
-        for a in owners:
-            for b in owners:
-                both = a < b and tuple(sorted((owners[a], owners[b]))) in links
-                if both and (a, b) not in pairs and (b, a) not in pairs:
-                    pairs.append((a, b))
+        for a, b in permutations(owners, 2):
+            both = a < b and tuple(sorted((owners[a], owners[b]))) in links
+            if both and (a, b) not in pairs and (b, a) not in pairs:
+                pairs.append((a, b))
         contracts = []
         for names in pairs:
             body, two = (self.bullet.getDynamicsInfo(*owners[name]) for name in names)
@@ -244,15 +244,15 @@ class PybulletEngine(RigidEngine):
 
     def _dofs(self, members: range) -> list[int]:
         """Return the indices in Drake's v of a tree's velocities in Bullet's order."""
-        dofs: list[int] = []
-        for i in sorted(members, key=lambda i: self.places[i][1]):
-            start = self.tree.links[i].joint.v_start
-            dofs += range(start, start + 6) if self.tree.links[i].free else [start]
-        return dofs
+        starts = [(link.joint.v_start, 6 if link.free else 1) for link in self._ordered(members)]
+        return [start + k for start, count in starts for k in range(count)]
 
     def _joint_positions(self, members: range, q: Array) -> list[float]:
-        order = sorted(members, key=lambda i: self.places[i][1])
-        return [float(q[self.tree.links[i].joint.q_start]) for i in order if not self.tree.links[i].free]
+        return [float(q[link.joint.q_start]) for link in self._ordered(members) if not link.free]
+
+    def _ordered(self, members: range) -> list[RigidLink]:
+        """Return the links of a tree in Bullet's order."""
+        return [self.tree.links[i] for i in sorted(members, key=lambda i: self.places[i][1])]
 
     def _set(self, x: Array) -> None:
         self.bullet.restoreState(self.untouched)
@@ -260,7 +260,7 @@ class PybulletEngine(RigidEngine):
         for (i, j), base, center, turned in self.free:
             R = rotation(q[i : i + 4])
             position = list(q[i + 4 : i + 7] + R @ center)
-            self.bullet.resetBasePositionAndOrientation(base, position, list(_turn(R @ turned)))
+            self.bullet.resetBasePositionAndOrientation(base, position, _turn(R @ turned))
             self.bullet.resetBaseVelocity(base, list(v[j + 3 : j + 6]), list(v[j : j + 3]))
         for owner, link in self.joints:
             self.bullet.resetJointState(*owner, float(q[link.joint.q_start]), float(v[link.joint.v_start]))
@@ -270,7 +270,7 @@ def _read_part(bullet: Any, owner: Owner) -> tuple[float, Array, Array, Array]:
     """Return mass, centre of mass (3,), inertia (3, 3) about it and principal axes (3, 3) of a link, in world."""
     info = bullet.getDynamicsInfo(*owner)
     state = bullet.getBasePositionAndOrientation(owner[0]) if owner[1] < 0 else bullet.getLinkState(*owner, 0, 1)
-    R = rotation(np.array(state[1])[[3, 0, 1, 2]])
+    R = _matrix(state[1])
     return float(info[0]), np.array(state[0]), R @ np.diag(info[2]) @ R.T, R
 
 
@@ -303,6 +303,11 @@ def _shape(geometry: Geometry) -> dict[str, Any]:
     return {"shapeType": long, "radius": sizes["radius"][0], "height": sizes["length"][0]}
 
 
-def _turn(R: Array) -> Array:
+def _turn(R: Array) -> list[float]:
     """Return the quaternion (x, y, z, w)."""
-    return np.asarray(RotationMatrix(R).ToQuaternion().wxyz()[[1, 2, 3, 0]])
+    return list(RotationMatrix(R).ToQuaternion().wxyz()[[1, 2, 3, 0]])
+
+
+def _matrix(xyzw: Sequence[float]) -> Array:
+    """Return the rotation matrix (3, 3) of a quaternion."""
+    return rotation(np.array(xyzw)[[3, 0, 1, 2]])

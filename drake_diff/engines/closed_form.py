@@ -263,13 +263,8 @@ class NumpyEngine(EulerEngine):
             self.form, self.time_step = model, positive_float("time_step [s]", time_step)
         self.coordinates = self.form.coordinates
         self.nq, self.nv, self.nu = self.coordinates.nq, self.coordinates.nv, len(self.form.input_names)
-        self.damping, self.limits = self.form.damping, np.array(self.form.effort_limits)
-
-    def _effort(self, u: Array) -> Array:
-        return np.asarray(self.form.actuation @ np.clip(u, -self.limits, self.limits))
-
-    def _effort_by_input(self, u: Array) -> Array:
-        return np.asarray(self.form.actuation * (np.abs(u) <= self.limits))
+        self.damping, self.actuation = self.form.damping, self.form.actuation
+        self.limits = np.array(self.form.effort_limits)
 
     def _needed_derivative(self, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
         return self.form.needed_derivative(q, v, a)
@@ -288,7 +283,7 @@ class NumpyEngine(EulerEngine):
     def contract(self) -> EngineContract:
         return EngineContract(
             engine=self.name, joints=self.form.joints(), native_order=self.form.joint_names,
-            inputs=self.form.input_names, actuation=float_rows(self.form.actuation),
+            inputs=self.form.input_names, actuation=float_rows(self.actuation),
             effort_limits=self.form.effort_limits, time_step=self.time_step, gravity=floats(self.form.gravity_vector),
             contact_law="none", derivatives="by every entry of x and u",
             reasons={

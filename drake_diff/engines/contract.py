@@ -57,7 +57,8 @@ class ContractLine:
 
 def is_another_model(line: ContractLine, touched: bool) -> bool:
     """Return whether a "different" line means another model, depending on whether contact acts (`touched`)."""
-    return (touched and line.quantity in MUST_HAVE) or (not line.reason and line.quantity not in LAWS)
+    must_have = touched and line.quantity in MUST_HAVE and line.reason not in UNKNOWN
+    return must_have or (not line.reason and line.quantity not in LAWS)
 
 
 class Match:
@@ -117,9 +118,8 @@ class Match:
     def joints(self, quantity: str, read: Callable[[JointContract], tuple[Any, ...]]) -> ContractLine:
         """Compare joints by name, so that a different order is reported once and not in every line."""
         others = {j.name: j for j in self.two.joints}
-        lines = {
-            j.name: self.numbers(quantity, read(j), read(others[j.name])) for j in self.one.joints if j.name in others
-        }
+        both = [(j, others[j.name]) for j in self.one.joints if j.name in others]
+        lines = {a.name: self.numbers(quantity, read(a), read(b)) for a, b in both}
         if not lines:
             return ContractLine(quantity, "different", "no joint has the same name in both")
         wrong = {name: line for name, line in lines.items() if line.verdict == "different"}
@@ -272,18 +272,17 @@ def match_contracts(a: Engine, b: Engine) -> tuple[ContractLine, ...]:
 
 def _forces_by_joint(contract: EngineContract) -> dict[str, dict[str, float]]:
     """Return the generalized force per unit of each input, by joint."""
-    owners = [name for j in contract.joints for name in [j.name] * (6 if j.kind == "quaternion_floating" else 1)]
-    rows = list(zip(owners, contract.actuation, strict=True))
-    return {name: {joint: row[i] for joint, row in rows if row[i]} for i, name in enumerate(contract.inputs)}
+    rows = list(zip(contract.by_velocity, contract.actuation, strict=True))
+    return {name: {joint.name: row[i] for joint, row in rows if row[i]} for i, name in enumerate(contract.inputs)}
 
 
 def _random_state(kinds: list[str], random: np.random.Generator) -> tuple[Array, Array]:
     """Return random q and v for joints of these kinds, in Drake's coordinates, with quaternions of norm 1."""
-    free = [kind == "quaternion_floating" for kind in kinds]
-    parts = [random.standard_normal(7 if floats else 1) for floats in free]
-    for coordinates in (coordinates for coordinates, floats in zip(parts, free, strict=True) if floats):
-        coordinates[:4] /= np.linalg.norm(coordinates[:4])
-    return np.concatenate(parts), random.standard_normal(len(kinds) + 5 * sum(free))
+    positions = [random.standard_normal(7 if kind == "quaternion_floating" else 1) for kind in kinds]
+    free = [q for q in positions if len(q) == 7]
+    for q in free:
+        q[:4] /= np.linalg.norm(q[:4])
+    return np.concatenate(positions), random.standard_normal(len(kinds) + 5 * len(free))
 
 
 NAMED = 4  # maximum number of pairs or geometries that a line names

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from drake_diff._base.arrays import Array, finite_array
 from drake_diff.engines.contract import FUNCTION_DOES_NOT_SAY, SAME_NUMBER, ContractLine, Match
 from drake_diff.engines.drake import DrakeEngine
-from drake_diff.engines.interface import DRAKES_STEP, Arguments, Engine, EngineContract, StepJacobian, float_rows
+from drake_diff.engines.interface import DRAKES_STEP, Arguments, Engine, EngineContract, float_rows, not_offered
 from drake_diff.exceptions import InputError, NotOfferedError, SimulationError, UnknownNameError
 from drake_diff.mechanics.coordinates import euler_step
 from drake_diff.mechanics.description import JointContract, coordinates_of
@@ -32,6 +32,7 @@ NOT_SAID = (
 )  # fmt: skip
 UNSAID = float("nan")
 PARTS = ("forces at rest", "velocity products", "damping forces", "forces of the inputs")
+LACKING = "{name}: a function of accelerations does not provide"
 ALONE = 1e-6  # relative remainder of a part below which a factor explains the whole difference
 # Relative rounding of a force M(q) a, times the condition number of M.
 ROUNDING = 1e-14
@@ -125,7 +126,7 @@ class ClosedForm(Arguments):
     def _try(self, model: Model) -> None:
         """Call the function twice at a state, to report errors early."""
         sample = sample_states(model, 1)[0]
-        expected = "a function of q, v and u alone"
+        expected = "a function of only q, v and u"
         try:
             first, second = (self.acceleration(sample.x[: self.nq], sample.x[self.nq :], sample.u) for _ in range(2))
         except SimulationError as error:
@@ -219,7 +220,7 @@ class ClosedForm(Arguments):
         except (InputError, NotOfferedError, SimulationError) as error:
             return tuple(ContractLine(force, "different", f"not comparable: {error}") for force in PARTS)
         tolerance = max(SAME_NUMBER[match.precision], ROUNDING * max(float(np.linalg.cond(M)) for M in masses))
-        names = [j.name for j in contract.joints for _ in range(6 if j.kind == "quaternion_floating" else 1)]
+        names = [joint.name for joint in contract.by_velocity]
         scale = np.array([max(float(np.abs(force).max(initial=0.0)) for force in parts) for parts in wanted])
         lines = []
         for i, quantity in enumerate(PARTS):
@@ -234,28 +235,12 @@ class ClosedForm(Arguments):
             lines[-1] = replace(lines[-1], detail=f"{lines[-1].detail}; {remark}")
         return tuple(lines)
 
-    def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
-        """Raise NotOfferedError. Comparisons of Jacobians use differences of the steps."""
-        raise self._not_offered("derivatives")
-
-    def energy(self, x: ArrayLike) -> float:
-        """Raise NotOfferedError."""
-        raise self._not_offered("energy")
-
-    def contact_depth(self, x: ArrayLike) -> float:
-        """Raise NotOfferedError."""
-        raise self._not_offered("overlap")
-
-    def mass_matrix(self, q: ArrayLike) -> Array:
-        """Raise NotOfferedError."""
-        raise self._not_offered("M(q) alone")
-
-    def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
-        """Raise NotOfferedError."""
-        raise self._not_offered("forces alone")
-
-    def _not_offered(self, what: str) -> NotOfferedError:
-        return NotOfferedError(f"{self.name}: a function of accelerations does not provide {what}")
+    # Comparisons of Jacobians use differences of the steps.
+    differentiate_step = not_offered(f"{LACKING} derivatives")
+    energy = not_offered(f"{LACKING} energy")
+    contact_depth = not_offered(f"{LACKING} overlap")
+    mass_matrix = not_offered(f"{LACKING} M(q) alone")
+    bias = not_offered(f"{LACKING} forces alone")
 
     @property
     def contract(self) -> EngineContract:
@@ -286,11 +271,8 @@ class ClosedForm(Arguments):
 def _parts_of(engine: Engine, q: Array, v: Array, u: Array) -> Parts:
     """Compute the parts of the forces from an engine's terms. Raises NotOfferedError if it has none."""
     contract = engine.contract
-    rest, limit = -engine.bias(q, np.zeros(len(v))), np.array(contract.effort_limits)
-    damping = [[0.0] * 6 if j.kind == "quaternion_floating" else [j.damping] for j in contract.joints]
-    D = np.array([number for joint in damping for number in joint])
-    actuation = np.array(contract.actuation, dtype=float).reshape(len(v), len(u))
-    return Parts(rest, -engine.bias(q, v) - rest, -D * v, actuation @ np.clip(u, -limit, limit))
+    rest = -engine.bias(q, np.zeros(len(v)))
+    return Parts(rest, -engine.bias(q, v) - rest, -contract.damping * v, contract.effort(u))
 
 
 def _how_different(wanted: Array, given: Array) -> str:

@@ -26,6 +26,7 @@ PROXIMITY = {
 }  # fmt: skip
 KINDS = {"weld": "fixed", "prismatic": "prismatic", "quaternion_floating": "floating"}
 SHAPES = ("Sphere", "Box", "Cylinder")  # shapes of URDF; Bullet also reads capsules
+MOMENTS = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
 
 
 def urdf(description: Description) -> str:
@@ -140,15 +141,13 @@ def _tree(description: Description, base: str, links: tuple[Link, ...]) -> tuple
         kind = KINDS.get(link.kind) or ("revolute" if limited else "continuous")
         joint = _add_joint(root, link.joint, kind, (link.parent, link.body), zero.in_parent(link))
         if link.kind in ("revolute", "prismatic"):
-            efforts = [
-                e for e, x in zip(description.effort_limits, description.actuated, strict=True) if x == link.joint
-            ]
             sides = None if kind == "continuous" else (link.lower, link.upper)
-            _add_freedom(joint, zero.axis(link), link.damping, min([UNLIMITED, *efforts]), sides)
+            driven = zip(description.effort_limits, description.actuated, strict=True)
+            effort = min([UNLIMITED, *(effort for effort, name in driven if name == link.joint)])
+            _add_freedom(joint, zero.axis(link), link.damping, effort, sides)
             for follower in (follower for follower in description.followers if follower.joint == link.joint):
-                SubElement(
-                    joint, "mimic", joint=follower.leader, multiplier=row(follower.ratio), offset=row(follower.offset)
-                )
+                relation = {"multiplier": row(follower.ratio), "offset": row(follower.offset)}
+                SubElement(joint, "mimic", {"joint": follower.leader, **relation})
     return root, elements
 
 
@@ -174,8 +173,7 @@ def _add_inertial(body: Element, mass: float, center: RigidTransform, inertia: A
     inertial = SubElement(body, "inertial")
     _add_origin(inertial, center)
     SubElement(inertial, "mass", value=row(mass))
-    places = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
-    SubElement(inertial, "inertia", {name: row(inertia[index]) for name, index in places.items()})
+    SubElement(inertial, "inertia", {name: row(inertia[index]) for name, index in MOMENTS.items()})
 
 
 def _add_collision(body: Element, geometry: Geometry, X: RigidTransform) -> Element:
@@ -255,9 +253,8 @@ def _add_mjcf_body(parent: Element, link: Link) -> Element:
     _set_mjcf_pose(body, link.on_parent @ link.on_child.inverse())
     if link.mass > 0:
         moments, turn = principal(link.inertia)
-        inertial = SubElement(body, "inertial", mass=row(link.mass), diaginertia=row(moments))
-        inertial.set("pos", row(link.center_of_mass))
-        inertial.set("quat", row(turn))
+        numbers = {"mass": link.mass, "diaginertia": moments, "pos": link.center_of_mass, "quat": turn}
+        SubElement(body, "inertial", {name: row(value) for name, value in numbers.items()})
     if link.kind == "quaternion_floating":
         if link.parent != "world" or not all(x.IsExactlyIdentity() for x in (link.on_parent, link.on_child)):
             raise ModelError(f"joint {link.joint}: a free body in MuJoCo must float in the world, by its own frame")
@@ -335,15 +332,18 @@ def collision_name(geometry: str) -> str:
 
 def _add_sdf_link(model: Element, link: Link, zero: AtZero) -> Element:
     element = SubElement(model, "link", name=link.body)
-    SubElement(element, "pose").text = row([*zero.frames[link.body].translation(), 0, 0, 0])
-    center, turned = zero.inertia(link)
+    _add_texts(element, {"pose": [*zero.frames[link.body].translation(), 0, 0, 0]})
+    center, inertia = zero.inertia(link)
     inertial = SubElement(element, "inertial")
-    SubElement(inertial, "pose").text = row([*center, 0, 0, 0])
-    SubElement(inertial, "mass").text = row(link.mass)
-    inertia = SubElement(inertial, "inertia")
-    for a, b in ("xx", "xy", "xz", "yy", "yz", "zz"):
-        SubElement(inertia, f"i{a}{b}").text = row(turned["xyz".index(a), "xyz".index(b)])
+    _add_texts(inertial, {"pose": [*center, 0, 0, 0], "mass": link.mass})
+    _add_texts(SubElement(inertial, "inertia"), {name: inertia[index] for name, index in MOMENTS.items()})
     return element
+
+
+def _add_texts(parent: Element, values: Mapping[str, object]) -> None:
+    """Add an element with this name for each number or array."""
+    for name, value in values.items():
+        SubElement(parent, name).text = row(value)
 
 
 def _add_sdf_joint(model: Element, description: Description, link: Link, zero: AtZero) -> None:
@@ -353,24 +353,18 @@ def _add_sdf_joint(model: Element, description: Description, link: Link, zero: A
     if link.kind == "weld":
         return
     axis = SubElement(joint, "axis")
-    SubElement(axis, "xyz").text = row(zero.axis(link))
-    limits = [e for e, x in zip(description.effort_limits, description.actuated, strict=True) if x == link.joint]
-    limit, dynamics = SubElement(axis, "limit"), SubElement(axis, "dynamics")
+    _add_texts(axis, {"xyz": zero.axis(link)})
+    efforts = [e for e, x in zip(description.effort_limits, description.actuated, strict=True) if x == link.joint]
     numbers = {"lower": max(link.lower, -UNLIMITED), "upper": min(link.upper, UNLIMITED)}
-    for name, value in {**numbers, "effort": min([UNLIMITED, *limits]) if limits else 0.0}.items():
-        SubElement(limit, name).text = row(value)
+    _add_texts(SubElement(axis, "limit"), {**numbers, "effort": min([UNLIMITED, *efforts]) if efforts else 0.0})
     numbers = {"damping": link.damping, "spring_reference": link.rest, "spring_stiffness": link.stiffness}
-    for name, value in numbers.items():
-        SubElement(dynamics, name).text = row(value)
+    _add_texts(SubElement(axis, "dynamics"), numbers)
     for follower in (follower for follower in description.followers if follower.joint == link.joint):
         numbers = {"multiplier": follower.ratio, "offset": follower.offset}
-        mimic = SubElement(axis, "mimic", joint=follower.leader)
-        for name, value in {**numbers, "reference": 0.0}.items():
-            SubElement(mimic, name).text = row(value)
+        _add_texts(SubElement(axis, "mimic", joint=follower.leader), {**numbers, "reference": 0.0})
         SubElement(joint, "drake:mimic", {"joint": follower.leader, **{name: row(x) for name, x in numbers.items()}})
     if link.armature:
-        SubElement(joint, "drake:rotor_inertia").text = row(link.armature)
-        SubElement(joint, "drake:gear_ratio").text = "1.0"
+        _add_texts(joint, {"drake:rotor_inertia": link.armature, "drake:gear_ratio": 1.0})
 
 
 def _add_sdf_geometry(link: Element, geometry: Geometry, X: RigidTransform, friction: float | None) -> None:
@@ -382,13 +376,9 @@ def _add_sdf_geometry(link: Element, geometry: Geometry, X: RigidTransform, fric
     pose = SubElement(collision, "pose", rotation_format="quat_xyzw")
     pose.text = row([*X.translation(), *xyz, w])
     name = "plane" if kind == "HalfSpace" else kind.lower()
-    element = SubElement(SubElement(collision, "geometry"), name)
-    for key, values in sizes.items():
-        SubElement(element, key).text = row(values)
+    _add_texts(SubElement(SubElement(collision, "geometry"), name), sizes)
     if friction is not None:
         ode = SubElement(SubElement(SubElement(collision, "surface"), "friction"), "ode")
-        SubElement(ode, "mu").text = SubElement(ode, "mu2").text = row(friction)
-    material = SubElement(collision, "drake:proximity_properties")
-    for quantity, value in geometry.material.items():
-        for name in PROXIMITY[quantity]:
-            SubElement(material, f"drake:{name}").text = row(value)
+        _add_texts(ode, {"mu": friction, "mu2": friction})
+    material = {f"drake:{name}": x for quantity, x in geometry.material.items() for name in PROXIMITY[quantity]}
+    _add_texts(SubElement(collision, "drake:proximity_properties"), material)

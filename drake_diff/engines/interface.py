@@ -5,7 +5,7 @@ import sys
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, Protocol
 from xml.etree import ElementTree
 
@@ -14,15 +14,8 @@ from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_diff._base.arrays import Array, finite_array, frozen
-from drake_diff.exceptions import SimulationError
-from drake_diff.mechanics.coordinates import (
-    Centers,
-    Coordinates,
-    euler_acceleration,
-    euler_jacobian,
-    euler_step,
-    zero,
-)
+from drake_diff.exceptions import NotOfferedError, SimulationError
+from drake_diff.mechanics.coordinates import Centers, Coordinates, euler_acceleration, euler_jacobian, euler_step, zero
 from drake_diff.mechanics.description import (
     Description,
     GeometryContract,
@@ -65,6 +58,21 @@ class EngineContract:
     derivatives: str = "none"  # variables of the derivatives in the engine, before the map to Drake's x and u
     # By quantity of the match: the reason why this engine differs from Drake.
     reasons: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def by_velocity(self) -> tuple[JointContract, ...]:
+        """The joint of each velocity (nv,)."""
+        return tuple(j for j in self.joints for _ in range(6 if j.kind == "quaternion_floating" else 1))
+
+    @property
+    def damping(self) -> Array:
+        """The damping (nv,) of the joints, 0 for free bodies."""
+        return np.array([0.0 if j.kind == "quaternion_floating" else j.damping for j in self.by_velocity])
+
+    def effort(self, u: Array) -> Array:
+        """Return B u (nv,), clipped at the effort limits."""
+        limits, B = np.array(self.effort_limits), np.array(self.actuation, dtype=float)
+        return np.asarray(B.reshape(len(B), len(u)) @ np.clip(u, -limits, limits))
 
     def __repr__(self) -> str:
         joints, inputs = (", ".join(names) or "none" for names in ([j.name for j in self.joints], self.inputs))
@@ -154,14 +162,26 @@ def limit(value: float) -> float:
     return float(value) if abs(value) < UNLIMITED else float(np.copysign(np.inf, value))
 
 
+def not_offered(why: str) -> Any:
+    """Return a method that raises NotOfferedError with the message `why`, where {name} is the engine's name."""
+
+    def method(self: Arguments, *_: Any, **__: Any) -> Any:
+        raise NotOfferedError(why.format(name=self.name))
+
+    method.__doc__ = "Raise NotOfferedError."
+    return method
+
+
 class Arguments:
-    """Checks of an engine's arguments, which raise ShapeError or NonFiniteError."""
+    """Checks of an engine's arguments, which raise ShapeError or NonFiniteError, and the force of its inputs."""
 
     name: str
     version: str
     nq: int
     nv: int
     nu: int
+    actuation: Array  # (nv, nu)
+    limits: Array  # (nu,) of the inputs
 
     def __repr__(self) -> str:
         return f"Engine {self.name} {self.version}; print(engine.contract) shows its properties"
@@ -179,6 +199,14 @@ class Arguments:
 
     def _motion(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
         return finite_array("q", q, (self.nq,)), finite_array("v", v, (self.nv,))
+
+    def _effort(self, u: Array) -> Array:
+        """Return B u (nv,), clipped at the effort limits."""
+        return np.asarray(self.actuation @ np.clip(u, -self.limits, self.limits))
+
+    def _effort_by_input(self, u: Array) -> Array:
+        """Return the derivative (nv, nu) of `_effort`."""
+        return np.asarray(self.actuation * (np.abs(u) <= self.limits))
 
 
 class EulerEngine(Arguments):
@@ -230,14 +258,6 @@ class EulerEngine(Arguments):
         """Return the bias forces (nv,)."""
 
     @abstractmethod
-    def _effort(self, u: Array) -> Array:
-        """Return B u (nv,), clipped at the effort limits."""
-
-    @abstractmethod
-    def _effort_by_input(self, u: Array) -> Array:
-        """Return the derivative (nv, nu) of `_effort`."""
-
-    @abstractmethod
     def _needed_derivative(self, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
         """Return the derivatives (nv, nv) of the force M a + bias with respect to small motion and to v."""
 
@@ -254,14 +274,6 @@ class PlantEngine(Arguments):
             self.description.by_velocity(name) for name in ("damping", "armature", "stiffness", "rest")
         )
         self.actuation, self.limits = self.description.actuation, self.description.effort_limits
-
-    def _effort(self, u: Array) -> Array:
-        """Return B u (nv,), clipped at the effort limits."""
-        return np.asarray(self.actuation @ np.clip(u, -self.limits, self.limits))
-
-    def _effort_by_input(self, u: Array) -> Array:
-        """Return the derivative (nv, nu) of `_effort`."""
-        return np.asarray(self.actuation * (np.abs(u) <= self.limits))
 
     def _stretch(self, q: Array) -> Array:
         """Return the deflection (nv,) of the springs on hinges and slides."""
@@ -367,11 +379,6 @@ def geometry_contracts(description: Description) -> tuple[GeometryContract, ...]
             X = (pose.translation(), pose.rotation().matrix())
             contracts.append(geometry_contract(g.name, carrier, kind, lengths, *X))
     return tuple(contracts)
-
-
-def without_damping(pair: PairContract) -> PairContract:
-    """Return the pair for an engine that takes friction and stiffness from the model, but not dissipation."""
-    return replace(pair, dissipation=None, relaxation_time=None)
 
 
 def geometry_contract(

@@ -1,7 +1,7 @@
 """Load engines by name, for the whole plant or for its independent coordinates. Engines are imported on demand."""
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
@@ -118,6 +118,7 @@ class ReducedEngine(EulerEngine):
         self.coordinates, self.time_step, self.status = coordinates_of(model), model.time_step, "ok"
         self.nq, self.nv, self.nu = model.nq, model.nv, model.nu
         self.damping = self.coupling.forces(self.coupling.ratio_v * whole.damping)
+        self.actuation, self.limits = self.coupling.forces(whole.actuation), whole.limits
 
     def energy(self, x: ArrayLike) -> float:
         return float(self.whole.energy(self.coupling.state(self._state(x)[0])))
@@ -128,15 +129,8 @@ class ReducedEngine(EulerEngine):
 
     def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
         q, v = self._motion(q, v)
-        return np.asarray(
-            self.coupling.forces(self.whole.bias(self.coupling.positions(q), self.coupling.velocities(v)))
-        )
-
-    def _effort(self, u: Array) -> Array:
-        return np.asarray(self.coupling.forces(self.whole._effort(u)))
-
-    def _effort_by_input(self, u: Array) -> Array:
-        return np.asarray(self.coupling.spread.T @ self.whole._effort_by_input(u))
+        force = self.whole.bias(self.coupling.positions(q), self.coupling.velocities(v))
+        return np.asarray(self.coupling.forces(force))
 
     def _needed_derivative(self, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
         E, coupling = self.coupling.spread, self.coupling
@@ -154,27 +148,15 @@ def reduced_contract(contract: EngineContract, model: Model) -> EngineContract:
     coupling: JointCoupling | None = model.coupling
     if coupling is None:
         return contract
-    damping, joints_left, start = np.zeros(len(coupling.of_v)), [], 0
-    joints: Mapping[int, Any] = {}
-    for joint in contract.joints:
-        joints = {**joints, start: joint}
-        damping[start] = joint.damping
-        start += 6 if joint.kind == "quaternion_floating" else 1
-    own_damping, (lower, upper) = coupling.forces(coupling.ratio_v * damping), model.position_limits
-    places = {int(j): k for k, j in enumerate(coupling.own_v)}
-    single = {j: i for i, j in coordinates_of(model).single}
-    for start, joint in joints.items():
-        k = places.get(start)
-        if k is None:
-            continue
-        if k in single:
-            limits = {"lower": float(lower[single[k]]), "upper": float(upper[single[k]])}
-            joint = replace(joint, damping=float(own_damping[k]), **limits)
-        joints_left.append(joint)
-    names = {joint.name for joint in joints_left}
+    damping, (lower, upper) = coupling.forces(coupling.ratio_v * contract.damping), model.position_limits
+    by_velocity = [contract.by_velocity[j] for j in coupling.own_v]
+    for i, k in coordinates_of(model).single:
+        reduced = {"damping": float(damping[k]), "lower": float(lower[i]), "upper": float(upper[i])}
+        by_velocity[k] = replace(by_velocity[k], **reduced)
+    joints = {joint.name: joint for joint in by_velocity}
     return replace(
         contract,
-        joints=tuple(joints_left),
-        native_order=tuple(name for name in contract.native_order if name in names),
+        joints=tuple(joints.values()),
+        native_order=tuple(name for name in contract.native_order if name in joints),
         actuation=float_rows(coupling.spread.T @ np.array(contract.actuation).reshape(len(coupling.of_v), -1)),
     )

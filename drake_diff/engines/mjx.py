@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from drake_diff._base.arrays import Array, frozen
 from drake_diff.engines.interface import EngineContract, PlantEngine, StepJacobian
 from drake_diff.engines.mujoco import mujoco_model
-from drake_diff.engines.mujoco_contract import CONES, MujocoCoordinates, read_contract, touches
+from drake_diff.engines.mujoco_contract import PYRAMIDAL, MujocoCoordinates, read_contract, touches
 from drake_diff.exceptions import GradientError, MissingDependencyError, ModelError, SimulationError
 from drake_diff.model.model import Model
 
@@ -25,7 +25,6 @@ try:
 except ImportError as error:
     raise MissingDependencyError(f"this engine needs MJX ({error}): pip install 'drake-diff[mjx]'") from error
 
-PYRAMIDAL = {name: number for number, name in CONES.items()}["pyramidal"]
 # Residual M a - f, relative to f (at least 1 N or N m). MJX does not report convergence, which leaves about 1e-12.
 UNBALANCED = 1e-6
 STILL = 1e-8  # [rad/s] speed below which MJX drops the rotation

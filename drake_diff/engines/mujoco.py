@@ -12,11 +12,7 @@ from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, frozen, positive_float
 from drake_diff.engines.formats import mjcf
-from drake_diff.engines.interface import (
-    EngineContract,
-    PlantEngine,
-    StepJacobian,
-)
+from drake_diff.engines.interface import EngineContract, PlantEngine, StepJacobian
 from drake_diff.engines.mujoco_contract import MujocoCoordinates, check_known, read_contract, read_followers
 from drake_diff.exceptions import InputError, MissingDependencyError, ModelError, SimulationError
 from drake_diff.mechanics.description import Description, Follower

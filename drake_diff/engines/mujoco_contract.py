@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from drake_diff._base.arrays import Array, skew
 from drake_diff.engines.interface import (
@@ -99,7 +100,7 @@ class MujocoCoordinates:
         into, out = self._tangent_map(x), np.linalg.inv(self._tangent_map(x_next))
         W, N = self.coordinates.motion(x[: self.nq]), self.coordinates.rate(x_next[: self.nq])
         eye = np.eye(self.nv)
-        narrow, wide = _diagonal(W, eye), _diagonal(N, eye)
+        narrow, wide = block_diag(W, eye), block_diag(N, eye)
         return wide @ out @ A @ into @ narrow, wide @ out @ B[:, self.actuator]
 
     def on_tangent(self, x: Array, x_next: Array, by_native: Array) -> tuple[Array, Array]:
@@ -109,13 +110,13 @@ class MujocoCoordinates:
         move, see = np.zeros((self.nq, self.nv)), np.zeros((self.nv, self.nq))
         move[self.positions] = self.coordinates.rate(q) @ self.turn(q).T
         see[:, self.positions] = self.turn(q_next) @ self.coordinates.motion(q_next)
-        narrowed = _diagonal(see, eye) @ by_native
-        return narrowed[:, :n] @ _diagonal(move, eye), narrowed[:, n:]
+        narrowed = block_diag(see, eye) @ by_native
+        return narrowed[:, :n] @ block_diag(move, eye), narrowed[:, n:]
 
     def _tangent_map(self, x: Array) -> Array:
         """Return the matrix (2 nv, 2 nv) from Drake's (small motion, dv) to MuJoCo's."""
         q, v = x[: self.nq], x[self.nq :]
-        T = _diagonal(self.turn(q), self.turn(q))
+        T = block_diag(self.turn(q), self.turn(q))
         for i, j in self.coordinates.free:
             by_turn = rotation(q[i : i + 4]).T @ skew(v[j : j + 3])
             T[np.ix_(self.nv + self.dofs[j : j + 3], np.arange(j, j + 3))] = by_turn
@@ -128,12 +129,7 @@ def name_of(m: Any, address: Any) -> str:
     return str(m.names[start : m.names.index(b"\0", start)].decode())
 
 
-def _diagonal(a: Array, b: Array) -> Array:
-    (m, n), (r, s) = a.shape, b.shape
-    return np.block([[a, np.zeros((m, s))], [np.zeros((r, n)), b]])
-
-
-PLANE, PYRAMIDAL_CONE = 0, 0  # mjtGeom, mjtCone
+PLANE, PYRAMIDAL = 0, 0  # mjtGeom, mjtCone
 SHAPES = {PLANE: "HalfSpace", 2: "Sphere", 3: "Capsule", 4: "Ellipsoid", 5: "Cylinder", 6: "Box"}
 FILTERPARENT, REFSAFE = 1 << 9, 1 << 11  # mjtDisableBit
 SMALL = 1e-15  # mjMINVAL
@@ -203,16 +199,8 @@ def _of_geoms(m: Any, a: int, b: int) -> Given:
         g = a if rank > 0 else b
         friction = np.array(m.geom_friction[g])[[0, 0, 1, 2, 2]]
         return int(m.geom_condim[g]), friction, np.array(m.geom_solref[g]), none, np.array(m.geom_solimp[g]), apart
-    weight_a, weight_b = float(m.geom_solmix[a]), float(m.geom_solmix[b])
-    share = (
-        0.5
-        if max(weight_a, weight_b) < SMALL
-        else 0.0
-        if weight_a < SMALL
-        else 1.0
-        if weight_b < SMALL
-        else weight_a / (weight_a + weight_b)
-    )
+    weights = [0.0 if weight < SMALL else float(weight) for weight in (m.geom_solmix[a], m.geom_solmix[b])]
+    share = weights[0] / sum(weights) if any(weights) else 0.5
     solref_a, solref_b = np.array(m.geom_solref[a]), np.array(m.geom_solref[b])
     mixed = share * solref_a + (1 - share) * solref_b
     solref = mixed if min(solref_a[0], solref_b[0]) > 0 else np.minimum(solref_a, solref_b)
@@ -262,13 +250,13 @@ def _stiffness(m: Any, both: tuple[int, int], dim: int, friction: Array, K: floa
     bodies = [int(m.geom_bodyid[g]) for g in both]
     inverse_mass = sum(float(m.body_invweight0[b][0]) for b in bodies)
     stiffness = K * d**2 / ((1 - d) * inverse_mass) if inverse_mass else np.inf
-    if dim == 1 or int(m.opt.cone) != PYRAMIDAL_CONE:
+    if dim == 1 or int(m.opt.cone) != PYRAMIDAL:
         return float(stiffness)
     mu = float(friction[0])
     return float(stiffness * (dim - 1) * float(m.opt.impratio) / (mu**2 * (1 + mu**2)))
 
 
-CONES = {0: "pyramidal", 1: "elliptic"}  # mjtCone
+CONES = {PYRAMIDAL: "pyramidal", 1: "elliptic"}  # mjtCone
 INTEGRATORS = {0: "EULER", 2: "IMPLICIT", 3: "IMPLICITFAST"}  # mjtIntegrator; MuJoCo cannot differentiate others
 OTHERS = {1: "RK4", 4: "DISCRETE"}
 SOLVERS = {0: "PGS", 1: "CG", 2: "Newton's method"}  # mjtSolver
@@ -296,7 +284,7 @@ UNKNOWN = {
 }  # fmt: skip
 COUNTED = {
     "na": "activation states", "neq": "equality constraints", "ntendon": "tendons", "nflex": "flexible bodies",
-    "nmocap": "bodies that are moved by hand", "nplugin": "plugins",
+    "nmocap": "mocap bodies", "nplugin": "plugins",
 }  # fmt: skip
 
 
@@ -329,8 +317,8 @@ def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Descri
     """Read the contract of `m`, with `d` at Drake's q = 0. `fields` are those in which MuJoCo and MJX differ."""
     limits, B = [], np.zeros((len(native.dofs), len(native.actuator)))
     pairs, geometries = read_pairs(m), read_geometries(m, d)
-    there = {g.name for g in geometries}
-    left_out = [p.names for p in description.pairs if not there.issuperset(p.names) and _not_given(description, p)]
+    there, not_given = {g.name for g in geometries}, {g.name for g in description.geometries if not shape_of(g)[1]}
+    left_out = [p.names for p in description.pairs if not there.issuperset(p.names) and not_given & set(p.names)]
     for column, i in enumerate(native.actuator):
         name = name_of(m, m.name_actuatoradr[i])
         if int(m.actuator_trntype[i]) != JOINT_TRANSMISSION:
@@ -366,16 +354,11 @@ def read_contract(m: Any, d: Any, native: MujocoCoordinates, description: Descri
         inputs=tuple(name_of(m, m.name_actuatoradr[i]) for i in native.actuator),
         actuation=float_rows(B), effort_limits=tuple(limits),
         time_step=float(m.opt.timestep), integrator=DRAKES_STEP if drakes and not free else euler,
-        gravity=floats(m.opt.gravity), contact_law=law if touches(m) else "none", geometries=geometries,
+        gravity=floats(m.opt.gravity), contact_law=law if pairs else "none", geometries=geometries,
         contacts=pairs,
         solver_tolerance=float(m.opt.tolerance), limit_law="soft constraint of the step's solver", reasons=reasons,
         **fields,
     )  # fmt: skip
-
-
-def _not_given(description: Description, pair: PairContract) -> bool:
-    """Return whether one of the two geometries has a shape that the MJCF export does not support."""
-    return any(not shape_of(g)[1] for g in description.geometries if g.name in pair.names)
 
 
 def read_followers(m: Any) -> tuple[Follower, ...]:

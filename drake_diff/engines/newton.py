@@ -5,6 +5,7 @@ with the velocity of its centre of mass, and its quaternion is normalized after 
 MuJoCo's step (engine mujoco of this package) by mujoco-warp, which is not included in Newton.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,6 @@ from drake_diff.engines.interface import (
     limit,
     shape_of,
     silent,
-    without_damping,
 )
 from drake_diff.exceptions import MissingDependencyError, NotOfferedError
 from drake_diff.mechanics.coordinates import Centers, rotation, unit
@@ -154,7 +154,8 @@ class NewtonEngine(RigidEngine):
             "centre of mass then angular, in world",
             integrator=", ".join(["semi-implicit Euler", *how]) if how else DRAKES_STEP,
             gravity=floats(self._gravity()), contact_law=law if self.pipeline else "none",
-            geometries=geometry_contracts(self.description), contacts=tuple(map(without_damping, self.tree.pairs)),
+            geometries=geometry_contracts(self.description),
+            contacts=tuple(replace(pair, dissipation=None, relaxation_time=None) for pair in self.tree.pairs),
             limit_law=f"explicit springs of {springs} and dampers of {dampers} (SI) beyond the limit",
             derivatives="by every number of Newton's state, warp's tape backwards", precision="float32",
             reasons={
@@ -281,12 +282,8 @@ def _centers_of_mass(m: Any, state: Any) -> Array:
 def _read_joints(m: Any, state: Any, tree: RigidLinks) -> tuple[JointContract, ...]:
     """Read the joints in Drake's order, with `state` at Drake's q = 0."""
     values = {name: _numbers(getattr(m, f"joint_{name}")) for name in OF_JOINTS}
-    centers, poses, inertias, contracts = (
-        _centers_of_mass(m, state),
-        _numbers(state.body_q),
-        _numbers(m.body_inertia),
-        {},
-    )
+    centers, poses, inertias = _centers_of_mass(m, state), _numbers(state.body_q), _numbers(m.body_inertia)
+    contracts = {}
     for i, link in enumerate(tree.links):
         kind, R = KINDS[int(m.joint_type.numpy()[i])], _matrix(poses[i])
         j, single = int(m.joint_qd_start.numpy()[i]), kind != "quaternion_floating"

@@ -16,13 +16,13 @@ from drake_diff.engines.interface import (
     DRAKES_STEP,
     EngineContract,
     RigidEngine,
-    StepJacobian,
     floats,
     geometry_contracts,
+    not_offered,
     principal,
     shape_of,
 )
-from drake_diff.exceptions import MissingDependencyError, ModelError, NotOfferedError
+from drake_diff.exceptions import MissingDependencyError, ModelError
 from drake_diff.mechanics.coordinates import Centers, rotation, unit
 from drake_diff.mechanics.description import Geometry, JointContract, PairContract, RigidLink, joint_contract, split
 from drake_diff.model.model import Model
@@ -41,7 +41,7 @@ UNLIMITED = 1e6  # [rad/s or m/s] instead of PhysX's 100 and 50
 # Mass [kg] and moment of inertia [kg m^2] of massless links and point masses, as PhysX takes 0 for infinite.
 SMALLEST = 1e-9
 ITERATIONS = 100  # of the solver, instead of 10, because the damping of one joint affects the others
-NOT_OFFERED = "PhysX gives neither mass matrix nor inverse dynamics; SAPIEN's are those of Pinocchio on another model"
+NO_TERMS = "PhysX gives neither mass matrix nor inverse dynamics; SAPIEN's are those of Pinocchio on another model"
 
 
 class World(NamedTuple):
@@ -91,14 +91,8 @@ class SapienEngine(RigidEngine):
                 v[j + 3 : j + 6], v[j : j + 3] = tree.root_linear_velocity, tree.root_angular_velocity
         return self._drake_state("PhysX", q, v, x, u)
 
-    def differentiate_step(self, x: ArrayLike, u: ArrayLike) -> StepJacobian:
-        raise NotOfferedError("PhysX has no derivatives of its step")
-
-    def mass_matrix(self, q: ArrayLike) -> Array:
-        raise NotOfferedError(NOT_OFFERED)
-
-    def bias(self, q: ArrayLike, v: ArrayLike) -> Array:
-        raise NotOfferedError(NOT_OFFERED)
+    differentiate_step = not_offered("PhysX has no derivatives of its step")
+    mass_matrix = bias = not_offered(NO_TERMS)
 
     def energy(self, x: ArrayLike) -> float:
         x, q, v = self._state(x)
@@ -128,7 +122,7 @@ class SapienEngine(RigidEngine):
         names = [joint.name for tree in world.trees for joint in tree.joints if joint.type in KINDS]
         contacts = []
         for pair in self.pairs:
-            a, b = (_material(self.friction.get(name)).dynamic_friction for name in pair.names)
+            a, b = (self._material(name).dynamic_friction for name in pair.names)
             contacts.append(PairContract(pair.names, float(a + b) / 2, None))
         euler = (
             "semi-implicit Euler, joint damping implicit, free bodies by v' of the centre of mass, quaternions by the "
@@ -212,7 +206,7 @@ class SapienEngine(RigidEngine):
         return links
 
     def _shape(self, geometry: Geometry) -> Any:
-        (kind, sizes), X, material = shape_of(geometry), geometry.pose, _material(self.friction.get(geometry.name))
+        (kind, sizes), X, material = shape_of(geometry), geometry.pose, self._material(geometry.name)
         if kind == "Sphere":
             shape = physx.PhysxCollisionShapeSphere(sizes["radius"][0], material)
         elif kind == "Box":
@@ -228,6 +222,12 @@ class SapienEngine(RigidEngine):
         shape.set_collision_groups([*self.groups[geometry.name], 0, 0])
         return shape
 
+    def _material(self, name: str) -> Any:
+        """Return the material of this geometry, SAPIEN's default if its friction is not defined."""
+        if name not in self.friction:
+            return physx.get_default_material()
+        return physx.PhysxMaterial(self.friction[name], self.friction[name], 0.0)
+
     def _set_tree_state(self, tree: Any, members: range, q: Array, v: Array, force: Array) -> None:
         tree.set_solver_position_iterations(ITERATIONS)
         tree.sleep_threshold = 0.0
@@ -240,9 +240,9 @@ class SapienEngine(RigidEngine):
         joints = [rigid[joint.name].joint for joint in tree.active_joints]
         if joints:
             with np.errstate(over="ignore"):  # overflow of float32 gives inf, and SimulationError
-                tree.qpos = np.array([q[x.q_start] for x in joints]).astype(np.float32)
-                tree.qvel = np.array([v[x.v_start] for x in joints]).astype(np.float32)
-                tree.qf = np.array([force[x.v_start] for x in joints]).astype(np.float32)
+                tree.qpos = q[[x.q_start for x in joints]].astype(np.float32)
+                tree.qvel = v[[x.v_start for x in joints]].astype(np.float32)
+                tree.qf = force[[x.v_start for x in joints]].astype(np.float32)
 
 
 def groups_by_shape(pairs: tuple[PairContract, ...]) -> dict[str, tuple[int, int]]:
@@ -253,11 +253,7 @@ def groups_by_shape(pairs: tuple[PairContract, ...]) -> dict[str, tuple[int, int
     if len(kinds) > GROUPS:
         raise ModelError(f"PhysX supports {GROUPS} collision groups; this model needs {len(kinds)}")
     bit = {name: 1 << kinds.index(partners[name]) for name in names}
-    masks = dict.fromkeys(names, 0)
-    for name in names:
-        for partner in partners[name]:
-            masks[name] |= bit[partner]
-    return {name: (bit[name], masks[name]) for name in names}
+    return {name: (bit[name], sum({bit[partner] for partner in partners[name]})) for name in names}
 
 
 def _read_part(link: Any) -> tuple[float, Array, Array, Array]:
@@ -294,13 +290,6 @@ def _fixed(scene: Any) -> Any:
     link.joint.type = "fixed"
     scene.add_entity(entity)
     return link
-
-
-def _material(friction: float | None) -> Any:
-    """Return the material with this friction, or SAPIEN's default if friction is None."""
-    if friction is None:
-        return physx.get_default_material()
-    return physx.PhysxMaterial(friction, friction, 0.0)
 
 
 def _pose(X: RigidTransform) -> Any:

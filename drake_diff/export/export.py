@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, positive_int
+from drake_diff._base.arrays import positive_int
 from drake_diff._base.values import plain_numbers
 from drake_diff.engines.contract import LAWS, match_contracts
 from drake_diff.engines.drake import DrakeEngine
@@ -90,17 +90,18 @@ def complaints(form: str, model: Model, text: str) -> list[str]:
                             contact_approximation=model.contract.contact.approximation,
                             mimic="reduce" if description.followers else None,
                         )  # fmt: skip
-                        followers, engine = describe_whole(found_there).followers, _Unlimited(found_there.whole)
+                        followers, engine = (
+                            describe_whole(found_there).followers,
+                            _Unlimited(found_there.whole),
+                        )
                         problems += _other_materials(form, description, engine.description)
                         if form == "sdf":
-                            of_sdf = _other_followers(description.followers, _followers_by_sdf(text))
-                            problems += [f"SDF's own <mimic>, {clause}" for clause in of_sdf]
-                problems += [
-                    f"read by {reader}, {clause}" for clause in _other_followers(description.followers, followers)
-                ]
+                            of_sdf = _followers_by_sdf(text)
+                            problems += _other_followers("SDF's own <mimic>", description.followers, of_sdf)
+                problems += _other_followers(f"read by {reader}", description.followers, followers)
                 lines = match_contracts(_Named(model.whole, form), engine)
             except DrakeDiffError as error:
-                problems.append(f"{reader} cannot read it: {error}")
+                problems.append(f"{reader} cannot read the file: {error}")
             else:
                 wrong = [line for line in lines if line.verdict == "different" and line.quantity not in LAWS]
                 if reader == "drake":
@@ -137,14 +138,15 @@ def _followers_by_sdf(text: str) -> list[Follower]:
     return followers
 
 
-def _other_followers(wanted: Sequence[Follower], read: Sequence[Follower]) -> list[str]:
+def _other_followers(where: str, wanted: Sequence[Follower], read: Sequence[Follower]) -> list[str]:
     """Return complaints about mimic joints that are missing or have other relations than they should."""
     meant, there = ({f.joint: f for f in side} for side in (wanted, read))
     problems = []
     for joint in sorted(meant.keys() | there.keys()):
         a, b = meant.get(joint), there.get(joint)
         if a is None or b is None or a.leader != b.leader or not _same([a.ratio, a.offset], [b.ratio, b.offset]):
-            problems.append(f"joints that follow others: {b or f'{joint} follows none'} where {a or 'none'} was meant")
+            relations = f"expected {a or f'{joint} to be free'}, got {b or f'{joint} is free'}"
+            problems.append(f"{where}, mimic joints: {relations}")
     return problems
 
 
@@ -162,7 +164,7 @@ def _other_materials(form: str, wanted: Description, read: Description) -> list[
             for quantity, value in g.material.items():
                 other = theirs[0].get(quantity)
                 if other is None or abs(other - value) > STEP_TOLERANCE * abs(value):
-                    problems.append(f"read by drake, {quantity}: {g.name}: {other} where {value:g} was meant")
+                    problems.append(f"read by drake, {quantity}: {g.name}: expected {value:g}, got {other}")
     return problems
 
 
@@ -328,12 +330,12 @@ def export_model(model: Model, directory: str | Path, *, target: str, states: in
         "not_in_the_file": left_out,
         "initial_states": made,
     }
+    coupling = model.coupling  # of mimic joints, which the file has as joints
+    starts = ([s.kind, *(s.x if coupling is None else coupling.state(s.x))] for s in samples)
     files = {
         f"model{SUFFIX[form]}": text,
         "contract.json": json.dumps(plain_numbers(facts_of_model), indent=1) + "\n",
-        "initial_states.csv": _table(
-            ["state", "kind", *model.whole.state_names], ([s.kind, *_whole(model, s.x)] for s in samples)
-        ),
+        "initial_states.csv": _table(["state", "kind", *model.whole.state_names], starts),
         "inputs.csv": _table(["state", *model.input_names], (s.u for s in samples)),
         "README.md": readme,
         **made_usd,
@@ -350,14 +352,9 @@ def _followers_text(followers: Sequence[Follower]) -> str:
         return "none."
     listed = "; ".join(map(str, followers))
     return (
-        f"{listed} (m and rad), as in the file. Check that your reader enforces it, also at the start. "
+        f"{listed} (m and rad), as in the file. Check that your reader enforces these relations, also at the start. "
         "A recording has no columns for these joints."
     )
-
-
-def _whole(model: Model, x: Array) -> Array:
-    """Return the state of all joints, including mimic joints."""
-    return x if model.coupling is None else np.asarray(model.coupling.state(x))
 
 
 def _table(header: list[str], rows: Iterable[Iterable[Any]]) -> str:

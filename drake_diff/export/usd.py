@@ -74,7 +74,7 @@ def _refuse(moving: Sequence[Link], followers: Sequence[Follower]) -> None:
             )
     for link in moving:
         if link.mass <= 0 or np.any(principal(link.inertia)[0] <= 0):
-            raise ModelError(f"link {link.body}: USD cannot hold a mass or moment of inertia of 0")
+            raise ModelError(f"link {link.body}: USD does not support a mass or moment of inertia of 0")
         for name in (link.body, link.joint):
             if not Tf.IsValidIdentifier(name):
                 raise ModelError(f"{name!r} is not a valid name in USD")
@@ -89,7 +89,7 @@ def lost(description: Description) -> tuple[str, ...]:
         a, b = (sides[name].get("friction") for name in pair.names)
         if a != b:
             losses.append(
-                f"friction of {' with '.join(pair.names)}: {pair.friction} here, PhysX takes the average of {a} and {b}"
+                f"friction of {' with '.join(pair.names)}: {pair.friction}, in PhysX the average of {a} and {b}"
             )
     if any(pair.dissipation or pair.relaxation_time for pair in description.pairs):
         losses.append("dissipation of contacts")
@@ -203,14 +203,12 @@ def _add_material(stage: Any, number: int, geometry: Geometry, prim: Any) -> Non
     if "friction" in geometry.material:
         physics.CreateStaticFrictionAttr(geometry.material["friction"])
         physics.CreateDynamicFrictionAttr(geometry.material["friction"])
-    material.GetPrim().AddAppliedSchema("PhysxMaterialAPI")
-    attributes: dict[str, tuple[Any, Any]] = {"frictionCombineMode": (Sdf.ValueTypeNames.Token, "average")}
-    if "stiffness" in geometry.material:
-        attributes["compliantContactStiffness"] = (Sdf.ValueTypeNames.Float, geometry.material["stiffness"])
-    for name, (kind, value) in attributes.items():
-        material.GetPrim().CreateAttribute(f"physxMaterial:{name}", kind).Set(value)
-    binding = UsdShade.MaterialBindingAPI.Apply(prim)
-    binding.Bind(material, UsdShade.Tokens.weakerThanDescendants, "physics")
+    of_physx, kinds = material.GetPrim(), Sdf.ValueTypeNames
+    of_physx.AddAppliedSchema("PhysxMaterialAPI")
+    of_physx.CreateAttribute("physxMaterial:frictionCombineMode", kinds.Token).Set("average")
+    if (stiffness := geometry.material.get("stiffness")) is not None:
+        of_physx.CreateAttribute("physxMaterial:compliantContactStiffness", kinds.Float).Set(stiffness)
+    UsdShade.MaterialBindingAPI.Apply(prim).Bind(material, UsdShade.Tokens.weakerThanDescendants, "physics")
 
 
 def _filter_pairs(description: Description, prims: Mapping[str, Any]) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.engines import engine_of, needs
+from helpers.followers import followed
 from helpers.models import MODELS
 from helpers.table import each_row
 from helpers.two_bases import two_bases
@@ -125,6 +126,14 @@ def test_what_no_single_change_takes_is_unexplained(load):
     moon = engine_of("drake", dd.load_model(model.source, time_step=H, gravity=[0, 0, -1.62]))
     e = compared(model, record(moon, [0.5, 0], INPUTS))
     assert (e.verdict, e.largest.responsible, e.largest.as_if) == ("unexplained", "unexplained", "")
+
+
+def test_a_deviation_of_a_model_with_reduced_mimic_joints_is_unexplained(tmp_path):
+    model = followed(tmp_path)
+    motion = dd.rollout(model, [0.1, 0.0], INPUTS)
+    pushed = dd.Recording("pushed", "1", H * np.arange(41), motion.xs + 1e-3 * np.arange(41)[:, None], INPUTS)
+    e = compared(model, pushed)
+    assert (e.verdict, e.largest.responsible) == ("unexplained", "unexplained")
 
 
 def test_contact_is_the_contact_law_s_and_a_told_law_explains_it(load):
