@@ -63,7 +63,6 @@ OTHER_APPROXIMATION = {"sap": "lagged", "similar": "sap", "lagged": "sap", "tams
 FINE = 8  # parts of a step; at h/8 the O(h) error that remains is a seventh of the change from h to h/8
 # Largest numbers of steps in an interval. A hand that must be within 5 mm at 1 m/s needs steps of 5 ms.
 FINER, FINEST = 16, 64
-HOPELESS = 2.0  # extrapolated ratio of a value to its tolerance beyond which finer steps are not tried
 MOST_STEPS = 4000  # of a replay with more than FINER parts per interval
 ANOTHER_INTEGRATION, IN_CONTINUOUS_TIME = "by another integration in continuous time", "in continuous time"
 TOLERANCE = 1e-6  # of each step of the integration in continuous time; the motion is judged to 5 %
@@ -240,7 +239,7 @@ def replays(plan: ReplayPlan) -> tuple[Replay, ...]:
 
 
 def _fails_in_the_limit(rows: Sequence[Replay]) -> bool:
-    """Return whether the plan fails under every controller in ever finer steps, by its last two variants.
+    """Return whether the plan fails a WIDER tolerance under every controller in ever finer steps, by its last two.
 
     The error of a replay is O(h), so that the worst ratio of a value to its tolerance tends to 2 r(h/2) - r(h).
     """
@@ -248,7 +247,7 @@ def _fails_in_the_limit(rows: Sequence[Replay]) -> bool:
         [max(c.ratio for c in r.checks) for r in rows if r.variant == variant]
         for variant in list(dict.fromkeys(r.variant for r in rows))[-2:]
     )
-    return all(np.isfinite(a) and 2 * b - a > HOPELESS for a, b in zip(coarse, fine, strict=True))
+    return all(np.isfinite(a) and 2 * b - a > WIDER for a, b in zip(coarse, fine, strict=True))
 
 
 def finest_parts(plan: ReplayPlan) -> int:

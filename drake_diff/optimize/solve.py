@@ -37,7 +37,6 @@ DEFAULTS = Options()
 METHODS = ("auto", "collocation", "shooting", "ilqr")
 DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": "ipopt", "ilqr": "riccati"}
 OTHER_GUESS = "another first guess"
-CONVERTED = "the collocated plan in the model's own steps"
 REFINING = 30  # iterations from a collocated plan to the optimum in discrete steps; well-posed problems take ten
 NOT_FOUND = (Status.INFEASIBLE, Status.ITERATION_LIMIT, Status.DIVERGED, Status.FAILED)
 BLIND = (Status.NO_GRADIENT, Status.DIVERGED)
@@ -409,7 +408,7 @@ def _in_steps(task: _Task, asked: Attempt, plan: Solution, chain: list[dict[str,
     nearest = "the motion in the model's own steps that is nearest to the collocated plan"
     attempts = (
         first,
-        replace(asked.by("ilqr", f"{CONVERTED}, by iLQR"), max_iterations=REFINING),
+        replace(asked.by("ilqr", f"{first.reason}, by iLQR"), max_iterations=REFINING),
         replace(first, reason=nearest, closest=True, max_iterations=5 * REFINING),
     )
     for attempt in attempts[1 if task.converted and "refinements" not in plan.options else 0 :]:
@@ -423,7 +422,8 @@ def _in_steps(task: _Task, asked: Attempt, plan: Solution, chain: list[dict[str,
 
 
 def _shooting(asked: Attempt) -> Attempt:
-    return replace(asked.by("shooting", CONVERTED), max_iterations=REFINING)
+    reason = "the collocated plan in the model's own steps"
+    return replace(asked.by("shooting", reason), max_iterations=REFINING)
 
 
 def _has_steps(problem: Problem) -> bool:
