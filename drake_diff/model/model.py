@@ -89,10 +89,6 @@ CHOICES = {
     "inputs": (None, "position", "effort"),
 }
 OTHERS_KEPT = 128  # maximum number of cached variants of a model; a certificate for the time step needs 91
-EXAMPLES = (
-    Path(__file__).parents[1] / "models",
-    Path(__file__).parent / "robots",
-)  # in a clone, the first is a link to the top-level folder
 NAMES_SHOWN = 12  # in repr, enough for the whole state of a robot arm
 
 
@@ -668,7 +664,9 @@ def load_model(
 
 def example_files() -> dict[str, Path]:
     """Return the file of each example by its name."""
-    files = [file for folder in EXAMPLES for file in folder.iterdir() if file.name.endswith(FORMATS)]
+    here = Path(__file__).parent  # in a clone, the first folder below is a link to the top-level folder
+    folders = here.parent / "models", here / "robots"
+    files = [file for folder in folders for file in folder.iterdir() if file.name.endswith(FORMATS)]
     return {file.stem: file for file in sorted(files, key=lambda file: file.name)}
 
 
