@@ -12,26 +12,11 @@ import drake_diff as dd
 
 pytestmark = pytest.mark.solve
 
-CODES = [
-    "no_actuator",
-    "undriven",
-    "massless_root",
-    "massless_joint",
-    "meshes_skipped",
-    "collision_gone",
-    "falls",
-    "invented_inertia",
-    "unread_compliance",
-    "ignored",
-    "zero_limit",
-    "corners_miss",
-    "left_out",
-    "switched_off",
-]
 INERTIA = '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>'
 INERTIAL = f'<inertial><mass value="1"/>{INERTIA}</inertial>'
 BOX = '<collision><geometry><box size="0.06 0.06 0.06"/></geometry></collision>'
 LIMIT = '<limit effort="7" velocity="1" lower="-2" upper="2"/>'
+LIMIT_OF_0 = '<limit effort="1" velocity="0" lower="-1" upper="1"/>'
 DRIVE = (
     '<transmission><type>SimpleTransmission</type><joint name="hinge"/><actuator name="motor"/></transmission></robot>'
 )
@@ -39,6 +24,10 @@ DRIVE = (
 
 def link(name, inertial=INERTIAL, shape=""):
     return f'<link name="{name}">{inertial}{shape}</link>'
+
+
+def with_more(robot, *parts):
+    return robot.replace("</robot>", "".join(parts) + "</robot>")
 
 
 def joint(name, parent, child, kind="revolute", limit=LIMIT, more=""):
@@ -66,12 +55,11 @@ def sdf(inertial, proximity="", limit=""):
     )
 
 
-GRASP = (
-    '<robot name="hand">'
-    + "".join(link(name, shape=BOX) for name in ("left", "right", "block"))
-    + joint("l", "world", "left", "prismatic", more='<origin xyz="-0.06 0.01 0.5"/>').replace("0 1 0", "1 0 0")
-    + joint("r", "world", "right", "prismatic", more='<origin xyz="0.06 0.01 0.5"/>').replace("0 1 0", "1 0 0")
-    + "</robot>"
+GRASP = with_more(
+    '<robot name="hand"></robot>',
+    *(link(name, shape=BOX) for name in ("left", "right", "block")),
+    joint("l", "world", "left", "prismatic", more='<origin xyz="-0.06 0.01 0.5"/>').replace("0 1 0", "1 0 0"),
+    joint("r", "world", "right", "prismatic", more='<origin xyz="0.06 0.01 0.5"/>').replace("0 1 0", "1 0 0"),
 )
 
 
@@ -88,21 +76,17 @@ def audited(tmp_path, text, **options):
     return {finding.code: finding for finding in dd.audit(model)}
 
 
-MESH = '<{}><geometry><mesh filename="hand.{}"/></geometry></{}>'
-
-
+TIP, WRIST = link("tip"), joint("wrist", "upper", "tip")
+MESH = '<{}><geometry><mesh filename="{}"/></geometry></{}>'
+COLLISION = MESH.format("collision", "{}", "collision")
 SWING = '<body name="a"><joint name="j" axis="0 1 0" {}/><geom size="0.1" mass="1"/></body>'
 MJCF = f'<mujoco model="m">{{}}<worldbody><geom type="plane" size="9 9 1"/>{SWING}</worldbody>{{}}</mujoco>'
-
-
 FILES = {
     "no_actuator": ARM.replace(DRIVE, "</robot>"),
     "massless_root": FREE.replace(INERTIAL, "", 1),
-    "massless_joint": ARM.replace("</robot>", link("tip", "") + joint("wrist", "upper", "tip") + "</robot>"),
-    "meshes_skipped": ARM.replace("</link>", MESH.format("visual", "dae", "visual") + "</link>"),
-    "collision_gone": ARM.replace(
-        "</link>", MESH.format("collision", "stl", "collision").replace("hand", "gone") + "</link>"
-    ),
+    "massless_joint": with_more(ARM, link("tip", ""), WRIST),
+    "meshes_skipped": ARM.replace("</link>", MESH.format("visual", "hand.dae", "visual") + "</link>"),
+    "collision_gone": ARM.replace("</link>", COLLISION.format("gone.stl") + "</link>"),
     "falls": FREE,
     "falls 2": FREE.replace(BOX, ""),
     "invented_inertia": ARM.replace('mass value="1"', 'mass value="-1"'),
@@ -116,30 +100,20 @@ FILES = {
     "zero_limit": ARM.replace(DRIVE, "</robot>").replace('velocity="1"', 'velocity="0"'),
     "zero_limit 2": ARM.replace(DRIVE, "</robot>").replace('lower="-2" upper="2"', 'lower="0" upper="0"'),
     "corners_miss": GRASP,
-    "undriven": ARM.replace("</robot>", link("tip") + joint("wrist", "upper", "tip") + "</robot>"),
-    "zero_limit 3": ARM.replace('lower="-2" upper="2"', 'lower="1" upper="1"').replace(
-        "</robot>", link("tip") + joint("wrist", "upper", "tip") + "</robot>"
-    ),
+    "undriven": with_more(ARM, TIP, WRIST),
+    "zero_limit 3": with_more(ARM.replace('lower="-2" upper="2"', 'lower="1" upper="1"'), TIP, WRIST),
     "zero_limit 4": ARM.replace('lower="-2" upper="2"', 'lower="1" upper="1"'),
-    "collision_gone 2": ARM.replace("</link>", MESH.format("collision", "STL", "collision") + "</link>"),
-    "falls 3": FREE.replace(BOX, MESH.format("collision", "STL", "collision")),
-    "massless_root 2": FREE.replace("</robot>", link("ghost", "") + "</robot>"),
+    "collision_gone 2": ARM.replace("</link>", COLLISION.format("hand.STL") + "</link>"),
+    "falls 3": FREE.replace(BOX, COLLISION.format("hand.STL")),
+    "massless_root 2": with_more(FREE, link("ghost", "")),
     "saturated_effort": ARM.replace('effort="7"', 'effort="0"'),
-    "mimic_joint": ARM.replace(
-        "</robot>", link("tip") + joint("wrist", "upper", "tip", more='<mimic joint="hinge"/>') + "</robot>"
-    ),
+    "mimic_joint": with_more(ARM, TIP, joint("wrist", "upper", "tip", more='<mimic joint="hinge"/>')),
     "ignored 3": sdf("").replace("</xyz></axis>", "</xyz><dynamics><friction>0.3</friction></dynamics></axis>"),
     "ignored 4": ARM.replace("</link>", '<contact><lateral_friction value="2"/></contact></link>'),
-    "ignored 5": ARM.replace("</robot>", '<gazebo reference="upper"><mu1>0.1</mu1></gazebo></robot>'),
-    "zero_limit 5": ARM.replace(
-        "</robot>",
-        link("tip")
-        + joint("wrist", "upper", "tip", limit='<limit effort="1" velocity="0" lower="-1" upper="1"/>').replace(
-            "</joint>", '<mimic joint="hinge"/></joint>'
-        )
-        + link("end")
-        + joint("last", "tip", "end")
-        + "</robot>",
+    "ignored 5": with_more(ARM, '<gazebo reference="upper"><mu1>0.1</mu1></gazebo>'),
+    "zero_limit 5": with_more(
+        *(ARM, TIP, link("end"), joint("last", "tip", "end")),
+        joint("wrist", "upper", "tip", limit=LIMIT_OF_0, more='<mimic joint="hinge"/>'),
     ),
     "left_out": MJCF.format("", "", '<actuator><damper name="servo" joint="j" kv="5"/></actuator>'),
     "left_out 2": MJCF.format("", "", '<actuator><motor name="pull" tendon="t"/></actuator>'),
@@ -155,45 +129,21 @@ TRAPS = [
     ("collision_gone", "warning", "collision_gone", {}, r"upper\): no collision shape", {"contact": False}),
     ("falls", "warning", "falls", {}, r"the world has no ground or fixed shape", {"ground": True}),
     ("falls", "warning", "falls 2", {"ground": True}, "it has no collision shapes", {"base": "weld"}),
-    (
-        "invented_inertia",
-        "error",
-        "invented_inertia",
-        {},
-        "no inertia fits the file's mass of -1 kg; Drake uses a ball of water of 1 kg",
-        None,
-    ),
+    ("invented_inertia", "error", "invented_inertia", {},
+     "no inertia fits the file's mass of -1 kg; Drake uses a ball of water of 1 kg", None),
     ("invented_inertia", "warning", "invented_inertia 2", {}, "the file's inertia is not physically valid", None),
     ("invented_inertia", "warning", "invented_inertia 3", {}, "gives no mass", None),
     ("invented_inertia", "warning", "invented_inertia 4", {}, "gives no inertia, so that the format's default", None),
-    (
-        "unread_compliance",
-        "warning",
-        "unread_compliance",
-        {},
-        "sap reads relaxation_time",
-        {"contact_approximation": "similar"},
-    ),
-    (
-        "unread_compliance",
-        "warning",
-        "unread_compliance 2",
-        {"contact_approximation": "lagged"},
-        "lagged read hunt_crossley",
-        {"contact_approximation": "sap"},
-    ),
+    ("unread_compliance", "warning", "unread_compliance", {}, "sap reads relaxation_time",
+     {"contact_approximation": "similar"}),
+    ("unread_compliance", "warning", "unread_compliance 2", {"contact_approximation": "lagged"},
+     "lagged read hunt_crossley", {"contact_approximation": "sap"}),
     ("ignored", "warning", "ignored", {}, r"friction\): Drake does not read this part of the file \(1 times\)", None),
     ("ignored", "info", "ignored 2", {}, "safety_controller", None),
     ("zero_limit", "error", "zero_limit", {}, "the velocity limit is 0", {"actuators": ["hinge"]}),
     ("zero_limit", "error", "zero_limit 2", {}, "limits are both 0", {"actuators": ["hinge"]}),
-    (
-        "corners_miss",
-        "warning",
-        "corners_miss",
-        {"contact_geometry": "corner_spheres"},
-        "block - left",
-        {"contact_geometry": "differences"},
-    ),
+    ("corners_miss", "warning", "corners_miss", {"contact_geometry": "corner_spheres"}, "block - left",
+     {"contact_geometry": "differences"}),
     ("undriven", "info", "undriven", {}, "wrist.*1 joints have an effort limit", {"actuators": ["wrist"]}),
     ("zero_limit", "error", "zero_limit 3", {}, "limits are both 1", {"fix_joints": ["hinge"]}),
     ("zero_limit", "error", "zero_limit 4", {}, "give it limits in the file", None),
@@ -201,63 +151,32 @@ TRAPS = [
     ("meshes_skipped", "warning", "collision_gone 2", {}, "1 collision meshes skipped", {"meshes": "spheres"}),
     ("falls", "warning", "falls 3", {}, r"it has no collision shapes", {"meshes": "spheres", "ground": True}),
     ("massless_root", "error", "massless_root 2", {"base": "weld"}, r"ghost\): the body floats and has no mass", None),
-    (
-        "saturated_effort",
-        "error",
-        "saturated_effort",
-        {},
-        r"hinge\): Drake leaves out actuators",
-        {"actuators": ["hinge"]},
-    ),
+    ("saturated_effort", "error", "saturated_effort", {}, r"hinge\): Drake leaves out actuators",
+     {"actuators": ["hinge"]}),
     ("mimic_joint", "warning", "mimic_joint", {}, r"wrist\): mimic joints that stay in the state", {"mimic": "reduce"}),
-    (
-        "pair_refused",
-        "error",
-        "falls",
-        {"ground": True},
-        r"ground \(HalfSpace\)",
-        {"contact_geometry": "corner_spheres"},
-    ),
-    (
-        "pair_refused",
-        "error",
-        "falls",
-        {"ground": True, "contact_model": "hydroelastic"},
-        "hydroelastic contact requires",
-        {"contact_geometry": "hydroelastic"},
-    ),
-    (
-        "pair_refused",
-        "error",
-        "falls 3",
-        {"ground": True, "meshes": "convex"},
-        "Convex",
-        {"meshes": "spheres", "contact_geometry": "corner_spheres"},
-    ),
-    (
-        "aligned_faces",
-        "error",
-        "falls",
-        {"ground": True, "contact_model": "hydroelastic", "contact_geometry": "hydroelastic"},
-        "faces are 0 rad from parallel",
-        {"contact_model": "point", "contact_geometry": "corner_spheres"},
-    ),
+    ("pair_refused", "error", "falls", {"ground": True}, r"ground \(HalfSpace\)",
+     {"contact_geometry": "corner_spheres"}),
+    ("pair_refused", "error", "falls", {"ground": True, "contact_model": "hydroelastic"},
+     "hydroelastic contact requires", {"contact_geometry": "hydroelastic"}),
+    ("pair_refused", "error", "falls 3", {"ground": True, "meshes": "convex"}, "Convex",
+     {"meshes": "spheres", "contact_geometry": "corner_spheres"}),
+    ("aligned_faces", "error", "falls",
+     {"ground": True, "contact_model": "hydroelastic", "contact_geometry": "hydroelastic"},
+     "faces are 0 rad from parallel", {"contact_model": "point", "contact_geometry": "corner_spheres"}),
     ("ignored", "warning", "ignored 3", {}, r"the friction of a joint, 0\.3, is ignored", None),
     ("ignored", "warning", "ignored 4", {}, "1 <contact> are ignored", None),
     ("ignored", "info", "ignored 5", {}, "1 <gazebo> are ignored", None),
     ("zero_limit", "error", "zero_limit 5", {}, r"wrist\): the velocity limit is 0", {"mimic": "fix"}),
-    (
-        "left_out",
-        "warning",
-        "left_out",
-        {},
-        r"1 actuators left out, .*: servo \(damper of j, line 1\)",
-        {"actuators": ["j"]},
-    ),
+    ("left_out", "warning", "left_out", {}, r"1 actuators left out, .*: servo \(damper of j, line 1\)",
+     {"actuators": ["j"]}),
     ("left_out", "warning", "left_out 2", {}, r"pull \(motor of no joint, line 1\)", None),
     ("switched_off", "warning", "switched_off", {}, r"contact\): the file disables this effect", {"contact": False}),
     ("never_apart", "warning", "never_apart", {}, r"a - b\): the links overlap", {"contact": "separable"}),
-]
+]  # fmt: skip
+# The codes without those that models of this repository have on purpose, or that other tests of them check.
+CODES = {code for code, *_ in TRAPS} - {
+    "saturated_effort", "mimic_joint", "pair_refused", "aligned_faces", "never_apart"
+}  # fmt: skip
 
 
 @pytest.mark.slow
@@ -317,4 +236,4 @@ def test_a_block_falls_out_of_corner_spheres_and_stays_between_boxes(tmp_path):
 @each_row("name", sorted(p.name for p in MODELS.iterdir()))
 def test_the_models_of_this_repository_have_none(load, name):
     model = load(name)
-    assert {f.code for f in dd.audit(model)} & set(CODES) == set()
+    assert {f.code for f in dd.audit(model)} & CODES == set()

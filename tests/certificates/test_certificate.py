@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from helpers.derivatives import scaled
 from helpers.models import Plant, contact_properties, random_state
 from helpers.robots import example_robot, state_in_range
 from helpers.table import each_row
@@ -36,9 +37,7 @@ def test_a_right_jacobian_agrees_and_one_entry_1_percent_off_is_caught(n):
     right = jacobian(x)
     certify_jacobian(f, x, right).require()
     for i, j in [(0, 0), (n - 1, n // 2), (n // 3, n - 1)]:
-        wrong = right.copy()
-        wrong[i, j] *= 1.01
-        certificate = certify_jacobian(f, x, wrong)
+        certificate = certify_jacobian(f, x, scaled(right, (i, j)))
         assert certificate.verdict == "disagree"
         assert (certificate.worst.row, certificate.worst.column) == (f"f[{i}]", f"x[{j}]")
         assert certificate.count("agree") == n * n - 1
@@ -61,10 +60,8 @@ CHAIN = """<link name="l{i}"><inertial><origin xyz="0 0 -0.1"/><mass value="{m}"
 
 @pytest.mark.parametrize("nx", [2, 20, 100])
 def test_one_entry_of_a_step_1_percent_off_is_caught(tmp_path, nx):
-    links = [
-        CHAIN.format(i=i, m=1 + 0.1 * i, z=-0.2 if i else 0, parent=f"l{i - 1}" if i else "world")
-        for i in range(nx // 2)
-    ]
+    parents = ["world", *(f"l{i}" for i in range(nx // 2 - 1))]
+    links = [CHAIN.format(i=i, m=1 + 0.1 * i, z=-0.2 if i else 0, parent=name) for i, name in enumerate(parents)]
     (tmp_path / "chain.urdf").write_text(f"<robot name='chain'>{''.join(links)}</robot>")
     model = dd.load_model(tmp_path / "chain.urdf", time_step=0.005)
     x = 0.3 * np.random.default_rng(2).standard_normal(nx)
@@ -72,9 +69,8 @@ def test_one_entry_of_a_step_1_percent_off_is_caught(tmp_path, nx):
     dd.certify(model, x).require()
     row = nx - 1
     column = int(np.argmax(np.abs(d.A[row, : nx // 2])))
-    A = np.array(d.A)
-    A[row, column] *= 1.01
-    certificate = dd.certify(model, x, derivatives=dataclasses.replace(d, A=A))
+    wrong = dataclasses.replace(d, A=scaled(d.A, (row, column)))
+    certificate = dd.certify(model, x, derivatives=wrong)
     assert certificate.verdict == "disagree"
     assert certificate.worst.row == model.state_names[row]
     assert certificate.worst.column == model.state_names[column]
@@ -368,8 +364,7 @@ def test_no_wrong_derivative_by_the_inputs_of_a_sliding_ball_is_passed(approxima
 def test_the_same_differences_judge_another_derivative():
     f, jacobian = smooth(5)
     x = np.random.default_rng(1).standard_normal(5)
-    wrong = jacobian(x)
-    wrong[2, 3] *= 1.01
+    wrong = scaled(jacobian(x), (2, 3))
     first = certify_jacobian(f, x, jacobian(x))
     again, anew = first.of(wrong), certify_jacobian(f, x, wrong)
     assert np.array_equal(again.codes, anew.codes)
@@ -390,9 +385,7 @@ def test_1_percent_near_a_joint_limit_and_under_pd_control_is_found_and_named(na
     assert "solved to rounding" in str(certificate)
     size = np.abs(certificate.derivative) >= certificate.size
     for i, j in random.choice(np.argwhere(size), 10, replace=False):
-        wrong = certificate.derivative.copy()
-        wrong[i, j] *= random.choice([0.99, 1.01])
-        found = certificate.of(wrong)
+        found = certificate.of(scaled(certificate.derivative, (i, j), random.choice([0.99, 1.01])))
         assert found.verdict == "disagree"
         assert (found.worst.row, found.worst.column) == (found.rows[i], found.columns[j])
 
@@ -402,10 +395,8 @@ def test_steps_that_are_not_known_to_rounding_are_said_to_be_drakes_own_and_hide
 
     def refused(model, vector, xs, us, values, held=None):
         n = len(xs)
-        refusals = dict.fromkeys(range(n), Refusal("not today"))
-        return RefinedSteps(
-            xs, xs, np.ones(n, dtype=bool), np.full(n, np.nan), np.full((n, model.nv), np.nan), refusals
-        )
+        refusals, nothing = dict.fromkeys(range(n), Refusal("not today")), np.full((n, model.nv), np.nan)
+        return RefinedSteps(xs, xs, np.ones(n, dtype=bool), np.full(n, np.nan), nothing, refusals)
 
     monkeypatch.setattr("drake_diff.certificates.certify.refine_steps", refused)
     model = sliding("lagged")
@@ -439,19 +430,16 @@ def test_a_motor_of_a_small_limit_is_probed_within_it(tmp_path):
     )
     certificate = dd.certify(dd.load_model(tmp_path / "slide.urdf", time_step=0.05, base="weld"), [0, 0], [0]).require()
     assert certificate.derivative[1, 2] == pytest.approx(0.05 / 2e-5, rel=1e-9)
-    wrong = certificate.derivative.copy()
-    wrong[1, 2] *= 1.01
-    assert certificate.of(wrong).verdict == "disagree"
+    assert certificate.of(scaled(certificate.derivative, (1, 2))).verdict == "disagree"
 
 
 def test_a_product_that_is_zero_in_both_factors_is_smooth():
     """As for the rate of a quaternion at rest, mixed second derivatives change the derivative near the point."""
     jacobian = lambda z: np.array([[z[1], z[0], 0.0], [0.0, 0.0, 3.0]])  # noqa: E731
-    certificate = certify_jacobian(lambda z: np.array([z[0] * z[1], 3 * z[2]]), np.zeros(3), jacobian)
-    certificate.require()
     wrong = lambda z: jacobian(z) + np.array([[0.0, 1e-6, 0.0], [0.0, 0.0, 0.0]])  # noqa: E731
-    false = certify_jacobian(lambda z: np.array([z[0] * z[1], 3 * z[2]]), np.zeros(3), wrong)
-    assert false.verdict != "agree"
+    product = lambda z: np.array([z[0] * z[1], 3 * z[2]])  # noqa: E731
+    certify_jacobian(product, np.zeros(3), jacobian).require()
+    assert certify_jacobian(product, np.zeros(3), wrong).verdict != "agree"
 
 
 def test_a_row_of_rounding_alone_is_zero():
@@ -478,11 +466,9 @@ def test_the_exactly_optimal_slew_of_a_satellite_is_verified(tmp_path):
         '<sdf version="1.9"><model name="sat"><link name="bus"><inertial><mass>10</mass><inertia><ixx>0.4</ixx>'
         "<iyy>0.7</iyy><izz>0.9</izz></inertia></inertial></link></model></sdf>"
     )
-    ends = {"left": 1, "right": -1}
-    pair = [
-        dd.model.BodyForce(name, "bus", point=(0, s / 2, 0), direction=(-s, 0, 0), lower=-50.0, upper=50.0)
-        for name, s in ends.items()
-    ]
+    bounds = {"lower": -50.0, "upper": 50.0}
+    ends = (("left", 1), ("right", -1))
+    pair = [dd.model.BodyForce(n, "bus", point=(0, s / 2, 0), direction=(-s, 0, 0), **bounds) for n, s in ends]
     model = dd.load_model(tmp_path / "sat.sdf", time_step=0.05, gravity=(0, 0, 0), body_forces=pair)
     x0, goal = model.default_state, model.default_state
     goal[[0, 3]] = np.sqrt(0.5)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.derivatives import scaled
 from helpers.models import MODELS
 from helpers.robots import example_robot, state_in_contact, state_in_range
 from helpers.table import each_row
@@ -30,9 +31,7 @@ def doubt(f, derivative):
 def test_the_jacobian_of_a_formula_passes_and_each_entry_a_percent_off_does_not():
     assert doubt(bent, WEIGHT) == ""
     for i, j in np.ndindex(WEIGHT.shape):
-        wrong = WEIGHT.copy()
-        wrong[i, j] *= 1.0101
-        assert "disagrees with" in doubt(bent, wrong), (i, j)
+        assert "disagrees with" in doubt(bent, scaled(WEIGHT, (i, j), 1.0101)), (i, j)
 
 
 def test_what_would_have_been_noticed_is_noticed():
@@ -47,9 +46,7 @@ def test_what_would_have_been_noticed_is_noticed():
 
 
 def test_the_difference_of_one_wrong_entry_has_the_slopes_that_were_measured():
-    wrong = WEIGHT.copy()
-    wrong[2, 3] *= 2
-    look = LookAt(wrong)
+    look = LookAt(scaled(WEIGHT, (2, 3), 2))
     taken = look.taken(bent(look.displacements))
     # the differences have an error of 1e-9 of the largest slope
     assert taken.difference @ look.directions.T == pytest.approx(WEIGHT @ look.directions.T, abs=1e-9 * 1e3)
@@ -66,10 +63,8 @@ def test_the_difference_of_one_wrong_entry_has_the_slopes_that_were_measured():
         (lambda x: x + 1e-6 * np.floor(x / 1e-5 + 0.5), 1.0),  # a staircase that rises more than its stairs
         (lambda x: np.floor(x / 1e-3 + 0.5) * 1e-3, 0.0),  # wide stairs
         (lambda x: x + np.maximum(x - 1e-6, 0.0), 1.0),  # a corner at a distance of 1e-6
-        (
-            lambda x: 1e-3 * x + np.maximum(np.abs(x) - 1e-4, 0) * np.sign(x),
-            1e-3,
-        ),  # a small slope between larger slopes on both sides
+        # a small slope between larger slopes on both sides
+        (lambda x: 1e-3 * x + np.maximum(np.abs(x) - 1e-4, 0) * np.sign(x), 1e-3),
     ],
 )
 def test_what_has_no_slope_at_the_point_is_in_doubt(f, slope):
@@ -103,9 +98,7 @@ def test_robots_on_their_feet_pass_at_once_and_a_wrong_entry_is_named(name, appr
         assert look.certificate.power <= 0.01
         a, scale = look.look.derivative, look.step.scale
         for i, j in random.permutation(np.argwhere(np.abs(a) >= look.look.size * (1 - 1e-12)))[:100]:
-            wrong = a.copy()
-            wrong[i, j] *= 1.0101
-            assert replace(look.look, derivative=wrong).doubt() != "", (i, j)
+            assert replace(look.look, derivative=scaled(a, (i, j), 1.0101)).doubt() != "", (i, j)
         assert look.certificate.derivative * scale == pytest.approx(a)
 
 

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.contracts import CHANGES, FOLLOWS, arms, different
-from helpers.engines import engine_of
+from helpers.contracts import CHANGES, FOLLOWS, arms, different, different_from_drake
+from helpers.engines import engine_of, own_mjcf
 from helpers.models import MODELS
 from helpers.table import each_row
 
@@ -99,31 +99,15 @@ def test_a_stiffness_that_is_each_engines_own_default_is_not_called_equal(load):
     assert "10000" in different(drake, without_stiffness())["stiffness"]
 
 
-def own_mjcf(tmp_path, model, *edits):
-    text = mjcf(describe(model), model.time_step)
-    for old, new in edits:
-        assert old in text
-        text = text.replace(old, new, 1)
-    path = tmp_path / "own.xml"
-    path.write_text(text)
-    return engine_of("mujoco", model, path=path)
-
-
 def test_a_users_own_mjcf_is_mapped_by_name_and_its_gear_is_found(tmp_path):
     model = arms(tmp_path)
-    drake = dd.engines.load_engine("drake", model)
-    found = different(
-        drake, own_mjcf(tmp_path, model, ('joint="left_joint_2" gear="1"', 'joint="left_joint_2" gear="2"'))
-    )
+    gear = 'joint="left_joint_2" gear="1"', 'joint="left_joint_2" gear="2"'
+    found = different_from_drake(model, own_mjcf("mujoco", tmp_path, model, gear))
     assert {"actuator mapping"} == found.keys() - {"limit law", "solver tolerance", "effort limits"}
     assert "'left_joint_2': 2.0" in found["actuator mapping"]
+    renamed = [(f'{where}="left_joint_2"', f'{where}="other"') for where in ("<joint name", "joint")]
     with pytest.raises(InputError, match="left_joint_2"):
-        own_mjcf(
-            tmp_path,
-            model,
-            ('<joint name="left_joint_2"', '<joint name="other"'),
-            ('joint="left_joint_2"', 'joint="other"'),
-        )
+        own_mjcf("mujoco", tmp_path, model, *renamed)
 
 
 @each_row("old, new, said", [
@@ -132,7 +116,7 @@ def test_a_users_own_mjcf_is_mapped_by_name_and_its_gear_is_found(tmp_path):
 ])  # fmt: skip
 def test_the_integrators_step_is_drakes_exactly_where_the_contract_says_so(tmp_path, old, new, said):
     model = arms(tmp_path)
-    drake, mujoco = dd.engines.load_engine("drake", model), own_mjcf(tmp_path, model, (old, new))
+    drake, mujoco = dd.engines.load_engine("drake", model), own_mjcf("mujoco", tmp_path, model, (old, new))
     found = different(drake, mujoco)
     assert (said is None and "integrator" not in found) or said in found["integrator"]
     x, u = np.linspace(-0.5, 0.6, 8), np.linspace(-1, 1, 4)
@@ -147,12 +131,12 @@ def test_the_integrators_step_is_drakes_exactly_where_the_contract_says_so(tmp_p
 ])  # fmt: skip
 def test_an_mjcf_with_what_the_contract_does_not_know_is_refused(tmp_path, old, new, said):
     with pytest.raises(ModelError, match=said):
-        own_mjcf(tmp_path, arms(tmp_path), (old, new))
+        own_mjcf("mujoco", tmp_path, arms(tmp_path), (old, new))
 
 
 def test_an_mjcf_that_mujoco_does_not_read_is_refused(tmp_path):
     with pytest.raises(ModelError, match="own"):
-        own_mjcf(tmp_path, arms(tmp_path), ("<option", "<opinion"))
+        own_mjcf("mujoco", tmp_path, arms(tmp_path), ("<option", "<opinion"))
 
 
 @pytest.mark.parametrize("name", ["mujoco", MJX])
@@ -181,12 +165,13 @@ def test_other_friction_and_stiffness_are_found(tmp_path):
     ):
         path = tmp_path / "ball.sdf"
         path.write_text((MODELS / "sphere_on_ground.sdf").read_text().replace(old, new, 1))
-        found = different(
-            dd.engines.load_engine("drake", needed), engine_of("mujoco", dd.load_model(path, time_step=0.01))
-        )
+        found = different_from_drake(needed, engine_of("mujoco", dd.load_model(path, time_step=0.01)))
         assert word in found[quantity]
-    same = different(dd.engines.load_engine("drake", needed), engine_of("mujoco", needed))
-    assert same.keys() == {"contact law", "solver tolerance", "integrator"}
+    assert different_from_drake(needed, engine_of("mujoco", needed)).keys() == {
+        "contact law",
+        "solver tolerance",
+        "integrator",
+    }
 
 
 class Other:

@@ -5,13 +5,8 @@ JAX compiles for seconds per model, so all tests are marked slow.
 
 import numpy as np
 import pytest
-from helpers.contracts import arms, different
-from helpers.engines import (
-    G,
-    engine_of,
-    needs,
-    on_tangent,
-)
+from helpers.contracts import arms, different, different_from_drake
+from helpers.engines import G, engine_of, needs, on_tangent, own_mjcf
 from helpers.forward_formula import free_box
 from helpers.models import Plant, contact_properties, random_state
 from helpers.plants import block_on_rails
@@ -21,7 +16,6 @@ from pydrake.multibody.tree import SpatialInertia
 
 import drake_diff as dd
 from drake_diff.engines.closed_form import MassSpringDamper, NumpyEngine
-from drake_diff.engines.formats import mjcf
 from drake_diff.exceptions import GradientError, ModelError
 from drake_diff.mechanics.description import describe
 from drake_diff.model.tangent import tangent_space
@@ -37,16 +31,6 @@ def assert_jacobian_is_that_of_the_step(engine, model, x, u, *, step=1e-6, atol=
         e = step * np.eye(len(A))[i]
         ends = [space.minus(engine.step(space.plus(x, d), u), x_next) for d in (e, -e)]
         np.testing.assert_allclose(column, (ends[0] - ends[1]) / (2 * step), rtol=0, atol=atol)
-
-
-def own_mjcf(tmp_path, model, *edits):
-    text = mjcf(describe(model), model.time_step)
-    for old, new in edits:
-        assert old in text
-        text = text.replace(old, new)
-    path = tmp_path / "own.xml"
-    path.write_text(text)
-    return engine_of("mjx", model, path=path)
 
 
 # ---- free motion ---------------------------------------------------------------------------------------------------
@@ -132,7 +116,7 @@ def test_sliding_and_sticking_have_the_steps_jacobian_and_not_slipping_at_all_ha
 def test_a_solver_that_stops_early_is_said(tmp_path):
     model, x = block_on_rails()
     x[2] = 0.03  # between sliding and sticking, where no Newton step is exact
-    engine = own_mjcf(tmp_path, model, ("<option ", '<option iterations="1" '))
+    engine = own_mjcf("mjx", tmp_path, model, ("<option ", '<option iterations="1" '))
     engine.step(x, [])
     assert "unbalanced" in engine.status
     engine.step([0, 1, 0, 0], [])  # without contact the solver has nothing to solve
@@ -170,17 +154,17 @@ def test_the_contract_is_that_of_mjxs_own_model(tmp_path):
 
 def test_the_integrator_is_drakes_or_refused(tmp_path):
     model = arms(tmp_path)
-    found = different(dd.engines.load_engine("drake", model), own_mjcf(tmp_path, model, ('"Euler"', '"implicitfast"')))
+    found = different_from_drake(model, own_mjcf("mjx", tmp_path, model, ('"Euler"', '"implicitfast"')))
     assert "integrator" not in found
     with pytest.raises(ModelError, match="got RK4"):
-        own_mjcf(tmp_path, model, ('"Euler"', '"RK4"'))
+        own_mjcf("mjx", tmp_path, model, ('"Euler"', '"RK4"'))
 
 
 def test_an_integrator_and_a_cone_that_mjx_has_not_are_refused(tmp_path):
     with pytest.raises(ModelError, match="IMPLICIT"):
-        own_mjcf(tmp_path, arms(tmp_path), ('"Euler"', '"implicit"'))
+        own_mjcf("mjx", tmp_path, arms(tmp_path), ('"Euler"', '"implicit"'))
     with pytest.raises(ModelError, match="condim=1"):
-        own_mjcf(tmp_path, block_on_rails()[0], ('condim="3"', 'condim="1"'))
+        own_mjcf("mjx", tmp_path, block_on_rails()[0], ('condim="3"', 'condim="1"'))
 
 
 def test_a_pair_that_mjx_has_no_collision_for_is_refused_by_name():

@@ -12,13 +12,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.tree import PrismaticJoint, SpatialInertia
 
 import drake_diff as dd
-from drake_diff.exceptions import (
-    ModelError,
-    NonFiniteError,
-    NotOfferedError,
-    ShapeError,
-    SimulationError,
-)
+from drake_diff.exceptions import ModelError, NonFiniteError, NotOfferedError, ShapeError, SimulationError
 
 needs("sapien")
 G = 9.81
@@ -43,9 +37,8 @@ def test_nothing_is_clamped_or_dragged_by_itself(load):
 def test_a_tumbling_body_keeps_the_size_of_its_angular_momentum():
     h, w = 0.01, np.array([1.0, 2.0, 3.0])
     model = free_box((0, 0, 0), h)
-    inertia = np.diag(
-        model.plant.GetBodyByName("box").default_spatial_inertia().CalcRotationalInertia().CopyToFullMatrix3()
-    )
+    box = model.plant.GetBodyByName("box").default_spatial_inertia()
+    inertia = np.diag(box.CalcRotationalInertia().CopyToFullMatrix3())
     after = physx(model).step([1, 0, 0, 0, 0, 0, 1, *w, 0, 0, 0], [])
     explicit = w - h * np.cross(w, inertia * w) / inertia
     scaled = explicit * np.linalg.norm(inertia * w) / np.linalg.norm(inertia * explicit)
@@ -72,9 +65,8 @@ def test_a_swapped_quaternion_or_velocity_frame_is_found(wrong, monkeypatch):
     expected = formula(model, x, [], exponential=True)
     if wrong == "quaternion order":
         real = engine.centers.turn
-        monkeypatch.setattr(
-            type(engine.centers), "turn", lambda self, q: real(np.concatenate([np.roll(q[:4], 1), q[4:]]))
-        )
+        turn = lambda self, q: real(np.concatenate([np.roll(q[:4], 1), q[4:]]))  # noqa: E731
+        monkeypatch.setattr(type(engine.centers), "turn", turn)
     elif wrong == "velocity frame":
         monkeypatch.setattr("drake_diff.mechanics.coordinates.rotation", lambda q: np.eye(3))
     assert (np.abs(engine.step(x, []) - expected).max() < 2e-6) == (wrong == "none")
@@ -138,8 +130,7 @@ def test_a_link_and_its_parent_never_touch_and_the_contract_says_so():
     drake, engine = dd.engines.load_engine("drake", model), physx(model)
     assert drake.contact_depth(x) == pytest.approx(0.05, abs=1e-9)  # in Drake, two can touch the body welded to one
     assert "lid_shape" in different(drake, engine)["contact pairs"]
-    every = {geometry.name: (1, 1) for _, geometry in engine.tree.geometries}
-    engine.groups = every
+    engine.groups = {geometry.name: (1, 1) for _, geometry in engine.tree.geometries}
     assert engine.contact_depth(x) == 0  # PhysX ignores the pair even if the groups would allow it
 
 

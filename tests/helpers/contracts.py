@@ -35,6 +35,10 @@ def different(a, b):
     return {line.quantity: line.detail for line in dd.engines.match_contracts(a, b) if line.verdict == "different"}
 
 
+def different_from_drake(model, engine):
+    return different(dd.engines.load_engine("drake", model), engine)
+
+
 FOLLOWS = {"M(q)", "bias(q, v)"}
 # For each change: the quantities that must be named, those that may be, and words in the first quantity's detail.
 CHANGES = {

@@ -1,7 +1,14 @@
-"""Derivatives of functions by AutoDiffXd."""
+"""Derivatives of functions by AutoDiffXd, and wrong ones."""
 
 import numpy as np
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
+
+
+def scaled(matrix, entry, factor=1.01):
+    """Return a copy with one entry multiplied by `factor`."""
+    copy = np.array(matrix)
+    copy[entry] *= factor
+    return copy
 
 
 def differentiate(function, x, u=None):

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import drake_diff as dd
+from drake_diff.engines.formats import mjcf
+from drake_diff.mechanics.description import describe
 from drake_diff.model.tangent import tangent_space
 from helpers.models import random_state
 
@@ -39,6 +41,17 @@ def needs(engine):
 def engine_of(name, model, **options):
     needs(name)
     return dd.engines.load_engine(name, model, **options)
+
+
+def own_mjcf(name, tmp_path, model, *edits):
+    """Load an engine with the MJCF of the model, in which the first match of each text is replaced."""
+    text = mjcf(describe(model), model.time_step)
+    for old, new in edits:
+        assert old in text
+        text = text.replace(old, new, 1)
+    path = tmp_path / "own.xml"
+    path.write_text(text)
+    return engine_of(name, model, path=path)
 
 
 class Doctored:

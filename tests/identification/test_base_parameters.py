@@ -28,9 +28,8 @@ def test_two_rods_have_the_textbooks_sums(load):
     assert found["upper.moment_z"].value == pytest.approx(-0.4 - 0.8 * 0.7)
     assert str(found["upper.moment_z"]) == "upper.moment_z - 0.8 lower.mass = -0.96 kg m"
     (yy, *_) = base_parameters(load("double_pendulum.urdf"), ["lower"])
-    assert dict(yy.parts) == {
-        "lower.inertia_yy": 1.0
-    }  # with a known upper link, the lower link's mass is observable alone
+    # With a known upper link, the lower link's mass is observable alone.
+    assert dict(yy.parts) == {"lower.inertia_yy": 1.0}
 
 
 @pytest.mark.parametrize(

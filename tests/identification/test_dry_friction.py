@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.estimates import assert_known
 from helpers.mujoco_arm import MuJoCoArm, bare_arm, drakes, shaken
 from scipy import stats
 from scipy.integrate import solve_ivp
@@ -39,12 +40,11 @@ def sticks_and_slips(us, mass=MASS, friction=FRICTION):
     return np.array(found)
 
 
-def measured(xs, us, outputs=None, seed=0):
+def measured(xs, us, seed=0):
     """Return a recording of positions with noise."""
-    seen = np.column_stack(
-        [xs[:, 0] + NOISE * np.random.default_rng(seed).standard_normal(N + 1), np.full(N + 1, np.nan)]
-    )
-    return dd.Recording("lab", "1", H * np.arange(N + 1), seen, us, outputs=outputs or {})
+    q = xs[:, 0] + NOISE * np.random.default_rng(seed).standard_normal(N + 1)
+    seen = np.column_stack([q, np.full(N + 1, np.nan)])
+    return dd.Recording("lab", "1", H * np.arange(N + 1), seen, us)
 
 
 def test_a_block_that_sticks_and_slips_has_its_friction(write_urdf):
@@ -69,9 +69,7 @@ def test_a_block_that_comes_to_rest_and_stays_has_its_friction(write_urdf, tmp_p
     xs = sticks_and_slips(us)
     assert np.all(xs[-70:, 1] == 0)
     e = dd.identify(write_urdf(mass=MASS), measured(xs, us), ["slide.coulomb_friction"], held_out=0)
-    assert e.explained, e.reason
-    low, high = e.intervals["slide.coulomb_friction"]
-    assert low < FRICTION < high < low + 0.01 * FRICTION
+    assert_known(e, "slide.coulomb_friction", FRICTION, 0.01 * FRICTION)
     assert np.all(e.motions[0].xs[-60:, 1] == 0)  # the fitted block also stays at rest
     dd.save(e, tmp_path / "run")
     assert dd.verify(tmp_path / "run").holds  # verification repeats the fit
@@ -88,8 +86,6 @@ def test_friction_that_creeps_is_not_sold_as_dry_friction(write_urdf):
 
     xs = solve_ivp(rates, (0, at[-1]), (0, 0), t_eval=at, rtol=1e-8, atol=1e-10, max_step=H).y.T
     e = dd.identify(write_urdf(mass=MASS), measured(xs, us), ["slide.coulomb_friction"])
-    low, high = e.intervals["slide.coulomb_friction"]
-    assert not e.explained or low < FRICTION < high
     assert not e.explained  # the creep is visible at noise of 0.1 mm
 
 
@@ -115,9 +111,7 @@ def test_the_friction_of_a_joint_that_follows_another_holds_both(tmp_path):
     us = pushes(9.0)
     xs = sticks_and_slips(us, mass=2 + 0.4**2 * 3)
     e = dd.identify(sliders(tmp_path), measured(xs, us), ["b.coulomb_friction"])
-    assert e.explained, e.reason
-    low, high = e.intervals["b.coulomb_friction"]
-    assert low < FRICTION / 0.4 < high < low + 0.02 * FRICTION / 0.4
+    assert_known(e, "b.coulomb_friction", FRICTION / 0.4, 0.02 * FRICTION / 0.4)
 
 
 def test_derivatives_go_through_a_stop_that_lets_another_joint_go(load):

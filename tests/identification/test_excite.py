@@ -13,27 +13,19 @@ from drake_diff.identification import excite
 
 pytestmark = pytest.mark.solve
 
+SIGMA, LIMITS = 0.002, {"slide_x": 0.5, "slide_v": 2.0, "push": 3.0}
+RAIL = {"duration": 1.0, "period": 0.02, "noise": {"slide_x": SIGMA}, "limits": LIMITS, "harmonics": 2}
+
 
 def test_what_is_promised_of_a_block_is_the_textbooks_and_more_than_random_motion_gives(write_urdf):
     """x = x0 + v0 t + s (double integral of u / m) is linear in x0, v0 and the strength s. The mass is 1 / s."""
-    model, sigma = write_urdf(mass=2.0), 0.002
-    x_name, v_name, u_name = *model.state_names, *model.input_names
-    limits = {x_name: 0.5, v_name: 2.0, u_name: 3.0}
-    found = {}
-    for name, most in ((f"{u_name}.strength", 4), (f"{u_name}.strength", 0), ("block.mass", 0)):
-        e = excite(
-            model,
-            [name],
-            duration=1.0,
-            period=0.02,
-            noise={x_name: sigma},
-            limits=limits,
-            harmonics=2,
-            max_iterations=most,
-        )
+    model, found = write_urdf(mass=2.0), {}
+    assert (*model.state_names, *model.input_names) == tuple(RAIL["limits"])
+    for name, most in (("push.strength", 4), ("push.strength", 0), ("block.mass", 0)):
+        e = excite(model, [name], **RAIL, max_iterations=most)
         moved = e.xs[:, 0] - e.xs[0, 0]  # the effect of s = 1, as the block starts from rest
         X = np.column_stack([np.ones(51), e.times, moved])
-        deviation = sigma * np.sqrt(np.linalg.inv(X.T @ X)[2, 2])
+        deviation = SIGMA * np.sqrt(np.linalg.inv(X.T @ X)[2, 2])
         wanted = deviation * (2.0 if name == "block.mass" else 1.0)
         # The values differ by rounding and by the error of Runge-Kutta steps of order 8.
         assert e.deviations[name] == pytest.approx(wanted, rel=1e-6)
@@ -41,7 +33,7 @@ def test_what_is_promised_of_a_block_is_the_textbooks_and_more_than_random_motio
         assert np.all(np.abs(e.us) <= 3.0)
         assert e.rest[name] == np.inf
         found[name, most] = e
-    best = found[f"{u_name}.strength", 4]
+    best = found["push.strength", 4]
     (name,) = best.deviations
     assert best.deviations[name] < 0.8 * found[name, 0].deviations[name]  # the value for the best of 15 random motions
     assert best.deviations[name] < 0.5 * best.random[name]
@@ -53,17 +45,14 @@ def test_what_is_promised_of_a_block_is_the_textbooks_and_more_than_random_motio
 
 def test_what_is_promised_of_friction_is_what_its_sign_does(write_urdf):
     """At friction 0, the position's derivative with respect to it is minus the double integral of sign(v) / m."""
-    model, sigma = write_urdf(mass=2.0), 0.002
-    limits = {"slide_x": 0.5, "slide_v": 2.0, "push": 3.0}
-    given = {"duration": 1.0, "period": 0.02, "noise": {"slide_x": sigma}, "limits": limits, "harmonics": 2}
-    e = excite(model, ["slide.coulomb_friction"], **given, max_iterations=0)
+    e = excite(write_urdf(mass=2.0), ["slide.coulomb_friction"], **RAIL, max_iterations=0)
     fine = np.linspace(0, 1, 50 * 400 + 1)
     slows = np.sign(np.interp(fine, e.times, e.xs[:, 1]))  # the speed is linear between samples
     speed = np.concatenate([[0.0], np.cumsum((slows[1:] + slows[:-1]) / 2)]) * (fine[1] - fine[0]) / 2.0
     moved = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2)])[::400] * (fine[1] - fine[0])
     X = np.column_stack([np.ones(51), e.times, moved])
     # The sum with steps of 50 us misses a reversal by at most half a step, in motions of about 0.1 s per side.
-    wanted = sigma * np.sqrt(np.linalg.inv(X.T @ X)[2, 2])
+    wanted = SIGMA * np.sqrt(np.linalg.inv(X.T @ X)[2, 2])
     assert e.deviations["slide.coulomb_friction"] == pytest.approx(wanted, rel=1e-3)
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.estimates import assert_known
 from helpers.pendulum import swing
 from helpers.robots import example_robot, state_in_range
 from helpers.table import each_row
@@ -47,9 +48,7 @@ def test_what_enters_linearly_is_the_linear_least_squares_solution(write_urdf):
 
 def test_the_damping_of_a_pendulum_is_found_from_positions_alone(pendulum):
     e = dd.identify(pendulum, swing(damping=0.15), ["hinge.damping"])
-    low, high = e.intervals["hinge.damping"]
-    assert low < 0.15 < high < low + 0.002
-    assert e.explained, e.reason
+    assert_known(e, "hinge.damping", 0.15, 0.002)
     assert e.unidentifiable == ()
     assert e.noise["hinge_q"] == pytest.approx(1e-3, rel=0.2)
     assert e.error_after < 1.3 < e.error_before
@@ -64,9 +63,7 @@ def test_samples_may_be_any_time_apart_and_missing(pendulum):
     log = swing(damping=0.15, times=times)
     log.xs[40:60] = np.nan
     e = dd.identify(pendulum, log, ["hinge.damping"])
-    low, high = e.intervals["hinge.damping"]
-    assert low < 0.15 < high < low + 0.003
-    assert e.explained, e.reason
+    assert_known(e, "hinge.damping", 0.15, 0.003)
 
 
 def test_several_recordings_are_fitted_at_once_and_one_is_predicted(pendulum):
@@ -74,9 +71,7 @@ def test_several_recordings_are_fitted_at_once_and_one_is_predicted(pendulum):
     named = [dd.Recording(f"log{k}", "1", r.times, r.xs, r.us) for k, r in enumerate(logs)]
     e = dd.identify(pendulum, named, ["hinge.damping"], held_out="log2")
     assert len(e.residuals) == 2
-    assert e.explained, e.reason
-    low, high = e.intervals["hinge.damping"]
-    assert low < 0.15 < high < low + 0.001
+    assert_known(e, "hinge.damping", 0.15, 0.001)
 
 
 def test_a_motion_with_dry_friction_is_not_explained_by_damping_and_is_by_friction(pendulum):
@@ -224,9 +219,7 @@ def test_the_models_own_steps_are_fitted_where_they_are_asked_for_and_are_only_a
     assert not long.explained
     assert long.intervals["hinge.damping"][0] > 0.15
     short = dd.identify(load("pendulum.urdf", time_step=0.001), log, ["hinge.damping"], motion="steps")
-    assert short.explained, short.reason
-    low, high = short.intervals["hinge.damping"]
-    assert low < 0.15 < high
+    assert_known(short, "hinge.damping", 0.15)
     assert short.motion == "the model's own steps of 1 ms"
 
 

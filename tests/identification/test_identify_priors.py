@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.estimates import assert_known
 from helpers.models import MODELS
 from helpers.pendulum import swing
 from typer.testing import CliRunner
@@ -44,9 +45,7 @@ def test_a_delay_is_found_to_a_part_of_a_sample(write_urdf):
     model = write_urdf(mass=2.0)
     for delay in (0.013, 0.06):
         e = dd.identify(model, rail(model, delay), ["model.input_delay", "block.mass"])
-        low, high = e.intervals["model.input_delay"]
-        assert low < delay < high < low + 0.004  # the samples are 0.02 s apart
-        assert e.explained, e.reason
+        assert_known(e, "model.input_delay", delay, 0.004)  # the samples are 0.02 s apart
     e = dd.identify(model, rail(model, 0.0), ["model.input_delay"])
     assert e.intervals["model.input_delay"][0] == 0.0
     assert e.values["model.input_delay"] < 0.002
@@ -151,14 +150,8 @@ def test_priors_and_bounds_are_kept_and_come_out_again(tmp_path):
     rows = [f"{t!r},{x!r},0" for t, x in zip(log.times.tolist(), log.xs[:, 0].tolist(), strict=True)]
     path = tmp_path / "lab.csv"
     path.write_text("\n".join([f"time,hinge_q,{model.input_names[0]}", *rows]))
-    words = [
-        "identify",
-        str(MODELS / "pendulum.urdf"),
-        "--recording",
-        str(path),
-        "--parameters",
-        "hinge.damping,pole.mass",
-    ]
+    words = ["identify", str(MODELS / "pendulum.urdf"), "--recording", str(path)]
+    words += ["--parameters", "hinge.damping,pole.mass"]
     more = ["--prior", "pole.mass=1,0.02", "--bounds", "hinge.damping=0,1", "--out", str(tmp_path / "run")]
     result = CliRunner().invoke(app, [*words, *more])
     assert result.exit_code == 0, result.output

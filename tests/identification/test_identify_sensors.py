@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.estimates import assert_known
 from helpers.models import MODELS
 from helpers.pendulum import GRAVITY, LEVER, swing
 from helpers.robots import example_robot, state_in_range
@@ -42,14 +43,11 @@ def test_readings_are_drakes_and_their_slopes_those_of_differences(name, body, j
     plant.SetPositionsAndVelocities(context, x)
     a = dynamics.accelerate(x[None], u[None])[0]
     frame, world = plant.GetBodyByName(body).body_frame(), plant.world_frame()
-    on_body = RigidTransform(RollPitchYaw(*POSE[3:]), POSE[:3])
-    pose = frame.CalcPoseInWorld(context) @ on_body
+    pose = frame.CalcPoseInWorld(context) @ RigidTransform(RollPitchYaw(*POSE[3:]), POSE[:3])
     J = plant.CalcJacobianSpatialVelocity(context, JacobianWrtVariable.kV, frame, POSE[:3], world, world)
-    bias = plant.CalcBiasSpatialAcceleration(
-        context, JacobianWrtVariable.kV, frame, POSE[:3], world, world
-    ).get_coeffs()
+    at_rest = plant.CalcBiasSpatialAcceleration(context, JacobianWrtVariable.kV, frame, POSE[:3], world, world)
     R = pose.rotation().matrix().T
-    spatial, acceleration = J @ x[nq:], J @ a + bias
+    spatial, acceleration = J @ x[nq:], J @ a + at_rest.get_coeffs()
     np.testing.assert_allclose(read[:3], pose.translation(), atol=1e-12)
     np.testing.assert_allclose(read[3:6], R @ spatial[:3], atol=1e-12)
     size = np.abs(acceleration).max()
@@ -92,12 +90,8 @@ def test_a_pendulum_is_known_by_an_accelerometer_and_a_gyro_on_it(load):
     log = dd.Recording("lab", "1", exact.times, measured.xs, exact.us, outputs=outputs)
     mounted = {"imu": ("pole", (0, 0, -r))}
     e = dd.identify(model, log, ["hinge.damping", "imu.gyro_y.bias"], sensors=mounted)
-    assert e.explained, e.reason
-    low, high = e.intervals["hinge.damping"]
-    assert low < 0.15 < high
-    assert high - low < 0.3 * np.ptp(without.intervals["hinge.damping"])
-    low, high = e.intervals["imu.gyro_y.bias"]
-    assert low < 0.05 < high < low + 1e-3
+    assert_known(e, "hinge.damping", 0.15, 0.3 * np.ptp(without.intervals["hinge.damping"]))
+    assert_known(e, "imu.gyro_y.bias", 0.05, 1e-3)
     assert e.noise["imu.accel_x"] == pytest.approx(1e-2, rel=0.2)
     wrong = dd.identify(model, log, ["hinge.damping", "imu.gyro_y.bias"], sensors={"imu": ("pole", (0, 0, -0.3))})
     assert not wrong.explained
@@ -108,22 +102,20 @@ def test_a_sensor_file_is_kept_and_comes_out_again(tmp_path):
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.01)
     log = swing(damping=0.15, times=np.linspace(0, 1, 81))
     tip = 0.5 * np.sin(-log.xs[:, 0]) + 1e-4 * np.random.default_rng(0).standard_normal(81)
-    rows = [
-        f"{t!r},{x!r},{y!r},0" for t, x, y in zip(*map(np.ndarray.tolist, (log.times, log.xs[:, 0], tip)), strict=True)
-    ]
+    samples = zip(*map(np.ndarray.tolist, (log.times, log.xs[:, 0], tip)), strict=True)
+    rows = [f"{t!r},{x!r},{y!r},0" for t, x, y in samples]
     rows[5] = rows[5].replace(f"{tip[5]!r}", "")
     path = tmp_path / "lab.csv"
     path.write_text("\n".join([f"time,hinge_q,tip.position_x,{model.input_names[0]}", *rows]))
-    e = dd.identify(model, path, ["hinge.damping"], sensors={"tip": ("pole", [0, 0, -0.5])})
+    mounted = {"tip": ("pole", [0, 0, -0.5])}
+    e = dd.identify(model, path, ["hinge.damping"], sensors=mounted)
     assert e.explained, e.reason
     assert set(e.noise) == {"hinge_q", "tip.position_x"}
     record = dd.save(e, tmp_path / "run")
     assert record.inputs.sensors["tip"].body == "pole"
     assert dd.verify(tmp_path / "run").holds
     read = read_recording(path, model, gaps=True)
-    again = dd.save(
-        dd.identify(model, read, ["hinge.damping"], sensors={"tip": ("pole", [0, 0, -0.5])}), tmp_path / "b"
-    )
+    again = dd.save(dd.identify(model, read, ["hinge.damping"], sensors=mounted), tmp_path / "b")
     assert again.estimates == record.estimates
     assert dd.verify(tmp_path / "b").holds
 

@@ -49,6 +49,11 @@ def saying(model, values, *, file=None, explained=True):
     )  # fmt: skip
 
 
+def number(model, name):
+    (value,) = [p.value for p in dd.list_parameters(model) if p.name == name]
+    return value
+
+
 def same(model, path, values):
     """Check that all parameters of the new file equal the old ones, except for those that were found."""
     old = {p.name: p.value for p in dd.list_parameters(model)}
@@ -96,8 +101,7 @@ def test_an_sdf_file_takes_springs_too(load, tmp_path):
     values = {"block.mass": 2.5, "slide.damping": 1.0, "slide.spring_stiffness": 60.0, "slide.spring_rest_length": 0.2}
     # A mass scales the inertia, as in Drake.
     path = write_model(saying(model, values), tmp_path / "right.sdf")
-    (inertia,) = [p.value for p in dd.list_parameters(model) if p.name == "block.inertia"]
-    same(model, path, {**values, "block.inertia": inertia * 1.25})
+    same(model, path, {**values, "block.inertia": number(model, "block.inertia") * 1.25})
 
 
 @pytest.mark.solve
@@ -113,14 +117,12 @@ def test_random_bodies_come_out_as_they_were_found(arm, tmp_path, seed):
         "arm.inertia": np.array([inertia[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]),
     }
     # A center of mass alone may be physically impossible.
-    kept = (
-        values if seed % 2 else {"arm.mass": values["arm.mass"]} if seed % 4 else {"arm.inertia": values["arm.inertia"]}
-    )
+    names = values if seed % 2 else ["arm.mass"] if seed % 4 else ["arm.inertia"]
+    kept = {name: values[name] for name in names}
     path = write_model(saying(arm, kept), tmp_path / f"{seed}.urdf")
     wanted = dict(kept)
     if "arm.inertia" not in kept and "arm.mass" in kept:
-        (own,) = [p.value for p in dd.list_parameters(arm) if p.name == "arm.inertia"]
-        wanted["arm.inertia"] = own * kept["arm.mass"] / 2
+        wanted["arm.inertia"] = number(arm, "arm.inertia") * kept["arm.mass"] / 2
     same(arm, path, wanted)
 
 
@@ -173,6 +175,7 @@ def test_other_kinds_of_files_are_refused(arm, load, tmp_path):
         write_model(replace(found, asked=None), tmp_path / "right.urdf")
 
 
+ON_BASE = ARM.replace('<robot name="arm">', '<robot name="arm"><link name="base"/>').replace('"world"', '"base"')
 OVERLAY = """directives:
 - add_model:
     name: one
@@ -187,10 +190,7 @@ OVERLAY = """directives:
 
 
 def test_an_overlay_stays_over_a_corrected_copy_of_the_file_that_it_adds(tmp_path):
-    robot = ARM.replace('<robot name="arm">', '<robot name="arm"><link name="base"/>').replace(
-        '<parent link="world"/>', '<parent link="base"/>'
-    )
-    (tmp_path / "arm.urdf").write_text(robot)
+    (tmp_path / "arm.urdf").write_text(ON_BASE)
     (tmp_path / "arm.dmd.yaml").write_text(OVERLAY.format(f"file://{tmp_path / 'arm.urdf'}"))
     model = dd.load_model(tmp_path / "arm.dmd.yaml", time_step=0.01)
     values = {"shoulder.damping": 0.7, "shoulder.offset": np.array([0.0, 0.1, 1.2])}
@@ -205,15 +205,12 @@ def test_an_overlay_stays_over_a_corrected_copy_of_the_file_that_it_adds(tmp_pat
     ]
     assert "# the arm" in path.read_text()
     assert "shoulder.damping was 0 N m s/rad, is 0.7" in (tmp_path / "right_arm.urdf").read_text()
-    assert (tmp_path / "arm.urdf").read_text() == robot
+    assert (tmp_path / "arm.urdf").read_text() == ON_BASE
 
 
 def test_what_an_overlay_cannot_tell_apart_is_refused_and_nothing_stays(tmp_path):
-    robot = ARM.replace('<parent link="world"/>', '<parent link="base"/>').replace(
-        '<robot name="arm">', '<robot name="arm"><link name="base"/>'
-    )
-    (tmp_path / "arm.urdf").write_text(robot)
-    (tmp_path / "other.urdf").write_text(robot)
+    for name in ("arm", "other"):
+        (tmp_path / f"{name}.urdf").write_text(ON_BASE)
     weld = "- add_weld: {{parent: world, child: {0}::base}}\n"
     adds = "- add_model: {{name: {0}, file: 'file://{1}'}}\n"
     parts = [adds.format(n, tmp_path / f"{f}.urdf") + weld.format(n) for n, f in (("one", "arm"), ("two", "other"))]
@@ -241,9 +238,4 @@ def test_names_cannot_end_the_comment(arm, tmp_path):
     found = saying(arm, {"arm.mass": 3.0}, file=(odd, "0" * 64))
     text = write_model(found, tmp_path / "right.urdf").read_text()
     assert "--><evil" not in text
-    same(arm, tmp_path / "right.urdf", {**found.values, "arm.inertia": _scaled(arm)})
-
-
-def _scaled(arm):
-    (own,) = [p.value for p in dd.list_parameters(arm) if p.name == "arm.inertia"]
-    return own * 1.5
+    same(arm, tmp_path / "right.urdf", {**found.values, "arm.inertia": number(arm, "arm.inertia") * 1.5})
