@@ -511,6 +511,9 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         given = np.vstack([xs, np.where(self.initial_state_mask, np.nan, self.x0), *self.waypoints.values(), self.goal])
         spans = np.concatenate([_spread(given), np.zeros(self.nu)])
         spans[:nx][spans[:nx] <= STILL**2 * np.max(np.nan_to_num(np.abs(given)), axis=0)] = 0.0
+        driven = horizon * np.nan_to_num(slopes[:, :nx], posinf=0.0)
+        moved = np.maximum(driven @ spans[:nx], driven @ (driven @ spans[:nx]))  # by others, and by what these move
+        spans[:nx][spans[:nx] <= STILL**2 * moved] = 0.0  # rounding of a guess such as 1e-19
         for _ in spans:
             with np.errstate(divide="ignore", invalid="ignore"):
                 drives = spans[:nx, None] / (horizon * slopes)
