@@ -286,8 +286,8 @@ def steps_between(recording: Recording, time_step: float) -> int:
     count = max(1, round(float(periods[0]) / time_step))
     for k in np.flatnonzero(np.abs(periods - count * time_step) > CLOCK_TOLERANCE * time_step)[:1]:
         subject = f"recording {recording.name}: period from sample {k} to {k + 1}"
-        whole = f"{count * time_step:g} s throughout, a whole multiple of the model's time step, {time_step:g} s"
-        raise InputError(subject, got=f"{periods[k]:.9g} s", expected=whole)
+        expected = f"{count * time_step:g} s throughout, a whole multiple of the model's time step, {time_step:g} s"
+        raise InputError(subject, got=f"{periods[k]:.9g} s", expected=expected)
     return count
 
 

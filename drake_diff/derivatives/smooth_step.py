@@ -20,10 +20,9 @@ For a tree (`SmoothStep`), the derivatives of the tree's accelerations are used 
 
 where M is the mass matrix plus reflected inertia, K the stiffness of springs and of PD control (kp), D joint damping
 plus the damping of PD control (kd + h kp), and c the constant force of their rest positions. As h D is added to the
-reflected inertia, the whole step is forward dynamics with h D as additional armature (`mechanics.tree`). B includes the
-BodyForces, and depends on q then. Inputs are
-clipped at their effort limits as in Drake. A PD controller at its limit, and any force that this form does not include,
-is detected because Drake's own step then differs.
+reflected inertia, the step is forward dynamics with h D as additional armature (`mechanics.tree`). The columns of B
+depend on q for BodyForces. Inputs are clipped at their effort limits as in Drake. A PD controller at its limit, and any
+force that this form does not include, is detected because Drake's own step then differs.
 """
 
 from dataclasses import dataclass
@@ -262,7 +261,7 @@ class SmoothStep:
     sprung: bool  # whether any K is not 0
     loaded: bool  # whether any K, D or c is not 0
     limited: bool  # whether any input is clipped
-    body_forces: Any | None = None  # see `body_forces_of`
+    body_forces: Any = None  # a function, see `body_forces_of`
 
     def __call__(self, steps: Steps) -> tuple[Array, NDArray[np.bool_]]:
         """Return the Jacobians (N, nx, nx + nu), and which steps (N,) are smooth, i.e. equal Drake's steps."""
@@ -275,12 +274,13 @@ class SmoothStep:
         c, h = self.coordinates, self.time_step
         q, v = xs[:, : c.nq], xs[:, c.nq :]
         force, clipped = self.force_of(q, v, us)
-        columns, slopes = self._pushes(q, us)
-        force += (columns @ us[:, us.shape[1] - columns.shape[2] :, None])[:, :, 0]
+        pushes = self._pushes(q, us) if self.body_forces else None
+        if pushes is not None:
+            force += (pushes[0] @ us[:, -pushes[0].shape[2] :, None])[:, :, 0]
         by_q, by_v, inverse, a = self.dynamics.accelerate(q, v, force)
         by_u = self._by_input(inverse, clipped)
-        by_u[:, :, us.shape[1] - columns.shape[2] :] = inverse @ columns
-        by_q += inverse @ slopes
+        if pushes is not None:
+            by_q, by_u[:, :, -pushes[0].shape[2] :] = by_q + inverse @ pushes[1], inverse @ pushes[0]
         parts = by_q - inverse * self.stiffness, by_v - inverse * self.damping, by_u
         x_next = euler_step(c, h, xs, a)
         return euler_jacobian(c, h, xs, x_next, np.concatenate(parts, axis=2)), x_next
@@ -359,12 +359,9 @@ class SmoothStep:
     def _pushes(self, q: Array, us: Array) -> tuple[Array, Array]:
         """Return the BodyForces' columns of B (N, nv, m), and their force's derivative by the tangent of q."""
         c, count = self.coordinates, len(q)
-        if self.body_forces is None:
-            return np.zeros((count, c.nv, 0)), np.zeros((1, c.nv, c.nv))
         columns, slopes = self.body_forces(q)
-        columns = columns.reshape(count, -1, c.nv)
-        slopes = slopes.reshape(count, c.nq, -1, c.nv)
-        by_q = np.einsum("kimj,km->kji", slopes, us[:, us.shape[1] - columns.shape[1] :])
+        columns, slopes = columns.reshape(count, -1, c.nv), slopes.reshape(count, c.nq, -1, c.nv)
+        by_q = np.einsum("kimj,km->kji", slopes, us[:, -columns.shape[1] :])
         return columns.swapaxes(1, 2), by_q @ c.rate(q)
 
     def _by_input(self, inverse: Array, clipped: NDArray[np.bool_] | None) -> Array:

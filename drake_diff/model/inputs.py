@@ -241,12 +241,12 @@ def read_inputs(
     inside the diagram and there are no other inputs.
     """
     wiring = _Wiring(diagram)
-    whole = int(plant.get_actuation_input_port().get_index())
+    actuation = int(plant.get_actuation_input_port().get_index())
     ports_of = {i: int(plant.get_actuation_input_port(i).get_index()) for i in instances(plant)}
     generalized = int(plant.get_applied_generalized_force_input_port().get_index())
     targets = [int(plant.get_desired_state_input_port(i).get_index()) for i in instances(plant)]
     spatial = int(plant.get_applied_spatial_force_input_port().get_index())
-    acting = [whole, *ports_of.values(), generalized, spatial, *targets]
+    acting = [actuation, *ports_of.values(), generalized, spatial, *targets]
     systems, reached = wiring.behind(plant, acting)
     _check_states(systems)
     always_exported = [generalized, *targets] if isinstance(diagram, RobotDiagram) else []
@@ -259,7 +259,7 @@ def read_inputs(
             continue
         into = {i for leaf, i in consumers if leaf is plant}
         alone = all(leaf is plant for leaf, _ in consumers)
-        if alone and into and into <= {whole, *ports_of.values()}:
+        if alone and into and into <= {actuation, *ports_of.values()}:
             places.append(len(vectors))
         elif number not in reached:
             left_out.append(port.get_name())
@@ -267,7 +267,7 @@ def read_inputs(
             vectors.append((number, port, into))
     chosen, sources = {number for number, _, _ in vectors}, {i: wiring.sources[id(plant), i] for i in acting}
     fed = frozenset(i for i, s in sources.items() if (s in chosen if isinstance(s, int) else s is not None))
-    driven = [i for i, a in enumerate(actuators(plant)) if whole in fed or ports_of[a.model_instance()] in fed]
+    driven = [i for i, a in enumerate(actuators(plant)) if actuation in fed or ports_of[a.model_instance()] in fed]
     commanded = [servos and a.has_controller() for a in actuators(plant)]
     free = [i for i in range(len(commanded)) if i not in driven]
     rows = [_rows_of_port(plant, port, into, generalized, forces) for _, port, into in vectors]
@@ -275,7 +275,7 @@ def read_inputs(
     rows.insert(first, _rows_of_actuators(plant, facts, free, commanded))
     slices = list(slices_of(map(len, rows)))
     del slices[first]
-    if not vectors and (whole in fed or driven):
+    if not vectors and (actuation in fed or driven):
         raise ModelError(
             "the plant's actuation input is connected inside the diagram, but drake_diff has to set it: leave it free "
             "or export it, or export the input of the system that feeds it"

@@ -278,12 +278,12 @@ class Twin:
     def _driven_force(self) -> Any:
         """Return the force (nv,) of the actuators that the diagram's systems drive."""
         total, plant, fed = np.zeros(self.plant.num_velocities()).astype(self.scalar), self.plant, self.inputs.fed
-        whole, every = plant.get_actuation_input_port(), actuators(plant) if self.inputs.fed_actuators else []
+        actuation, every = plant.get_actuation_input_port(), actuators(plant) if self.inputs.fed_actuators else []
         for i in self.inputs.fed_actuators:
             actuator, effort = every[i], 0.0
             port = plant.get_actuation_input_port(actuator.model_instance())
-            if int(whole.get_index()) in fed:
-                effort = effort + whole.Eval(self.context)[i]
+            if int(actuation.get_index()) in fed:
+                effort = effort + actuation.Eval(self.context)[i]
             if int(port.get_index()) in fed:
                 motors = [a.index() for a in every if a.model_instance() == actuator.model_instance()]
                 effort = effort + port.Eval(self.context)[motors.index(actuator.index())]

@@ -422,8 +422,7 @@ def _in_steps(task: _Task, asked: Attempt, plan: Solution, chain: list[dict[str,
 
 
 def _shooting(asked: Attempt) -> Attempt:
-    reason = "the collocated plan in the model's own steps"
-    return replace(asked.by("shooting", reason), max_iterations=REFINING)
+    return replace(asked.by("shooting", "the collocated plan in the model's own steps"), max_iterations=REFINING)
 
 
 def _has_steps(problem: Problem) -> bool:

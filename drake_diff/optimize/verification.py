@@ -213,7 +213,8 @@ def limits_of(solution: Solution, restarts: int) -> Iterator[str]:
         free = [n for n, *sides in zip(problem.input_names, b.u_lower, b.u_upper, strict=True) if np.isinf(sides).any()]
         if isinstance(problem.running_cost, ConstantCost) and free:
             yield f"the least time of inputs without limits: {messages.joined(free)}"
-    if problem.total_running_cost is None and problem.total_final_cost is None and problem.trajectory_cost is None:
+    costs = problem.total_running_cost, problem.total_final_cost, problem.trajectory_cost, problem.parameter_cost
+    if all(cost is None for cost in costs):
         yield "not an optimum: the problem has no cost"
     elif not restarts and NEAR not in solution.notes:
         yield "a local optimum: no other first guess was tried (restarts=0)"

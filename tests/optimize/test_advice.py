@@ -75,6 +75,9 @@ def test_what_limits_a_verified_plan_is_noted():
     assert shortest.notes[:2] == ("the horizon is on its bound of 0.5 s", "the least time of inputs without limits: u0")
     assert "a local optimum: no other first guess was tried (restarts=0)" in shortest.notes
     assert dd.solve(dd.Problem(block, **ends, horizon=1.0)).notes == ("not an optimum: the problem has no cost",)
+    light = dd.Dynamics(lambda x, u, m: [x[1], u[0] / m[0]], nx=2, nu=1, parameters={"m": 1.0})
+    chosen = {"optimize": ("controls", "parameters"), "parameters": ["m"], "parameter_cost": lambda m: (m[0] - 2) ** 2}
+    assert not any("no cost" in note for note in dd.solve(dd.Problem(light, **ends, horizon=1.0, **chosen)).notes)
     bounds = dd.Bounds(u_lower=[-4.0], u_upper=[4.0])  # T = 2 sqrt(d / u)
     limited = dd.solve(dd.Problem(block, **ends, horizon=(0.5, 2.0), running_cost=1.0, bounds=bounds), restarts=1)
     assert not any(
@@ -85,7 +88,6 @@ def test_what_limits_a_verified_plan_is_noted():
 def test_a_start_at_a_kink_is_to_be_moved():
     """The foot of a hopper just touches the ground at x0, where the step jumps with the length of its leg."""
     model = dd.load_model(MODELS / "hopper.sdf", time_step=0.005, fix_joints=("x", "swing"))
-    cost = dd.QuadraticCost(Q=np.eye(4), R=np.eye(model.nu))
-    solution = dd.solve(dd.Problem(model, x0={"z_x": 0.5, "leg_x": 0.45}, num_steps=5, running_cost=cost))
+    solution = dd.solve(dd.Problem(model, x0={"z_x": 0.5, "leg_x": 0.45}, num_steps=5, running_cost=EFFORT))
     assert solution.certificates[0].verdict == "discontinuous"
     assert "to try: an x0 that is not exactly at a contact or joint limit" in solution.notes

@@ -140,11 +140,9 @@ def test_a_row_that_is_flat_at_the_guess_is_kept_in_any_unit(unit):
 
 @pytest.mark.parametrize("rounding", [0.0, 1e-19, -1e-17])
 def test_a_guess_that_moves_a_joint_by_rounding_has_no_tiny_scales(load, rounding):
-    """The scale of a joint is not 1e-19 if the end of a guess differs from the start by that much."""
-    model = load("double_pendulum.urdf", time_step=0.02)
-    end = np.array([rounding, 1.0, rounding, 0.0])
+    model, end = load("double_pendulum.urdf", time_step=0.02), np.array([rounding, 1.0, rounding, 0.0])
     problem = dd.Problem(model, x0=np.zeros(4), x_goal=end, num_steps=40, running_cost=dd.QuadraticCost(R=np.eye(2)))
-    line = np.linspace(0, 1, 41)[:, None] * end
-    solution = dd.solve(problem, method="collocation", initial_guess=(line, np.zeros((40, 2))), restarts=0)
+    guess = np.linspace(0, 1, 41)[:, None] * end, np.zeros((40, 2))
+    solution = dd.solve(problem, method="collocation", initial_guess=guess, restarts=0)
     assert solution.success, solution.message
     assert len(solution.iterations) < 30  # 503 with a scale of 1e-19
