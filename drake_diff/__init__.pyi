@@ -22,6 +22,7 @@ from .model.step import step as step
 from .motion.gradient import differentiate_rollout as differentiate_rollout
 from .motion.policy import PD as PD
 from .motion.rollout import rollout as rollout
+from .optimize.check_plan import check_plan as check_plan
 from .optimize.problem.constraint import Bounds as Bounds
 from .optimize.problem.constraint import Constraint as Constraint
 from .optimize.problem.cost import QuadraticCost as QuadraticCost

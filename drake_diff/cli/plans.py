@@ -27,6 +27,7 @@ from drake_diff.cli.text import (
     show,
     show_table,
     survived,
+    takes_model,
 )
 from drake_diff.exceptions import InputError
 
@@ -44,6 +45,7 @@ Obstacles = Annotated[
     ),
 ]
 NUMBERS = {"sphere": 4, "box": 6}
+SHOWN = 12  # checks that `check` prints, the worst first
 PAUSE = 5.0  # [s] between two lines of progress without a terminal
 
 
@@ -68,16 +70,13 @@ def plan(
     expected = "NAME=x,y,z for a frame, or NAME=number for a joint"
     numbers = numbers_in("--goal", goal or (), expected, counts=range(1, 100))
     goals = {name: list(values) for name, values in numbers.items()}
-    shapes, folders = [_shape(words) for words in avoid or ()], packages_in(packages)
+    folders, obstacles = packages_in(packages), [_shape(words) for words in avoid or ()]
     if robot is not None and not robot.is_file():
         raise InputError("ROBOT", got=str(robot), expected="a file that exists")
     # Imported late, so that invalid input is rejected before Drake is loaded.
     from drake_diff.model.model import example_files
-    from drake_diff.optimize.problem.obstacles import BoxObstacle, SphereObstacle
     from drake_diff.planning.planner import plan as planned
     from drake_diff.planning.robot import TIME_STEP
-
-    obstacles = [SphereObstacle(n[:3], n[3]) if kind == "sphere" else BoxObstacle(n[:3], n[3:]) for kind, n in shapes]
 
     file = robot or example_files()[EXAMPLE]
     if robot is not None:
@@ -86,7 +85,7 @@ def plan(
         with progress_line("reading", pause=PAUSE) as report:
             asked: dict[str, Any] = {
                 "goals": goals,
-                "avoid": obstacles,
+                "avoid": _obstacles(obstacles),
                 "time": time,
                 "out": out,
                 "seed": seed,
@@ -105,6 +104,53 @@ def plan(
     conclude(done.success)
 
 
+def check(
+    model: Any,
+    file: Path,
+    plan: Annotated[
+        Path, typer.Argument(metavar="PLAN", help="Samples of states and inputs: CSV, MCAP or a ROS 2 bag.")
+    ],
+    goal: Goals = None,
+    avoid: Obstacles = None,
+    plant: Annotated[
+        str, typer.Option(help="steps (inputs are held until the next sample) or continuous (linear in between)")
+    ] = "steps",
+    tolerance: Annotated[float, typer.Option(help="Relative tolerance of the plan at its samples.")] = 1e-4,
+    out: Annotated[Path | None, out_option("artifacts/check_<plan>")] = None,
+) -> None:
+    """Verify PLAN, a plan of another tool, on the robot of --model, and write a run directory.
+
+    The samples are one time step of the model apart. With --goal, the plan must end there at rest, and without it the
+    replays must end at its last state. The limits of the robot file apply. Exit status 0 only if every check passes.
+    """
+    from drake_diff.optimize.check_plan import check_plan
+    from drake_diff.planning.given import recorded_plan
+    from drake_diff.runs.save import save
+
+    goals = numbers_in("--goal", goal or (), "NAME=x,y,z or NAME=number", counts=range(1, 100))
+    problem, xs, us = recorded_plan(plan, model, goals, _obstacles([_shape(words) for words in avoid or ()]))
+    inputs = us if plant == "steps" else [*us, us[-1]]
+    solution = check_plan(problem, xs, inputs, plant=plant, tolerance=tolerance)
+    directory = out or Path("artifacts") / f"check_{plan.stem}"
+    record = save(solution, directory)
+    columns = ("check", "where", "plant", "feedback", "value", "tolerance", "unit")
+    rows = []
+    for c in solution.checks[:SHOWN]:
+        numbers = (f"{number:.3g}" for number in (c.value, c.tolerance))
+        verdict = plain(c.verdict, "green" if c.passes else "red")
+        rows.append((verdict, c.what, c.where, c.plant, c.feedback or "open loop", *numbers, c.unit))
+    show_table(("verdict", *columns), rows, wrap=False)
+    show(judged(record.verdict), solution.message)
+    show(f"wrote {directory}")
+    conclude(record.verdict == "pass")
+
+
+def _obstacles(shapes: list[tuple[str, list[float]]]) -> list[Any]:
+    from drake_diff.optimize.problem.obstacles import BoxObstacle, SphereObstacle
+
+    return [SphereObstacle(n[:3], n[3]) if kind == "sphere" else BoxObstacle(n[:3], n[3:]) for kind, n in shapes]
+
+
 def _shape(words: str) -> tuple[str, list[float]]:
     kind, colon, values = words.partition(":")
     expected = "sphere:x,y,z,radius or box:x,y,z,length,width,height"
@@ -120,6 +166,7 @@ def add_commands(app: typer.Typer) -> None:
     """Add the commands of this module to `app`."""
     for command in (plan, robustness, panel):
         app.command()(command)
+    app.command()(takes_model(check, of_a_plan=True))
 
 
 def robustness(

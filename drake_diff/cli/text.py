@@ -61,12 +61,17 @@ def names_in(words: str | None) -> list[str] | None:
     return None if words is None else [name.strip() for name in words.split(",") if name.strip()]
 
 
-def takes_model(command: Callable[..., None]) -> Callable[..., None]:
+def takes_model(command: Callable[..., None], *, of_a_plan: bool = False) -> Callable[..., None]:
     """Convert `command(model, file, ...)` to a command with the argument MODEL and the options of `load_model`.
 
-    Typer reads options from the signature of a function, so this function sets it in one place for all commands.
+    Typer reads options from the signature of a function, so this function sets it in one place for all commands. If the
+    command takes a file `of_a_plan`, MODEL is the option --model, and there is no --time-step, as the plan has its own.
     """
-    loading = inspect.signature(_load).parameters
+    loading = dict(inspect.signature(_load).parameters)
+    if of_a_plan:
+        del loading["time_step"]
+        option = typer.Option(help="A URDF, SDF, MJCF (.xml) or .dmd.yaml file.")
+        loading["model"] = loading["model"].replace(annotation=Annotated[Path, option])
     arguments = [p for p in inspect.signature(command).parameters.values() if p.name not in ("model", "file")]
 
     @functools.wraps(command)
@@ -75,7 +80,7 @@ def takes_model(command: Callable[..., None]) -> Callable[..., None]:
         command(_load(**{name: given.pop(name) for name in loading}), file, **given)
 
     model, *options = loading.values()
-    parameters = [model, *arguments, *options]
+    parameters = [*arguments[:1], model, *arguments[1:], *options] if of_a_plan else [model, *arguments, *options]
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {p.name: p.annotation for p in parameters}
     return run

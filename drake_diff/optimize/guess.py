@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from pydrake.trajectories import Trajectory
+from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_diff._base.arrays import Array, finite_array, positive_float
 from drake_diff.derivatives.step import differentiate_step
@@ -30,7 +30,7 @@ NOISE = 1e-3  # noise on a stationary guess, as a fraction of the input limits, 
 WANDER = (1.0, 0.3)  # deviation of a random guess from the straight line, as a fraction of max(1, distance to the goal)
 WAVES = 4
 LONGER = 3.0  # largest factor between a random horizon and the first horizon, in both directions
-FORMS = "None, (xs, us), two Drake trajectories (state, input) or a Solution"
+FORMS = "None, (xs, us), two Drake trajectories (state, input), a state's trajectory or a Solution"
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,9 +140,17 @@ def _means(us: Array, ends: Array) -> Array:
 def sampled(problem: Problem, method: str, given: Any) -> Any:
     """Return `given`, with two Drake trajectories sampled at the problem's knots.
 
-    Held inputs are sampled in the middle of each step.
+    Held inputs are sampled in the middle of each step. States alone get the inputs of a default guess.
     """
-    if not (isinstance(given, (tuple, list)) and any(isinstance(signal, Trajectory) for signal in given)):
+    given = (given, None) if isinstance(given, Trajectory) else given
+    if not isinstance(given, (tuple, list)):
+        return given
+    if len(given) >= 2 and (given[1] is None or _is_empty(given[1])):
+        zeros = PiecewisePolynomial(np.zeros((problem.nu, 1)))
+        us = zeros if isinstance(given[0], Trajectory) else np.zeros((problem.num_steps, problem.nu))
+        xs, us, *rest = sampled(problem, method, (given[0], us, *given[2:]))
+        return xs, _line(problem, method, 0).us, *rest
+    if not any(isinstance(signal, Trajectory) for signal in given):
         return given
     if len(given) != 2:
         raise InputError("initial_guess", got=f"{len(given)} entries", expected="two trajectories: (state, input)")
@@ -159,13 +167,22 @@ def sampled(problem: Problem, method: str, given: Any) -> Any:
         raise InputError("initial_guess state", got=f"from {start:g} to {end:g} s", expected="a duration in (0, inf)")
     knots = np.linspace(start, end, problem.num_steps + 1)
     if method == "collocation" or problem.horizon:  # collocation takes a free horizon
-        return _values("state", state, knots), _values("input", held, knots), end - start
-    return _values("state", state, knots), _values("input", held, (knots[:-1] + knots[1:]) / 2)
+        return _guessed("state", state, knots), _guessed("input", held, knots), end - start
+    return _guessed("state", state, knots), _guessed("input", held, (knots[:-1] + knots[1:]) / 2)
 
 
-def _values(name: str, trajectory: Any, times: Array) -> Array:
+def _is_empty(signal: Any) -> bool:
+    return isinstance(signal, PiecewisePolynomial) and not signal.get_number_of_segments()
+
+
+def _guessed(name: str, trajectory: Any, times: Array) -> Array:
+    return trajectory_values(f"initial_guess {name}", trajectory, times)
+
+
+def trajectory_values(subject: str, trajectory: Any, times: Array) -> Array:
+    """Return the values (S, rows) of a Drake trajectory at `times` (S,) [s]; InputError if some are not finite."""
     inside = np.clip(times, trajectory.start_time(), trajectory.end_time())
-    return finite_array(f"initial_guess {name}", trajectory.vector_values(inside).T, (len(times), trajectory.rows()))
+    return finite_array(subject, trajectory.vector_values(inside).T, (len(times), trajectory.rows()))
 
 
 def _line(problem: Problem, method: str, seed: int) -> Guess:

@@ -37,6 +37,8 @@ BESIDE = np.linspace(-0.1, 0.1, 41)  # offsets from a plan at which costs are ev
 LOOKED_AT, MOST_BENDS = 3, 20  # knots at which costs are compared; candidate places of a jump on a line
 HALVED = 24  # bisections to distinguish a jump from a steep slope; 6e-8 of the distance between two places
 SMALLEST_JUMP = 1e-6  # fraction of the largest cost on these lines; a smooth cost changes by 1e-9
+SIMULATOR = "Drake's Simulator"
+GIVEN = "check_plan"  # the method of a plan that was given to be verified
 FIRST_KNOTS, BENDS = 3, 3  # knots of a guess; knots of a result in addition to its first and last knot
 
 
@@ -62,11 +64,13 @@ def _knot_checks(s: Any) -> Iterator[Check]:
     problem, xs = s.problem, np.asarray(s.xs)
     with np.errstate(all="ignore"):
         scales = problem.feasibility_scales(xs, s.us, s.vector.values, s.knots)
-    limits = FEASIBILITY_TOLERANCE * np.array([scales[name] for name in problem.state_names])
-    knots = np.flatnonzero(~np.all(s.defects_of_states <= limits, axis=1))
-    worst, i = _worst(s.defects_of_states, limits)
-    after = f"knots {_spans(knots)}" if len(knots) else f"knot {worst}" if len(s.defects) else "none"
-    yield check("defect", after, s.defects_of_states[worst, i], limits[i])
+    scales = {name: _feasibility(s) * scale for name, scale in scales.items()}
+    limits = np.array([scales[name] for name in problem.state_names])
+    if s.method != GIVEN or s.transcribed is None or problem.is_map:  # a given plan has no scheme: it is integrated
+        knots = np.flatnonzero(~np.all(s.defects_of_states <= limits, axis=1))
+        worst, i = _worst(s.defects_of_states, limits)
+        after = f"knots {_spans(knots)}" if len(knots) else f"knot {worst}" if len(s.defects) else "none"
+        yield check("defect", after, s.defects_of_states[worst, i], limits[i])
     wanted = {"goal": (-1, problem.goal), "start": (0, problem.start)}
     wanted |= {f"waypoint at knot {k}": (int(s.knots[k]), x) for k, x in problem.waypoints.items()}
     for name, (row, x) in wanted.items():
@@ -86,6 +90,11 @@ def _knot_checks(s: Any) -> Iterator[Check]:
     yield check("cost", where, s.cost_error, COST_TOLERANCE * s.cost_scale)
 
 
+def _feasibility(s: Any) -> float:
+    """Return the relative tolerance of a plan at its knots, which `check_plan` gets as an argument."""
+    return float(s.search.arguments["tolerance"]) if s.method == GIVEN and s.search else FEASIBILITY_TOLERANCE
+
+
 def _worst(values: Array, limits: Array) -> tuple[int, int]:
     """Return the row and column of the largest of values (M, n), relative to the limit (n,) of its column."""
     if not values.size:
@@ -95,10 +104,10 @@ def _worst(values: Array, limits: Array) -> tuple[int, int]:
 
 
 def _excess_checks(
-    what: str, excesses: Mapping[str, tuple[float, int]], scales: Mapping[str, float]
+    what: str, excesses: Mapping[str, tuple[float, int]], tolerances: Mapping[str, float]
 ) -> Iterator[Check]:
     for name, (excess, knot) in excesses.items():
-        yield check(what, f"{name} at knot {knot}", excess, FEASIBILITY_TOLERANCE * scales[name])
+        yield check(what, f"{name} at knot {knot}", excess, tolerances[name])
     if not excesses:
         yield check(what, "all at all knots", 0.0, 0.0)
 
@@ -110,6 +119,14 @@ def _interval_checks(s: Any, motion: Collocated) -> Iterator[Check]:
     where = f"{s.problem.state_names[i]} at knot {knot}"
     yield check("integration", where, motion.gaps[knot, i], tolerance[i], units_of(s.problem)[i])
     yield from s.between_nodes.checks
+    drake = None if s.problem.has_model or s.problem.is_map else s.problem.system.drake
+    if drake is not None and np.all(np.isfinite(motion.xs)):
+        ends = drake.simulated(s.trajectory().input, s.times, motion.xs)
+        gaps = np.nan_to_num(np.abs(ends - motion.xs[1:]), nan=np.inf)
+        knot, i = _worst(gaps, tolerance)
+        where = f"{s.problem.state_names[i]} at knot {knot}"
+        row = check("integration", where, gaps[knot, i], tolerance[i], units_of(s.problem)[i])
+        yield replace(row, plant=SIMULATOR)
 
 
 def _overlap_check(s: Any, motion: Collocated) -> Check:

@@ -32,7 +32,9 @@ from drake_diff.optimize.transcription.collocation import Collocated, collocated
 SAME_COST = 1e-2  # largest relative difference in cost between searches that reach one optimum on different meshes
 SAME_MOTION = 5e-2  # largest RMS difference over the knots, as a fraction of each state's range
 # Fields that no measure depends on.
-TOLD = ("cross_checks", "iterations", "message", "notes", "optima", "options", "search", "solver_message", "status")
+NO_INPUT = PiecewisePolynomial(np.zeros((0, 1)))  # of a system without inputs
+OF_THE_SEARCH = ("iterations", "optima", "options", "search", "solver_message", "wall_time")
+TOLD = ("cross_checks", "message", "notes", "status", *OF_THE_SEARCH)
 
 
 class Status(enum.Enum):
@@ -622,10 +624,12 @@ def trajectories(solution: Solution) -> Trajectories:
     times, motion = solution.times, solution.transcribed
     xs, us = np.asarray(solution.xs), np.asarray(solution.inputs_at_knots)
     if motion is None or solution.problem.is_map:
-        held = PiecewisePolynomial.ZeroOrderHold(times, np.vstack([us, us[-1:]]).T)
+        held = PiecewisePolynomial.ZeroOrderHold(times, np.vstack([us, us[-1:]]).T) if us.size else NO_INPUT
         between = PiecewisePolynomial.ZeroOrderHold if solution.problem.is_map else PiecewisePolynomial.FirstOrderHold
         return Trajectories(between(times, xs.T), held)
     state = PiecewisePolynomial.CubicHermite(times, xs.T, motion.rates.T)
+    if not us.size:
+        return Trajectories(state, NO_INPUT)
     if solution.us_mid is None:
         return Trajectories(state, PiecewisePolynomial.FirstOrderHold(times, us.T))
     parabolas = PiecewisePolynomial()

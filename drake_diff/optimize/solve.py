@@ -23,7 +23,7 @@ from drake_diff.optimize.guess import another_guess, first_guesses, other_guess,
 from drake_diff.optimize.ilqr.ilqr import check_problem, takes
 from drake_diff.optimize.options import Options
 from drake_diff.optimize.phased import PhasedSolution
-from drake_diff.optimize.problem.cost import TimedCost
+from drake_diff.optimize.problem.cost import changes_in_time
 from drake_diff.optimize.problem.phases import PhasedProblem
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Limits, Report
@@ -213,6 +213,8 @@ def _check_common(problem: Any, seed: Any, callback: Any, progress: Any, view: A
     count("seed", seed, 0, LARGEST_SEED)
     for phase in problem.phases:
         phase.check_derivatives()
+        if phase.has_model and phase.nu == 0 and set(phase.optimize) == {"controls"} and phase.horizon is None:
+            raise InputError("optimize", got='"controls", but the model has no actuators', expected="an actuated model")
     if not (callback is None or callable(callback)):
         raise InputError("callback", got=repr(callback), expected="a function of an Iteration, or None")
     if not (isinstance(progress, bool) or callable(progress)):
@@ -681,7 +683,7 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
         raise InputError("solver", got='"snopt"', expected=f'"ipopt" for scheme="{scheme}", or scheme="drake"')
     if problem.trajectory_cost is not None:
         raise InputError("trajectory_cost", got="given", expected='method="shooting"')
-    if not problem.optimizes_controls:
+    if problem.nu and not problem.optimizes_controls:
         raise InputError("optimize", got=list(problem.optimize), expected='"controls" for method="collocation"')
     _check_timed_cost(problem)
     OptimalControl(problem, scheme)  # raises an error if a cost cannot be differentiated
@@ -694,7 +696,7 @@ def _check_collocation(problem: Problem, attempt: Attempt) -> str:
             "goals": problem.goals,
             "horizon": problem.horizon,
             "parameters": problem.parameters.parameters,
-            "a running_cost that changes in time": isinstance(problem.running_cost, TimedCost),
+            "a running_cost that changes in time": changes_in_time(problem.running_cost),
             "refine": attempt.options.refine,
         }
         for name, value in left_out.items():
@@ -727,7 +729,7 @@ def _check_scheme(problem: Problem | PhasedProblem, attempt: Attempt) -> str:
 
 
 def _check_timed_cost(problem: Problem) -> None:
-    if isinstance(problem.running_cost, TimedCost) and problem.horizon and problem.horizon[0] < problem.horizon[1]:
+    if changes_in_time(problem.running_cost) and problem.horizon and problem.horizon[0] < problem.horizon[1]:
         raise InputError(
             "running_cost",
             got="a cost that changes in time",

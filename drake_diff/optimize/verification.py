@@ -10,7 +10,7 @@ from drake_diff._base.values import Refusal
 from drake_diff.exceptions import GradientError
 from drake_diff.optimize import messages
 from drake_diff.optimize.checks import PLAN, Check, Checks
-from drake_diff.optimize.measure import ASKED
+from drake_diff.optimize.measure import ASKED, GIVEN
 from drake_diff.optimize.messages import headline
 from drake_diff.optimize.problem.cost import ConstantCost
 from drake_diff.optimize.problem.phases import PhasedProblem
@@ -122,6 +122,9 @@ def _holding(s: Solution, plants: list[list[PlantTrial]]) -> str:
 
 def _remedy(draft: Solution, failing: list[Check]) -> str:
     """Suggest a remedy for a failure between knots."""
+    if draft.method == GIVEN:
+        is_off = draft.transcribed is None and draft.problem.has_model and any(c.what == "defect" for c in failing)
+        return 'plant="continuous" judges a plan whose input changes between its knots' if is_off else ""
     if draft.problem.is_map or not any(c.what in ("cost", "integration") or c.plant != PLAN for c in failing):
         return ""
     if draft.transcribed is None:
@@ -195,7 +198,8 @@ def refused(draft: Solution, error: Exception) -> Solution:
 def ended(draft: Any, status: Status, *sentences: str, **fields: Any) -> Any:
     """Return the draft with its final status. The first of `sentences` is the message, and the others are notes."""
     text, *others = [s for s in sentences if s] or [""]
-    message = headline(status.words, text)
+    is_given = draft.method == GIVEN and status is Status.CONVERGED
+    message = headline("verified" if is_given else status.words, text)
     cut = [text] if text not in message else []
     return draft.told(status=status, message=message, notes=(*cut, *others), **fields)
 

@@ -186,7 +186,8 @@ def _metrics_of_the_plan(
     yield measured(
         "cost error", "distance of the cost from what was minimized and from its true value", s.cost_error, "1"
     )
-    yield measured("defect", "largest distance from the dynamics over one step", s.defect, x, most["defect"], t_s=when)
+    limit = most["defect"] if rows["defect"] else None  # a given plan in continuous time has no scheme
+    yield measured("defect", "largest distance from the dynamics over one step", s.defect, x, limit, t_s=when)
     yield measured("goal error", "largest distance of the final state from the goal", s.goal_error, x, most["goal"])
     yield measured("bound violation", "largest excess over a bound", s.bound_violation, bounded, most["bound"])
     yield measured(

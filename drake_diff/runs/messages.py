@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff.optimize.measure import GIVEN
 from drake_diff.optimize.messages import FEW, joined
 from drake_diff.optimize.problem import goals
 from drake_diff.optimize.problem.cost import ConstantCost
@@ -76,7 +77,8 @@ def _of_a_plan(record: PlanRecord) -> Iterator[str]:
             yield f"{e.name} from {e.start:.9g} within [{shown(e.lower)}, {shown(e.upper)}]"
         tolerances = (f"{m.name} {m.tolerance:g} {m.unit}" for m in record.metrics if m.tolerance is not None)
         yield f"within {', '.join(tolerances)}"
-        yield f"by solve with {_table(record.inputs.search)}"
+        given = (record.inputs.search or {}).get("method") == GIVEN
+        yield f"by {'a check' if given else 'solve'} with {_table(record.inputs.search)}"
 
 
 def _of_a_problem(p: Mapping[str, Any]) -> Iterator[str]:

@@ -26,6 +26,8 @@ from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.model.load_file import FORMATS
 from drake_diff.model.model import Model, load_model
 from drake_diff.model.named_files import LAID_OUT, is_portable, lay_out
+from drake_diff.optimize.check_plan import checked
+from drake_diff.optimize.measure import GIVEN
 from drake_diff.optimize.options import Options
 from drake_diff.optimize.phased import PhasedSolution
 from drake_diff.optimize.problem.fixed_contacts import FixedContacts, Impact
@@ -217,6 +219,7 @@ def resolve(record: PlanRecord, model: Model, plan: dict[str, Array]) -> Solutio
         raise ArtifactError("record.json: the record has no solver")
     _check_shapes(record, model, plan)
     with _refusing_a_problem():
+        arguments = search_of(record) if solver.method == GIVEN else None
         return Solution(
             problem=rebuild_problem(record, model, plan["us"], plan.get(START)),
             method=solver.method,
@@ -224,6 +227,7 @@ def resolve(record: PlanRecord, model: Model, plan: dict[str, Array]) -> Solutio
             status=Status(solver.status),
             message=solver.message,
             scheme=solver.scheme,
+            search=None if arguments is None else Search(arguments),
             **plan_fields(plan),
         )
 
@@ -293,6 +297,8 @@ def solve_again(record: PlanRecord, recorded: Solution, plan: dict[str, Array]) 
     """
     with _refusing_a_problem():
         arguments: dict[str, Any] = dict(search_of(record) or {})
+        if recorded.method == GIVEN:
+            return checked(recorded, {name: arguments[name] for name in ("method", "plant", "tolerance")})
         kind, options = arguments.pop("initial_guess", None), arguments.pop("options")
         chosen = Options.from_dict({name: value for name, value in options.items() if name not in REMOVED})
         limit, guess = arguments.pop("time_limit"), _rebuild_guess(recorded.problem, kind, plan)

@@ -350,8 +350,8 @@ def odd_metrics(record: PlanRecord, plan: dict[str, Array]) -> Iterator[str]:
             1.0, again or 0.0
         ):
             yield f"{record.FILE}: metrics[{name}] is {recorded}, but the plan gives {again}"
-    inputs = [plan[name].reshape(-1, plan["us"].shape[1]) for name in ("us", "us_mid", "u_final") if name in plan]
-    us, later = np.vstack(inputs), xs[1:] if np.all(np.isfinite(start)) else xs
+    us = np.vstack([plan[name] for name in ("us", "us_mid", "u_final") if name in plan])
+    later = xs[1:] if np.all(np.isfinite(start)) else xs
     beyond = [numbers("u_lower", -np.inf) - us, us - numbers("u_upper", np.inf)]
     beyond += [numbers("x_lower", -np.inf) - later, later - numbers("x_upper", np.inf)]
     least = max(float(np.max(excess, initial=0.0)) for excess in beyond)

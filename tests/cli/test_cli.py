@@ -11,12 +11,14 @@ import time
 from contextlib import contextmanager
 from importlib import metadata
 
+import numpy as np
 import pytest
 from helpers.models import ROOT
 from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.cli import main as cli
+from drake_diff.comparison.recordings import write_csv
 from drake_diff.exceptions import ArtifactError
 from drake_diff.optimize import solve as solving
 from drake_diff.runs import directory as directories
@@ -335,3 +337,25 @@ def test_the_version_is_that_of_the_installation(tmp_path):
     version, computes = done.stdout.splitlines()
     assert (done.returncode, version) == (0, f"drake-diff {metadata.version('drake-diff')}")
     assert computes.startswith("Steps are differentiated by compiled functions (Numba ")
+
+
+def test_a_plan_of_another_tool_is_checked(tmp_path, monkeypatch, capsys):
+    """A plan in steps, the same with a wrong state, and the same for another goal."""
+    monkeypatch.setenv("COLUMNS", "200")
+    model = dd.load_model(ROOT / "models" / "pendulum.urdf", time_step=0.05)
+    problem = dd.Problem(model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=dd.QuadraticCost(R=[[1.0]]))
+    plan = dd.solve(problem)
+    write_csv(dd.Recording("plan", "1", plan.times, plan.xs, plan.us), model, tmp_path / "plan.csv")
+    wrong = plan.xs + np.eye(21)[5][:, None] * [0.1, 0]
+    write_csv(dd.Recording("wrong", "1", plan.times, wrong, plan.us), model, tmp_path / "wrong.csv")
+    robot = ("--model", ROOT / "models" / "pendulum.urdf", "--out", tmp_path / "run")
+    for words, status, text in (
+        (("plan.csv", "--goal", "hinge=1"), 0, "pass verified: holds open loop at 50 ms"),
+        (("plan.csv",), 0, "verified: holds"),
+        (("wrong.csv", "--goal", "hinge=1"), 1, "the motion does not follow the dynamics after knots 4-5"),
+        (("plan.csv", "--goal", "hinge=1.2"), 1, "hinge_q ends 0.2 rad from its goal"),
+        (("plan.csv", "--goal", "wrist=1.2"), 2, ""),
+    ):
+        assert exit_of(monkeypatch, "check", tmp_path / words[0], *words[1:], *robot) == status
+        assert text in capsys.readouterr().out
+    assert dd.verify(tmp_path / "run").verdict == "holds"

@@ -1,6 +1,7 @@
 """Tests of problems and costs: their meaning, and problems that are refused before anything runs."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -87,7 +88,7 @@ def test_a_nan_goal_is_free(load):
         ({"optimize": "initial_state", "initial_state_mask": [1, 0, 0, 0]}, "booleans"),
         ({"optimize": "initial_state", "initial_state_mask": [False] * 4}, "booleans, of which some are True"),
         ({"initial_state_mask": [True] * 4}, "no True without"),
-        ({"running_cost": 3.0}, "a function or a QuadraticCost, got float"),
+        ({"running_cost": 3.0}, "a QuadraticCost or a function, such as .*, got float"),
         ({"running_cost": dd.QuadraticCost(R=np.eye(2))}, r"running_cost.R: expected shape \(1, 1\)"),
         ({"running_cost": dd.QuadraticCost(Q=np.eye(3))}, r"running_cost.Q: expected shape \(4, 4\)"),
         ({"running_cost": None, "x_goal": None}, "a cost, an x_goal, goals or constraints"),
@@ -102,7 +103,7 @@ def test_a_nan_goal_is_free(load):
         ({"x0": [0, 0, 0, math.inf]}, r"x0\[3\]: expected a finite number, got inf"),
         ({"num_steps": 10.0}, "num_steps: expected a whole number of at least 1, got 10.0"),
         ({"final_cost": dd.QuadraticCost(Q=np.eye(3))}, r"final_cost.Q: expected shape \(4, 4\), got shape \(3, 3\)"),
-        ({"final_cost": "small"}, "final_cost: expected a function or a QuadraticCost, got str"),
+        ({"final_cost": "small"}, "final_cost: expected a QuadraticCost or a function, such as .*, got str"),
         ({"running_cost": dd.QuadraticCost(x_ref=[1, 2])}, r"running_cost.x_ref: expected shape \(4,\)"),
         ({"running_cost": dd.QuadraticCost(u_ref=[1, 2])}, r"running_cost.u_ref: expected shape \(1,\)"),
         ({"bounds": dd.Bounds(u_upper=5.0)}, r"u_upper: expected shape \(1,\), got shape \(\)"),
@@ -147,9 +148,18 @@ def test_a_models_speed_limit_applies(tmp_path):
     assert bounds.x_lower.tolist() == [-2.0, -math.inf, -3.0, -math.inf]
 
 
+def test_a_problem_is_copied_with_another_number_of_steps(load):
+    problem = dd.Problem(load("pendulum.urdf"), x0=[0, 0], num_steps=3, running_cost=R)
+    assert replace(problem, num_steps=5).us.shape == (5, 1)
+    given = replace(problem, us=np.zeros((3, 1)))
+    with pytest.raises(InputError, match="us: expected shape"):
+        replace(given, num_steps=5)
+
+
 def test_controls_without_actuators_are_refused(load):
+    problem = dd.Problem(load("projectile.sdf"), x0=np.eye(13)[0], num_steps=3, final_cost=lambda x: x[4])
     with pytest.raises(InputError, match="an actuated model"):
-        dd.Problem(load("projectile.sdf"), x0=np.eye(13)[0], num_steps=3, final_cost=lambda x: x[4])
+        dd.solve(problem)
 
 
 def test_a_tolerance_is_of_a_state_itself_and_of_its_way(load):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from pydrake.trajectories import Trajectory
 
-from drake_diff._base.arrays import Array, finite_array
+from drake_diff._base.arrays import Array, finite_array, positive_float
 from drake_diff._base.autodiff import UserFunction, gradient_of, user_function
 from drake_diff._base.differences import central_differences
 from drake_diff.exceptions import InputError, ShapeError
@@ -367,12 +367,21 @@ class SumOfCosts(TimedCost):
         return total
 
 
+def changes_in_time(cost: Any) -> bool:
+    """Return whether a running cost, or a part of its sum, depends on time."""
+    return any(map(changes_in_time, cost.costs)) if isinstance(cost, SumOfCosts) else isinstance(cost, TimedCost)
+
+
+def _rate(number: float) -> ConstantCost:
+    return ConstantCost(positive_float("running_cost", number))
+
+
 def running_cost_of(given: Any) -> Any:
-    """Convert a Problem's `running_cost`. A function of three variables depends on time, and a sequence is a sum."""
+    """Convert a part of a Problem's `running_cost`: a function of x, u and perhaps t, a rate, or a sequence to add."""
     if isinstance(given, (list, tuple)):
         if not given:
             raise InputError("running_cost", got="an empty list", expected="costs")
-        return SumOfCosts(tuple(running_cost_of(cost) for cost in given))
+        return SumOfCosts(tuple(_rate(c) if isinstance(c, (int, float)) else running_cost_of(c) for c in given))
     given = user_function("running_cost", given)
     timed = isinstance(given, UserFunction) and arguments_of(given) == 3
     return FunctionOfTime(given) if timed else given

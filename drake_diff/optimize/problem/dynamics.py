@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from pydrake.autodiffutils import ExtractValue, InitializeAutoDiff
 
-from drake_diff._base.arrays import Array, Indices, array_with_gaps, finite_array, frozen, positive_int
+from drake_diff._base.arrays import Array, Indices, array_with_gaps, count, finite_array, frozen, positive_int
 from drake_diff._base.autodiff import gradient_rows, user_function
 from drake_diff.exceptions import GradientError, InputError, ShapeError, UnknownNameError
 from drake_diff.mechanics.tree import tree_for
@@ -28,6 +28,7 @@ from drake_diff.model.parameters import (
 )
 from drake_diff.model.plant import joints, labelled, radius_of_gyration
 from drake_diff.optimize.problem.constraint import Bounds, arguments_of, carried, plant_limits, resolve_bounds
+from drake_diff.optimize.problem.drake_systems import DrakeSystem
 
 SMALLEST_TRIED = 1e-3  # of a parameter's first value: a smaller one's derivatives are certified at this value
 SIDES = ("lower", "upper")
@@ -144,8 +145,9 @@ class Dynamics:
         input_names: Sequence[str] | None = None,
         parameters: Mapping[str, Any] | ParameterVector | None = None,
     ):
-        self.nx, self.nu = positive_int("nx", nx), positive_int("nu", nu)
+        self.nx, self.nu = positive_int("nx", nx), count("nu", nu, 0)
         self.model: Model | None = None  # the model that defines the states, if any
+        self.drake: DrakeSystem | None = None  # the system of `from_system`
         self.default_state = frozen(np.zeros(self.nx))
         self.state_names = _names("state_names", state_names, "x", self.nx)
         self.input_names = _names("input_names", input_names, "u", self.nu)
@@ -163,6 +165,41 @@ class Dynamics:
         inputs, f = self.nu, user_function("dynamics", f, (self.nx,))
         by_knot = (lambda x, z: f(x, z[:inputs], z[inputs:])) if self.parameters.names else f
         self.form = Pointwise("dynamics", by_knot, self.nx, (self.nx,), self.whole(self.probe()))
+
+    @staticmethod
+    def from_system(system: Any, *, context: Any = None, input_ports: Sequence[str] | None = None) -> "Dynamics":
+        """Return the dynamics of a Drake System, with derivatives by its scalar conversion to AutoDiffXd.
+
+        A system of discrete states becomes an `optimize.DiscreteMap`. A plan in continuous time is also simulated from
+        each knot to the next by Drake's `Simulator`, with the events of the system. For the plan to have replays under
+        contact, certificates of steps, parameters and pages, use `load_model` or `model_from_diagram` instead.
+
+        Args:
+            system: a System with `ToAutoDiffXd`: a plant of `pydrake.examples`, a `MultibodyPlant`, a Diagram with
+                exported inputs, or a Python `LeafSystem_[T]`.
+            context: a context of `system` with the values of its parameters and of its default state; its default
+                context if not given.
+            input_ports: names of the vector input ports that are u, in this order. By default, all that are not
+                connected in `context`. For a `MultibodyPlant`, only "actuation".
+
+        Raises:
+            InputError: the system has no state or several kinds of states, its rates change in time, or an input port
+                is not a vector.
+            GradientError: the system cannot be converted to AutoDiffXd.
+
+        Example:
+            >>> from pydrake.examples import PendulumPlant
+            >>> pendulum = dd.Dynamics.from_system(PendulumPlant())
+            >>> pendulum.state_names, pendulum.input_names
+            (('x0', 'x1'), ('tau',))
+            >>> pendulum([0.0, 0.0], [0.25]).round(6).tolist()
+            [0.0, 1.0]
+        """
+        drake = DrakeSystem(system, context, input_ports)
+        kind = DiscreteMap if drake.is_discrete else Dynamics
+        dynamics = kind(drake.evaluate, len(drake.state), drake.nu, **drake.names_and_limits())
+        dynamics.drake, dynamics.default_state = drake, frozen(drake.state)
+        return dynamics
 
     def __repr__(self) -> str:
         states, inputs = ", ".join(self.state_names), ", ".join(self.input_names)

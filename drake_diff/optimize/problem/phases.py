@@ -11,7 +11,7 @@ from drake_diff._base.arrays import Array, finite_array, frozen, positive_float
 from drake_diff._base.values import PicklesItsFields, ShowsItsRepr
 from drake_diff.exceptions import InputError
 from drake_diff.optimize.problem.constraint import Constraint
-from drake_diff.optimize.problem.cost import TimedCost
+from drake_diff.optimize.problem.cost import changes_in_time
 from drake_diff.optimize.problem.dynamics import Pointwise
 from drake_diff.optimize.problem.problem import Problem
 
@@ -221,6 +221,6 @@ def _check_phase(name: str, phase: Problem, is_map: bool) -> None:
     if not phase.optimizes_controls:
         raise InputError(f"{name}: optimize", got=list(phase.optimize), expected='"controls" among them')
     free = phase.horizon is not None and phase.horizon[0] < phase.horizon[1]
-    if free and isinstance(phase.running_cost, TimedCost):
+    if free and changes_in_time(phase.running_cost):
         expected = "a running_cost that is constant in time, as the horizon is free"
         raise InputError(f"{name}: running_cost", got="a cost that changes in time", expected=expected)

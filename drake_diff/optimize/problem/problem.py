@@ -174,7 +174,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         state = system.finite_state if isinstance(system, Model) else partial(finite_array, shape=(self.nx,))
         self._set("x0", state("x0", x0))
         self._set("num_steps", number_of_steps(self.num_steps))
-        self._set("optimize", _check_optimize(self.nu, self.optimize))
+        self._set("optimize", _check_optimize(self.optimize))
         if isinstance(system, Model):
             given = self.parameters
             if isinstance(given, ParameterVector) and given.model is not system:
@@ -194,8 +194,10 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         self._set("bounds", bounds)
         self._set("initial_state_mask", self._check_mask())
         shape = (self.num_steps, self.nu)
-        us = frozen(np.zeros(shape)) if self.us is None else finite_array("us", self.us, shape)
-        if self.us is not None and not self.optimizes_controls:
+        # The default has strides of 0, so that dataclasses.replace with another num_steps makes it anew.
+        is_default = self.us is None or (isinstance(self.us, np.ndarray) and not any(self.us.strides))
+        us = np.broadcast_to(0.0, shape) if is_default else finite_array("us", self.us, shape)
+        if not is_default and not self.optimizes_controls:
             check_inside("us", us, bounds.u_lower, bounds.u_upper, self.input_names)
         self._set("us", us)
         check_inside("x0", self.x0, bounds.x_lower, bounds.x_upper, self.state_names)
@@ -727,7 +729,8 @@ class Problem(PicklesItsFields, ShowsItsRepr):
 
     def _check_constraints(self) -> tuple[Constraint, ...]:
         where = "; pass a coupling as couplings=" if isinstance(self.constraints, Couples) else ""
-        given = several("constraints", self.constraints, Constraint, f"a Constraint or several{where}")
+        like = "a Constraint or several, such as Constraint(lambda x, u: x[0] + u[0], upper=1)"
+        given = several("constraints", self.constraints, Constraint, f"{like}{where}")
         return tuple(constraint.resolved(self.x0, np.zeros(self.nu)) for constraint in given)
 
     def _check_couplings(self) -> tuple[Couples, ...]:
@@ -815,7 +818,8 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             self._set(name, user_function(name, getattr(self, name), ndim=2 if name == "trajectory_cost" else 1))
             cost = getattr(self, name)
             if cost is not None and not callable(cost) and not (name == "running_cost" and isinstance(cost, TimedCost)):
-                raise InputError(name, got=type(cost).__name__, expected="a function or a QuadraticCost")
+                expected = "a QuadraticCost or a function, such as lambda x, u: u[0] ** 2"
+                raise InputError(name, got=type(cost).__name__, expected=expected)
             if isinstance(cost, (QuadraticCost, TimedCost)):
                 cost.check_sizes(name, self.nx, self.nu)
         with np.errstate(all="ignore"):
@@ -909,15 +913,13 @@ def _not_zero(scales: Array, lower: Array, upper: Array) -> Array:
     return scales
 
 
-def _check_optimize(nu: int, optimize: Sequence[str]) -> tuple[str, ...]:
+def _check_optimize(optimize: Sequence[str]) -> tuple[str, ...]:
     names = (optimize,) if isinstance(optimize, str) else optimize
     if not isinstance(names, (tuple, list, set, frozenset)) or not names:
         raise InputError("optimize", got=repr(optimize), expected="at least one of " + ", ".join(OPTIMIZABLE))
     for name in names:
         if name not in OPTIMIZABLE:
             raise UnknownNameError("optimize", got=name, known=OPTIMIZABLE)
-    if "controls" in names and nu == 0:
-        raise InputError("optimize", got='"controls", but the model has no actuators', expected="an actuated model")
     return tuple(names)
 
 

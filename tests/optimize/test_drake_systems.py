@@ -1,0 +1,155 @@
+"""`Dynamics.from_system`: Drake's own systems as dynamics of a problem, simulated by Drake's Simulator."""
+
+import numpy as np
+import pytest
+from helpers.models import MODELS
+from pydrake.examples import AcrobotPlant, CompassGait, PendulumPlant, VanDerPolOscillator
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.systems.framework import DiagramBuilder, LeafSystem, LeafSystem_
+from pydrake.systems.primitives import LinearSystem
+from pydrake.systems.scalar_conversion import TemplateSystem
+
+import drake_diff as dd
+
+EFFORT = dd.QuadraticCost(R=[[1.0]])
+
+
+@TemplateSystem.define("Slide_")
+def Slide_(T):
+    """A unit mass on a slide. With `brake`, an event halves its speed every 0.25 s, which its rates do not show."""
+
+    class Impl(LeafSystem_[T]):
+        def _construct(self, brake: bool = False, gust: float = 0.0, converter=None):
+            LeafSystem_[T].__init__(self, converter)
+            self.brake, self.gust = brake, gust
+            self.DeclareVectorInputPort("force", 1)
+            self.DeclareContinuousState(2)
+            if brake:
+                self.DeclarePeriodicUnrestrictedUpdateEvent(0.25, 0.1, self.slow)
+
+        def _construct_copy(self, other, converter=None):
+            Impl._construct(self, other.brake, other.gust, converter=converter)
+
+        def slow(self, context, state):
+            x = context.get_continuous_state_vector().CopyToVector()
+            state.get_mutable_continuous_state().SetFromVector([x[0], 0.5 * x[1]])
+
+        def DoCalcTimeDerivatives(self, context, derivatives):
+            x, u = context.get_continuous_state_vector().CopyToVector(), self.get_input_port(0).Eval(context)
+            push = self.gust * context.get_time()
+            derivatives.get_mutable_vector().SetFromVector([x[1], u[0] + push])
+
+    return Impl
+
+
+def plan_of(system: dd.Dynamics) -> dd.Solution:
+    """The least effort from rest to rest over a distance of 1 in 1 s, which is 12 for a unit mass."""
+    return dd.solve(
+        dd.Problem(system, x0=[0, 0], x_goal=[1, 0], num_steps=20, horizon=1.0, running_cost=EFFORT),
+        method="collocation",
+    )
+
+
+def test_a_pendulum_has_the_derivatives_of_its_formula_at_the_parameters_of_a_context():
+    plant = PendulumPlant()
+    context = plant.CreateDefaultContext()
+    mass, length, damping, gravity = (context.get_numeric_parameter(0)[i] for i in range(4))
+    x, u = np.array([0.7, -0.3]), np.array([0.4])
+    for scale in (1.0, 3.0):
+        context.get_mutable_numeric_parameter(0).SetAtIndex(2, scale * damping)
+        f, A, B = dd.Dynamics.from_system(plant, context=context).derivatives(x, u)
+        inertia, d = mass * length**2, scale * damping
+        assert f == pytest.approx([x[1], (u[0] - mass * gravity * length * np.sin(x[0]) - d * x[1]) / inertia])
+        assert np.allclose(A, [[0, 1], [-gravity / length * np.cos(x[0]), -d / inertia]], rtol=1e-12)
+        assert np.allclose(B, [[0], [1 / inertia]], rtol=1e-12)
+
+
+@pytest.mark.parametrize("system", [Slide_[None](), LinearSystem([[0, 1], [0, 0]], [[0], [1]], np.eye(2), [[0], [0]])])
+def test_a_slide_in_python_and_as_a_linear_system_has_its_least_effort(system):
+    solution = plan_of(dd.Dynamics.from_system(system))
+    assert solution.success
+    assert solution.cost == pytest.approx(12.0, rel=1e-6)
+    rows = [c for c in solution.checks if c.plant == "Drake's Simulator"]
+    assert [c.what for c in rows] == ["integration"]
+    assert rows[0].value < 1e-6
+
+
+def test_an_event_that_the_rates_do_not_show_is_found_by_the_simulator():
+    solution = plan_of(dd.Dynamics.from_system(Slide_[None](True)))
+    assert solution.status is dd.Status.CONVERGED_NOT_VERIFIED
+    assert [c.plant for c in solution.checks.failing] == ["Drake's Simulator"]
+
+
+def test_a_bare_plant_and_a_diagram_agree_with_the_model():
+    bare = MultibodyPlant(0.0)
+    builder = DiagramBuilder()
+    inside, _ = AddMultibodyPlantSceneGraph(builder, 0.0)
+    for plant in (bare, inside):
+        Parser(plant).AddModels(str(MODELS / "cart_pole.urdf"))
+        plant.Finalize()
+    builder.ExportInput(inside.get_actuation_input_port(), "force")
+    reference = dd.optimize.plant_dynamics(dd.load_model(MODELS / "cart_pole.urdf", time_step=0.01))
+    systems = [dd.Dynamics.from_system(system) for system in (bare, builder.Build())]
+    assert systems[0].state_names[0].endswith("slide_x")
+    assert systems[1].input_names == ("force",)
+    assert systems[0].bounds.u_upper.tolist() == [20.0]  # the effort limit of the file
+    x, u = np.array([0.1, 0.7, -0.3, 1.1]), np.array([2.5])
+    for got in (system.derivatives(x, u) for system in systems):
+        for ours, wanted in zip(got, reference.derivatives(x, u), strict=True):
+            assert np.allclose(ours, wanted, rtol=0, atol=1e-11)
+
+
+def test_a_system_in_steps_is_a_discrete_map():
+    system = dd.Dynamics.from_system(LinearSystem([[1, 0.1], [0, 1]], [[0], [0.1]], np.eye(2), [[0], [0]], 0.1))
+    assert isinstance(system, dd.optimize.DiscreteMap)
+    problem = dd.Problem(system, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=EFFORT)
+    A, B = np.array([[1, 0.1], [0, 1]]), np.array([[0], [0.1]])
+    reach = np.hstack([np.linalg.matrix_power(A, 19 - k) @ B for k in range(20)])
+    least = np.linalg.lstsq(reach, np.array([1.0, 0.0]), rcond=None)[0]  # the least norm
+    assert dd.solve(problem).cost == pytest.approx(least @ least, rel=1e-8)
+
+
+def test_the_limit_cycle_of_a_system_without_inputs():
+    """The period of the Van der Pol oscillator is 6.6632868593 at mu = 1 (Andersen and Geer, 1982)."""
+    system, angle = dd.Dynamics.from_system(VanDerPolOscillator()), np.linspace(0, 2 * np.pi, 61)
+    problem = dd.Problem(
+        system, x0=[2.0, 0.0], num_steps=60, horizon=(4.0, 9.0), couplings=[dd.optimize.Periodic()],
+        optimize=("initial_state",), initial_state_mask=[True, False],
+    )  # fmt: skip
+    circle = np.column_stack([2 * np.cos(angle), -2 * np.sin(angle)])
+    solution = dd.solve(problem, initial_guess=(circle, None, 6.0))
+    assert solution.success
+    assert solution.horizon == pytest.approx(6.6632868593, rel=1e-5)
+    assert dd.check_plan(problem, *solution.trajectory()).success
+    assert dd.check_plan(problem, solution.xs[solution.knots], horizon=solution.horizon).success
+    assert not dd.check_plan(problem, circle, horizon=solution.horizon).success
+
+
+def test_systems_without_such_dynamics_are_refused_by_name():
+    discrete = MultibodyPlant(0.01)
+    discrete.Finalize()
+    for given, words in (
+        ("pendulum", "a Drake System"),
+        (CompassGait(), "continuous and discrete states"),
+        (discrete, "load_model and model_from_diagram"),
+        (Slide_[None](False, 1.0), "rates that change in time"),
+        (LeafSystem(), "no state"),
+    ):
+        with pytest.raises(dd.exceptions.InputError, match=words):
+            dd.Dynamics.from_system(given)
+    with pytest.raises(dd.exceptions.UnknownNameError, match="did you mean 'elbow_torque'"):
+        dd.Dynamics.from_system(AcrobotPlant(), input_ports=["elbow_torqe"])
+
+
+def test_a_system_that_cannot_be_converted_is_refused():
+    class Plain(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareContinuousState(1)
+
+        def DoCalcTimeDerivatives(self, context, derivatives):
+            derivatives.get_mutable_vector().SetFromVector([1.0])
+
+    with pytest.raises(dd.exceptions.GradientError, match=r"define it as a LeafSystem_\[T\]"):
+        dd.Dynamics.from_system(Plain())
