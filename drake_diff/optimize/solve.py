@@ -29,14 +29,17 @@ from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Limits, Report
 from drake_diff.optimize.run import Run, closest_to, is_kept_apart, kept_apart
 from drake_diff.optimize.solution import PLANS, Search, Solution, Status, distinct
+from drake_diff.optimize.starts import search_cheaper
 from drake_diff.optimize.transcription.task import MAP, SCHEMES, OptimalControl, default_scheme
-from drake_diff.optimize.verification import advice, limits_of, near, not_in_steps, overlaps
+from drake_diff.optimize.verification import LOCAL, advice, limits_of, near, not_in_steps, overlaps
 
 COMPILED = 0.5  # [s] a longer compilation is reported
 DEFAULTS = Options()
 METHODS = ("auto", "collocation", "shooting", "ilqr")
 DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": "ipopt", "ilqr": "riccati"}
 OTHER_GUESS = "another first guess"
+OTHER_STARTS = {"method": "collocation", "reason": "other first guesses"}
+MOST_VERIFIED = 3  # of the cheaper motions from random guesses
 REFINING = 30  # iterations from a collocated plan to the optimum in discrete steps; well-posed problems take ten
 NOT_FOUND = (Status.INFEASIBLE, Status.ITERATION_LIMIT, Status.DIVERGED, Status.FAILED)
 BLIND = (Status.NO_GRADIENT, Status.DIVERGED)
@@ -59,7 +62,7 @@ def solve(  # type: ignore[misc]  # only this signature lists the keywords
     max_iterations: int = 500,
     time_limit: float | None = None,
     seed: int = 0,
-    restarts: int = 0,
+    restarts: int | None = None,
     options: Options | None = None,
     progress: bool | Progress = False,
     callback: Callable[[Iteration], None] | None = None,
@@ -87,7 +90,9 @@ def solve(  # type: ignore[misc]  # only this signature lists the keywords
         time_limit: [s] of the whole solve. Numba's compilation, once per machine, is excluded, and a note reports it.
         seed: the seed of the noise in a default guess, and of random initial guesses.
         restarts: the number of further initial guesses, smooth random ones by `seed`, all tried in turn even if a plan
-            is verified. The cheapest verified plan is returned, and `Solution.optima` has those that differ.
+            is verified. The cheapest verified plan is returned, and `Solution.optima` has those that differ. None: if
+            "auto" finds a collocated plan from its own guess, it searches from up to 12 such guesses, fewer if these
+            lead to the same cost, and verifies the cheapest motions. Their number depends on iterations, not on time.
         options: further options of the algorithms, an `optimize.Options`: schemes, tolerances, continuations through
             contact, refinement of meshes.
         progress: True prints a line a few times a second. A function is called with each line.
@@ -141,8 +146,8 @@ def solve(  # type: ignore[misc]  # only this signature lists the keywords
         "seed": int(seed),
         "options": chosen.to_dict(),
     }
-    if count("restarts", restarts, 0):
-        arguments["restarts"] = int(restarts)
+    if restarts is None or count("restarts", restarts, 0):
+        arguments["restarts"] = restarts
     asked = Attempt(method, "asked for", chosen, int(seed))
     report.asked = Search(arguments, initial_guess)
     compiled = uncounted()
@@ -177,7 +182,7 @@ def _solved(
     problem: Problem | PhasedProblem,
     asked: "Attempt",
     limits: Limits,
-    restarts: int,
+    restarts: int | None,
     report: Report,
     on_start: Callable[[], None] | None,
 ) -> Solution | PhasedSolution:
@@ -199,6 +204,8 @@ def _solved(
     solution = make()
     if restarts:
         solution = _restarted(task, asked, solution, restarts)
+    elif restarts is None and asked.method == "auto" and initial_guess is None:
+        solution = _from_other_starts(task, asked, solution)
     tried = {link["method"] for link in solution.options.get("chain", ())} | {solution.method}
     suggestion = advice(
         solution, arguments, [other for other in METHODS[1:] if other not in tried and _takes(problem, other)]
@@ -269,6 +276,7 @@ class _Task:
     report: Report
     on_start: Callable[[], None] | None
     start: float = field(default_factory=now)
+    collocated: list[Solution] = field(default_factory=list)  # plans that pass their own checks, unverified
     converted: list[Solution] = field(default_factory=list)  # solutions in steps from collocated plans
 
     @property
@@ -298,7 +306,7 @@ class _Task:
             )
         stages = () if continuation is None else check_schedule(problem, continuation)
         searched = kept_apart(problem) if attempt.apart else closest_to(problem, given) if attempt.closest else None
-        limits = self._limits_of(attempt)
+        limits = self.limits_of(attempt)
         options = {
             "max_iterations": limits.max_iterations,
             "time_limit": None if np.isinf(self.limits.time_limit) else self.limits.time_limit,
@@ -332,7 +340,7 @@ class _Task:
         """Return whether a search begins from a default guess. For phases, this depends on the user's guess only."""
         return (self.report.asked.guess if isinstance(self.problem, PhasedProblem) else given) is None
 
-    def _limits_of(self, attempt: Attempt) -> Limits:
+    def limits_of(self, attempt: Attempt) -> Limits:
         """Return the limits that remain for an attempt."""
         left = self.limits.time_limit - (now() - self.start)
         most = min(attempt.max_iterations or self.limits.max_iterations, self.limits.max_iterations)
@@ -366,19 +374,10 @@ def _attempted(task: _Task, asked: Attempt, given: Any, chain: list[dict[str, st
         if solutions and task.is_late:
             chain.append({**attempt.told(in_phases), "ended": "not begun: time limit"})
             break
-        rows: list[dict[str, str]] = []
-
-        def convert(plan: Solution, rows: list[dict[str, str]] = rows) -> Solution | None:
-            """Solve in steps before the plan's replays and finer meshes, which take longer and are often not needed."""
-            if rows:
-                return None
-            _convert(task, _shooting(asked), plan, rows)
-            last = task.converted[-1] if task.converted else None
-            return last if last is not None and last.status in (Status.CONVERGED, Status.INTERRUPTED) else None
-
         early = asked.method == "auto" and attempt.method == "collocation" and not in_phases
+        rows: list[dict[str, str]] = []
         try:
-            make = task.prepare(attempt, guess, convert if early and _has_steps(task.problem) else None)
+            make = task.prepare(attempt, guess, _conversion(task, asked, rows) if early else None)
         except DrakeDiffError as error:
             if not solutions:
                 raise
@@ -395,6 +394,25 @@ def _attempted(task: _Task, asked: Attempt, given: Any, chain: list[dict[str, st
         if last.status in ENDED:
             break
     return solutions
+
+
+def _conversion(
+    task: _Task, asked: Attempt, rows: list[dict[str, str]]
+) -> Callable[[Solution], Solution | None] | None:
+    """Return a function that solves in steps from a collocated plan, or None if the problem has no steps.
+
+    This comes before the plan's replays and finer meshes, which take longer and are often not needed.
+    """
+
+    def convert(plan: Solution) -> Solution | None:
+        if rows:
+            return None
+        task.collocated.append(plan)
+        _convert(task, _shooting(asked), plan, rows)
+        last = task.converted[-1] if task.converted else None
+        return last if last is not None and last.status in (Status.CONVERGED, Status.INTERRUPTED) else None
+
+    return convert if _has_steps(task.problem) else None
 
 
 def _in_steps(task: _Task, asked: Attempt, plan: Solution, chain: list[dict[str, str]]) -> Solution:
@@ -491,6 +509,27 @@ def _restarted(task: _Task, asked: Attempt, first: Solution, restarts: int) -> S
     costs = ", ".join(f"{optimum.solution.cost:.4g} ({optimum.count})" for optimum in optima)
     verified = sum(optimum.count for optimum in optima)
     return best.noted(f"{verified} of {len(attempts)} first guesses were verified, at cost (how many): {costs}")
+
+
+def _from_other_starts(task: _Task, asked: Attempt, first: Solution) -> Solution:
+    """Return a verified plan that is cheaper than `first`, from a few random guesses, or else `first` with a note."""
+    plan = task.collocated[-1] if task.collocated else first
+    if plan.transcribed is None or first.status not in PLANS or not task.problem.has_cost or task.is_late:
+        return first
+    starts = search_cheaper(plan, asked.seed, lambda: task.limits_of(asked), task.report)
+    chain = [*first.options.get("chain", ()), {**OTHER_STARTS, "ended": str(starts)}]
+    best = first
+    for guess in starts.cheaper[:MOST_VERIFIED]:
+        if (best.success and best is not first) or task.is_late or starts.ended:
+            break
+        task.converted.clear()
+        attempt, rows = asked.by("collocation", f"a cheaper motion, {guess.message}"), list[dict[str, str]]()
+        solution = task.prepare(attempt, guess, _conversion(task, asked, rows))()
+        chain += [{**attempt.told(False), "ended": solution.status.value}, *rows]
+        best = min((best, _in_steps(task, asked, solution, chain)), key=_preference)
+    note = f"{LOCAL}: {starts}{', not verified' if starts.cheaper and best is first else ''}"
+    best = best.told(options=best.options | {"chain": chain})
+    return best.noted(note) if best.success else best
 
 
 def _preference(solution: Solution) -> tuple[int, float, float]:

@@ -24,6 +24,7 @@ SHORTER = "take a smaller time step"
 _ALIKE = ("ITERATION_LIMIT", "TIME_LIMIT", "INFEASIBLE", "INTERRUPTED", "DIVERGED", "NO_GRADIENT", "FAILED")
 # The solver stopped before it met its own tolerance, and independent measures decide whether the plan is a solution.
 NEAR = "a motion near the collocated optimum, but not an optimum in these steps"
+LOCAL = "a local optimum"
 DEARER = 0.25  # of a plan's cost; motions near plans of the task benchmark cost up to 15 % more in coarse steps
 STOPPED = (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.NO_GRADIENT, Outcome.FAILED)
 ON_A_BOUND = 1e-6  # relative distance of a horizon from its bound, below which it counts as on the bound
@@ -204,7 +205,7 @@ def ended(draft: Any, status: Status, *sentences: str, **fields: Any) -> Any:
     return draft.told(status=status, message=message, notes=(*cut, *others), **fields)
 
 
-def limits_of(solution: Solution, restarts: int) -> Iterator[str]:
+def limits_of(solution: Solution, restarts: int | None) -> Iterator[str]:
     """Yield the limitations of a verified plan: a horizon on its bound, unlimited inputs, a single initial guess."""
     problem = solution.problem
     if not solution.success or isinstance(problem, PhasedProblem):
@@ -217,11 +218,10 @@ def limits_of(solution: Solution, restarts: int) -> Iterator[str]:
         free = [n for n, *sides in zip(problem.input_names, b.u_lower, b.u_upper, strict=True) if np.isinf(sides).any()]
         if isinstance(problem.running_cost, ConstantCost) and free:
             yield f"the least time of inputs without limits: {messages.joined(free)}"
-    costs = problem.total_running_cost, problem.total_final_cost, problem.trajectory_cost, problem.parameter_cost
-    if all(cost is None for cost in costs):
+    if not problem.has_cost:
         yield "not an optimum: the problem has no cost"
-    elif not restarts and NEAR not in solution.notes:
-        yield "a local optimum: no other first guess was tried (restarts=0)"
+    elif not restarts and not any(LOCAL in note or note == NEAR for note in solution.notes):
+        yield f"{LOCAL}: no other first guess was tried (restarts=0)"
 
 
 def advice(solution: Solution, arguments: dict[str, Any], other_methods: Sequence[str]) -> str:

@@ -303,7 +303,8 @@ def solve_again(record: PlanRecord, recorded: Solution, plan: dict[str, Array]) 
         chosen = Options.from_dict({name: value for name, value in options.items() if name not in REMOVED})
         limit, guess = arguments.pop("time_limit"), _rebuild_guess(recorded.problem, kind, plan)
         limit = None if limit is None else positive_float("time_limit [s]", limit)
-        solution: Solution = solve(recorded.problem, initial_guess=guess, options=chosen, **arguments)
+        repeated = {"restarts": 0, **arguments}  # older records lack the default of their time
+        solution: Solution = solve(recorded.problem, initial_guess=guess, options=chosen, **repeated)
     asked = {**arguments, "options": options, "time_limit": limit}
     given = {"time_limit": limit} if "time_limit" in solution.options else {}
     return solution.told(options=solution.options | given, search=Search(asked, guess))

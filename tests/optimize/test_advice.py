@@ -71,7 +71,7 @@ def test_what_limits_a_verified_plan_is_noted():
     ends = {"x0": [0, 0], "x_goal": [1, 0], "num_steps": 10}
     longest = dd.solve(dd.Problem(block, **ends, horizon=(0.5, 2.0), running_cost=dd.QuadraticCost(R=[[1.0]])))
     assert "the horizon is on its bound of 2 s" in longest.notes  # the effort 12 d^2 / T^3 falls with T
-    shortest = dd.solve(dd.Problem(block, **ends, horizon=(0.5, 2.0), running_cost=1.0))
+    shortest = dd.solve(dd.Problem(block, **ends, horizon=(0.5, 2.0), running_cost=1.0), restarts=0)
     assert shortest.notes[:2] == ("the horizon is on its bound of 0.5 s", "the least time of inputs without limits: u0")
     assert "a local optimum: no other first guess was tried (restarts=0)" in shortest.notes
     assert dd.solve(dd.Problem(block, **ends, horizon=1.0)).notes == ("not an optimum: the problem has no cost",)

@@ -59,7 +59,7 @@ def test_balls_that_met_pass_each_other(crossing):
 
 
 def test_balls_that_do_not_meet_are_left_alone(crossing):
-    solution = dd.solve(crossing(height=0.5))
+    solution = dd.solve(crossing(height=0.5), restarts=0)
     assert solution.success, solution.message
     assert [link["method"] for link in solution.options["chain"]] == ["collocation", "shooting"]
 

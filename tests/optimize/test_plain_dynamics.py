@@ -159,7 +159,7 @@ def test_where_a_finer_mesh_fails_the_last_motion_is_kept(monkeypatch, refine):
     """The first mesh is solved, and every finer one is made to fail."""
     swing = dd.Dynamics(lambda x, u: [x[1], u[0] - 10 * np.sin(x[0])], nx=2, nu=1)
     problem = dd.Problem(swing, x0=[0, 0], x_goal=[np.pi, 0], num_steps=4, horizon=2.0, running_cost=EFFORT)
-    coarse = dd.solve(problem, options=Options(refine=False))
+    coarse = dd.solve(problem, options=Options(refine=False), restarts=0)
     honest = Transcription._solve_on
 
     def fails_later(outcome):

@@ -265,7 +265,7 @@ def test_auto_goes_on_from_what_a_failed_attempt_left(load, monkeypatch):
 
     monkeypatch.setattr(Run, "collocate", fail_once)
     problem = pendulum(load, running_cost=EFFORT, x_goal=[np.pi, 0])
-    solution = dd.solve(problem, options=Options(other_guesses=0))
+    solution = dd.solve(problem, options=Options(other_guesses=0), restarts=0)
     assert solution.success, solution.message
     assert [link["method"] for link in solution.options["chain"]] == ["collocation", "shooting", "ilqr"]
     assert solution.options["chain"][2]["reason"] == "collocation was not verified: a guess for it"

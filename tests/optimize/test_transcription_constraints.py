@@ -102,11 +102,11 @@ def test_a_given_first_state_need_not_keep_a_constraint():
 @each_row(
     "constraint, message",
     [
-        (3, "constraints: expected a Constraint or several, got int"),
-        ([3], "constraints: expected a Constraint or several, got int"),
+        (3, "constraints: expected a Constraint or several, such as .*, got int"),
+        ([3], "constraints: expected a Constraint or several, such as .*, got int"),
         (
             dd.optimize.Periodic(),
-            "constraints: expected a Constraint or several; pass a coupling as couplings=, got Periodic",
+            "constraints: expected a Constraint or several, such as .*; pass a coupling as couplings=, got Periodic",
         ),
         (dd.Constraint(lambda x: x[5], upper=1), "constraint .* got IndexError"),
         (dd.Constraint(lambda x: x, upper=[1, 2, 3]), "constraint .* expected 3, one per bound, got 2 values"),

@@ -616,6 +616,12 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         """
         return float(np.sum(self.cost_terms(xs, inputs, time_step)))
 
+    @property
+    def has_cost(self) -> bool:
+        """Whether the problem has a cost, also of weighted goals."""
+        costs = self.total_running_cost, self.total_final_cost, self.trajectory_cost, self.parameter_cost
+        return any(cost is not None for cost in costs)
+
     def least_cost(self, x0: Array, time_step: float) -> float:
         """Return a millionth of the cost of resting at `x0` (nx,) under inputs of 0. Smaller costs count as zero."""
         return STILL * abs(

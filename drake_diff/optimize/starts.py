@@ -1,0 +1,80 @@
+"""Searches from a few random initial guesses, without verification, for motions that are cheaper than a plan."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drake_diff.optimize.guess import another_guess
+from drake_diff.optimize.program import Limits, Outcome, Report
+from drake_diff.optimize.run import arrays_of
+from drake_diff.optimize.solution import Solution, Status
+from drake_diff.optimize.transcription.collocation import FOUND, Transcription
+
+MOST_STARTS, FEWEST_STARTS = 12, 3  # if the first few all lead to the plan's cost, the others are not tried
+# Of all starts together, times the knots' states and inputs, so that they take about as long for robots as for small
+# systems, and of one start. A search that needs more iterations rarely ends at a cheaper motion.
+MOST_ITERATIONS, MOST_OF_A_START, SIZED_ITERATIONS = 600, 100, 200_000
+CHEAPER = 0.01  # fraction of the cost: smaller differences may be due to the mesh or the steps
+ENDED_BY_THE_USER = (Outcome.INTERRUPTED, Outcome.TIME_LIMIT)
+
+
+@dataclass(frozen=True, eq=False)
+class Starts:
+    """Motions of different costs that are cheaper than a plan, as initial guesses, the cheapest first.
+
+    `starts` and `iterations` count the effort. `ended` tells whether a signal or the time limit ended the search.
+    """
+
+    cheaper: tuple[Solution, ...]
+    starts: int
+    iterations: int
+    ended: bool
+
+    def __str__(self) -> str:
+        tried = f"{self.starts} random first guesses in {self.iterations} iterations"
+        costs = ", ".join(f"{_cost(motion):.4g}" for motion in self.cheaper)
+        return f"{tried} led to {f'cheaper motions, at cost {costs}' if costs else 'no cheaper motion'}"
+
+
+def search_cheaper(plan: Solution, seed: int, limits: Callable[[], Limits], report: Report | None) -> Starts:
+    """Search from random guesses by `seed` for motions that cost less than a collocated `plan`.
+
+    The number of starts depends on iterations alone, so that the same seed gives the same result on all machines.
+    """
+    problem, first = plan.problem, _cost(plan)
+    size = problem.num_steps * (problem.nx + problem.nu)
+    most = min(MOST_ITERATIONS, SIZED_ITERATIONS // size)
+    transcription = Transcription(problem, plan.scheme)
+    scale = max(abs(first), problem.least_cost(plan.xs[0], plan.time_step))
+    motions: list[Solution] = []
+    used, number, alike, ended = 0, 0, True, False
+    while number < MOST_STARTS and used < most and not (number >= FEWEST_STARTS and alike) and not ended:
+        number += 1
+        xs, us, *horizon = another_guess(problem, seed, number)
+        guess = transcription.begin(0, (xs, us), horizon=horizon[0] if horizon else None)
+        few = replace(limits(), max_iterations=min(MOST_OF_A_START, most - used, limits().max_iterations))
+        motion = transcription.solve([guess], limits=few, report=None)
+        used += len(motion.result.iterations)
+        ended = motion.result.outcome in ENDED_BY_THE_USER
+        if motion.result.outcome not in FOUND:
+            alike = False
+            continue
+        phase = motion.phases[0]
+        fields = {"scheme": plan.scheme, "multipliers": motion.result.multipliers, **arrays_of(phase)}
+        by = problem, "collocation", "ipopt", Status.FAILED, f"random {number} of seed {seed}"
+        motions.append(Solution(*by, phase.xs, phase.us[:-1], **fields))
+        alike = alike and abs(phase.quadrature - first) <= CHEAPER * scale
+        if report is not None:
+            report.say(f"random first guess {number}: cost {phase.quadrature:.6g}")
+    cheaper: list[Solution] = []
+    for candidate in sorted(motions, key=_cost):  # a plan of each cost
+        last = _cost(cheaper[-1]) if cheaper else -np.inf
+        if last + CHEAPER * scale < _cost(candidate) < first - CHEAPER * scale:
+            cheaper.append(candidate)
+    return Starts(tuple(cheaper), number, used, ended)
+
+
+def _cost(plan: Solution) -> float:
+    """Return the cost by the scheme's quadrature, which the search minimizes."""
+    return np.inf if plan.transcribed is None else plan.transcribed.quadrature
