@@ -31,6 +31,7 @@ from drake_diff.identification.unknowns import (
     numbers_at,
     set_numbers,
 )
+from drake_diff.mechanics.coordinates import euler_jacobian, euler_step
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameter, ParameterVector, applied, select
 from drake_diff.model.step import advance
@@ -241,9 +242,11 @@ class TreeMotion:
         xs[:, 0] = starts
         for m in range(hs.shape[1]):
             xs[:, m + 1], some = xs[:, m], hs[:, m] > 0
-            steps = xs[some, m], hs[some, m], us[some, m]
-            xs[some, m + 1] = step_with_friction(dynamics, *steps)[0] if self.dry else dynamics.step(*steps)
+            xs[some, m + 1] = self._step(dynamics, xs[some, m], hs[some, m], us[some, m])
         return xs
+
+    def _step(self, dynamics: TreeDynamics, x: Array, h: Array, u: Array) -> Array:
+        return step_with_friction(dynamics, x, h, u)[0] if self.dry else dynamics.step(x, h, u)
 
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
         """Return the derivatives of each step with respect to the state (K, M, nx, nx) and to z (K, M, nx, np)."""
@@ -253,10 +256,12 @@ class TreeMotion:
         total[:, :, :nx] = np.eye(nx)
         steps = np.flatnonzero(h > 0)
         for rows in np.split(steps, range(CHUNK, len(steps), CHUNK)):
-            points = x[rows], h[rows], u[rows], by
-            total[rows] = friction_jacobians(dynamics, *points) if self.dry else dynamics.step_jacobians(*points)
+            total[rows] = self._jacobians(dynamics, x[rows], h[rows], u[rows], by)
         total = total.reshape(*hs.shape, nx, -1)
         return total[..., :nx], total[..., nx:]
+
+    def _jacobians(self, dynamics: TreeDynamics, x: Array, h: Array, u: Array, by: Array) -> Array:
+        return friction_jacobians(dynamics, x, h, u, by) if self.dry else dynamics.step_jacobians(x, h, u, by)
 
     def by(self, z: Array) -> Array:
         """Return the derivatives (count, np) of the tree's numbers with respect to z."""
@@ -293,29 +298,19 @@ class EulerMotion(TreeMotion):
         numbers = dynamics.numbers
         return replace(dynamics, numbers=replace(numbers, reflected=numbers.reflected + self.longest * numbers.damping))
 
-    def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
-        """Return the states (K, M+1, nx) from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
-        dynamics, nq = self.dynamics(values), self.model.nq
-        xs = np.empty((len(starts), hs.shape[1] + 1, starts.shape[1]))
-        xs[:, 0] = starts
-        for m in range(hs.shape[1]):
-            h, x = hs[:, m, None], xs[:, m]
-            after = x[:, nq:] + h * dynamics.accelerate(x, us[:, m])
-            xs[:, m + 1] = np.concatenate([x[:, :nq] + h * after, after], axis=1)
-        return xs
+    def by(self, z: Array) -> Array:
+        """Return the derivatives (count, np) of the tree's numbers with respect to z."""
+        by, places = super().by(z), self.tree.numbers.places
+        by[places("reflected")] += self.longest * by[places("damping")]
+        return by
 
-    def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
-        """Return the derivatives of each step with respect to the state (K, M, nx, nx) and to z (K, M, nx, np)."""
-        dynamics, by, nx, nq = self.dynamics(self.unknowns.values(z)), self.by(z), xs.shape[2], self.model.nq
-        by[dynamics.numbers.places("reflected")] += self.longest * by[dynamics.numbers.places("damping")]
-        x, u, h = xs[:, :-1].reshape(-1, nx), us.reshape(hs.size, -1), hs.reshape(-1, 1, 1)
-        jacobians = np.zeros((hs.size, nx, nx + by.shape[1]))
-        jacobians[:, nq:] = h * dynamics.acceleration_jacobians(x, u, by)[1]
-        jacobians[:, nq:, nq:nx] += np.eye(nx - nq)
-        jacobians[:, :nq] = h * jacobians[:, nq:]
-        jacobians[:, :nq, :nq] += np.eye(nq)
-        jacobians = jacobians.reshape(*hs.shape, nx, -1)
-        return jacobians[..., :nx], jacobians[..., nx:]
+    def _step(self, dynamics: TreeDynamics, x: Array, h: Array, u: Array) -> Array:
+        return euler_step(self.tree.coordinates, self.longest, x, dynamics.accelerate(x, u))
+
+    def _jacobians(self, dynamics: TreeDynamics, x: Array, h: Array, u: Array, by: Array) -> Array:
+        a, by_state = dynamics.acceleration_jacobians(x, u, by)
+        x_next = euler_step(self.tree.coordinates, self.longest, x, a)
+        return euler_jacobian(self.tree.coordinates, self.longest, x, x_next, by_state)
 
 
 @dataclass(frozen=True, eq=False)
