@@ -363,8 +363,7 @@ class _Design:
             raise ModelError(f"{self.model.name}: no random motion from x0 is within the limits and avoids contact")
         Rs = self.informed(*self.planned(self.rough, np.array(starts), self.few)[:2], self.few)
         norms = np.median([np.linalg.norm(R, axis=0) for R in Rs], axis=0)
-        widths = self.unknowns.widths
-        scale = np.where(np.isfinite(widths), widths / FAR, 1 / np.where(norms > 0, norms, 1.0))
+        scale = self.unknowns.scales(norms, FAR) / FAR
         order = np.argsort([-self.worth(R, scale) for R in Rs], kind="stable")
         tried = self.searched(starts[order[0]], scale, most) if most else []
         best = next((motion for motion in map(self.feasible, [*tried, *(starts[i] for i in order)]) if motion), None)
@@ -518,19 +517,19 @@ def base_parameters(model: Model, bodies: Sequence[str] | None = None) -> tuple[
     tree = tree_for_identification(model)
     if isinstance(tree, Refusal):
         raise ModelError(f"{model.name}: motion in continuous time is not supported: {tree}")
-    carried = [body for body in tree.bodies if tree.placed[body][0] >= 0]
+    carried = [body for body in tree.bodies if tree.on[body][0] >= 0]
     known = [body for body in carried if tree.bodies[body].mass > 0]
     wanted = known if bodies is None else list(bodies)
     for body in wanted:
         if body not in known:
             raise UnknownNameError("moving body with a mass", got=body, known=known)
-    wanted.sort(key=lambda body: tree.placed[body][0])
+    wanted.sort(key=lambda body: tree.on[body][0])
     effects, names, units, values = [], [], [], []
     of_links = _effects(model, tree, len(wanted))
     for body in wanted:
         link = tree.bodies[body]
         numbers = numbers_of(link)
-        effect = of_links[tree.placed[body][0]] @ tree.moved_by[body]
+        effect = of_links[tree.on[body][0]] @ tree.moved_by[body]
         for j in ORDER:
             effects.append(effect[:, j])
             names.append(f"{body}.{NAMES[j]}")

@@ -84,9 +84,9 @@ def _sensor(model: Model, tree: Tree, label: str, quantity: str, mounted: Any) -
     body, turn, point = label, np.eye(3), np.zeros(3)
     if mounted is not None:
         body, turn, point = _mounted(label, mounted)
-    if body not in tree.placed:
+    if body not in tree.on:
         raise UnknownNameError(f"body of sensor {label}", got=body, known=list(labelled(bodies(model.plant))))
-    index, pose = tree.placed[body]
+    index, pose = tree.on[body]
     if index < 0:
         raise InputError(
             f"sensor {label}", got=f"on {body}, which is fixed to the world", expected="a sensor on a moving body"
@@ -158,7 +158,7 @@ class Sensors:
     def _forces(self, dynamics: TreeDynamics) -> list[tuple[int, int]]:
         """Return (column, degree of freedom) of each force."""
         forces = (sensor for sensor in self.each if sensor.quantity == FORCE)
-        return [(self.columns.index(f"{s.label}.{FORCE}"), int(dynamics.tree.first[s.link])) for s in forces]
+        return [(self.columns.index(f"{s.label}.{FORCE}"), dynamics.tree.links[s.link].joint.v_start) for s in forces]
 
     def _of_links(self, dynamics: TreeDynamics, q: Array, v: Array, a: Array) -> Array:
         """Return the readings (N, m), with 0 for forces."""

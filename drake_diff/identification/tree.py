@@ -23,10 +23,9 @@ from drake_diff._base.values import Refusal
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.coordinates import Coordinates
 from drake_diff.mechanics.description import Link, RigidLink, coordinates_of, read_links, springs_of
-from drake_diff.mechanics.tree import CompiledTree, Moved, compile_links, tree_of
+from drake_diff.mechanics.tree import CompiledTree, Moved, TreeModel, compile_links, tree_of
 from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators
-from drake_diff.model.repairs import JointCoupling
 
 KERNEL = "drake_diff.identification.kernel"
 INERTIA = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # xx yy zz xy xz yz
@@ -86,38 +85,24 @@ class Numbers:
 
 
 @dataclass(frozen=True, eq=False)
-class Tree:
-    """The tree of a model, with its structure, which does not depend on parameters."""
+class Tree(TreeModel):
+    """The tree of a model, with its own numbers and what does not depend on parameters; `compiled` has no welds."""
 
-    links: tuple[RigidLink, ...]  # parents first
-    compiled: CompiledTree  # of the moving links
     coordinates: Coordinates  # of the independent joints
-    coupling: JointCoupling | None  # of mimic joints
-    n: int  # degrees of freedom of all joints
     actuation: Array  # (n, nu)
-    placed: Mapping[str, tuple[int, Any]]  # by body: the index of its link, and its pose in the link's frame
     moved_by: Mapping[str, Array]  # (10, 10) by body: the map of its ten numbers to the frame of its link
     bodies: Mapping[str, Link]
     numbers: Numbers  # the model's own
 
     @property
-    def first(self) -> Indices:
-        """The first degree of freedom (L,) of each link."""
-        return np.array([link.joint.v_start for link in self.links], dtype=np.intp)
+    def n(self) -> int:
+        """The degrees of freedom of all joints."""
+        return len(self.damping)
 
     @cached_property
     def spread(self) -> Array:
         """The matrix (n, nv) from independent velocities to those of all joints."""
         return np.eye(self.n) if self.coupling is None else np.asarray(self.coupling.spread, dtype=float)
-
-    @cached_property
-    def springs(self) -> Indices:
-        """The index (n,) in q of each degree of freedom's position."""
-        positions = np.zeros(self.n, dtype=np.int64)
-        for link in self.links:
-            if not link.free:
-                positions[link.joint.v_start] = link.joint.q_start
-        return positions
 
     def joint_positions(self, q: Array) -> Array:
         """Return the positions of all joints for q (N, nq) of the independent ones."""
@@ -173,7 +158,7 @@ class TreeDynamics:
         if coupling is not None:
             follow = (coupling.of_q, coupling.ratio_q, coupling.offset)
         numbers = (getattr(self.numbers, name) for name in OF_JOINTS)
-        arrays = (*follow, tree.spread, *reversed(tree.coordinates.starts), tree.springs, *numbers)
+        arrays = (*follow, tree.spread, *reversed(tree.coordinates.starts), tree.positions, *numbers)
         return kernel(KERNEL).TreeSystem(self.links.tables, *map(_array, arrays), 0.0 if self.dry else SLIP_SPEED)
 
     def _push(self, u: Array) -> Array:
@@ -261,7 +246,7 @@ class TreeDynamics:
         if not self.dry:
             slide = np.tanh(v / SLIP_SPEED)
             jacobians[:, diagonal, n + diagonal] += numbers.coulomb / SLIP_SPEED * (1 - slide**2)
-        terms = (a @ E.T, v, q[:, tree.springs] - numbers.rest, -numbers.stiffness, slide)
+        terms = (a @ E.T, v, q[:, tree.positions] - numbers.rest, -numbers.stiffness, slide)
         for name, term in zip(OF_JOINTS, terms, strict=True):
             jacobians[..., 2 * n :] += np.broadcast_to(term, v.shape)[..., None] * by[places(name)]
         cut = np.clip(u, -numbers.limit, numbers.limit)
@@ -406,25 +391,20 @@ def tree_for_identification(model: Model) -> Tree | Refusal:
         return dynamics
     if isinstance(springs, Refusal):
         return springs
-    bodies, links, placed = read_links(model.plant, springs), dynamics.links, dynamics.on
+    bodies, links = read_links(model.plant, springs), dynamics.links
     if any(link.stiffness != 0 and link.kind == "quaternion_floating" for link in bodies):
         raise ModelError("a free body has a spring")
-    n, inertial = len(dynamics.damping), np.zeros((len(links), 10))
-    for link in bodies:
-        index, pose = placed[link.body]
-        if index >= 0:
-            inertial[index] += _moved_by(pose) @ numbers_of(link)
     motors = actuators(model.plant)
     limits = model.inputs.of_actuators([actuator.effort_limit() for actuator in motors])
     numbers = Numbers(
-        inertial=inertial,
+        inertial=np.array([numbers_of(link) for link in links]).reshape(-1, 10),
         offset=np.array([link.on_parent.translation() for link in links]).reshape(-1, 3),
         gravity=dynamics.gravity,
         damping=dynamics.damping,
         reflected=dynamics.reflected,
         stiffness=dynamics.stiffness,
         rest=dynamics.rest,
-        coulomb=np.zeros(n),
+        coulomb=np.zeros(len(dynamics.damping)),
         strength=np.ones(model.nu),
         limit=np.asarray(limits, dtype=float),
     )
@@ -436,18 +416,14 @@ def tree_for_identification(model: Model) -> Tree | Refusal:
         )
         for link in links
     ]  # fmt: skip
-    compiled = compile_links(rigid, dynamics.gravity, n)
+    compiled = compile_links(rigid, dynamics.gravity, len(dynamics.damping))
     if compiled is None:
         return Refusal("a free body is not joined to the world by its own frame")
     return Tree(
-        links=links,
-        compiled=compiled,
+        **{**vars(dynamics), "compiled": compiled},
         coordinates=coordinates_of(model),
-        coupling=model.coupling,
-        n=n,
         actuation=model.inputs.of_actuators(np.asarray(model.plant.MakeActuationMatrix()).T[: len(motors)]).T,
-        placed=placed,
-        moved_by={body: _moved_by(pose) for body, (_, pose) in placed.items()},
+        moved_by={body: _moved_by(pose) for body, (_, pose) in dynamics.on.items()},
         bodies={link.body: link for link in bodies},
         numbers=numbers,
     )
@@ -460,8 +436,8 @@ def ten_numbers(mass: Any, center: Any, inertia: Any) -> Any:
     return np.array([mass, *(mass * c for c in center), *(i + mass * s for i, s in zip(inertia, about, strict=True))])
 
 
-def numbers_of(link: Link) -> Array:
-    """Return the ten numbers of a body in its own frame."""
+def numbers_of(link: Link | RigidLink) -> Array:
+    """Return the ten numbers of a body in its own frame, or of a link with its welded bodies in the link's frame."""
     return np.asarray(ten_numbers(link.mass, link.center_of_mass, link.inertia[tuple(np.transpose(INERTIA))]))
 
 

@@ -121,6 +121,11 @@ class Unknowns:
             widths[s] = 1.0 if relative else unknown.size or np.inf
         return FAR * widths
 
+    def scales(self, norms: Array, size: float) -> Array:
+        """Return the widths (np,), or `size` divided by the norms (np,) of a Jacobian's columns without a width."""
+        widths = self.widths
+        return np.where(np.isfinite(widths), widths, size / np.where(norms > 0, norms, 1.0))
+
     @property
     def pulls(self) -> Array:
         """The widths (np,), but infinite for unknowns with a prior."""
@@ -328,7 +333,7 @@ def _why_not(model: Model, tree: Tree | None, name: str, value: Array) -> str | 
         return "a body without mass"
     if quantity == INERTIA and room_of_inertia(value) <= 0:
         return "the inertia of a point or a rod"
-    if tree is not None and quantity in (MASS, CENTER, INERTIA) and tree.placed[label][0] < 0:
+    if tree is not None and quantity in (MASS, CENTER, INERTIA) and tree.on[label][0] < 0:
         return "a body that is fixed to the world"
     return None
 
@@ -386,7 +391,7 @@ def set_numbers(model: Model, tree: Tree, unknowns: Unknowns, values: Any) -> Nu
         if quantity in OF_JOINTS:
             arrays[OF_JOINTS[quantity]][by_joint[label].v_start] = value
         elif quantity == "offset":
-            pose = tree.placed[by_joint[label].parent][1]
+            pose = tree.on[by_joint[label].parent][1]
             arrays["offset"][indices[label]] = pose.rotation().matrix() @ value + pose.translation()
         elif quantity == "gravity":
             arrays["gravity"][:] = value
@@ -401,7 +406,7 @@ def _set_bodies(tree: Tree, given: dict[str, Any], inertial: Any, *, as_in_files
     for label in dict.fromkeys(n.rsplit(".", 1)[0] for n in given if n.rsplit(".", 1)[1] in (MASS, CENTER, INERTIA)):
         before = ten_numbers(*_central(tree, label, {}))
         after = ten_numbers(*_central(tree, label, given, as_in_files=as_in_files))
-        inertial[tree.placed[label][0]] += tree.moved_by[label] @ (after - before)
+        inertial[tree.on[label][0]] += tree.moved_by[label] @ (after - before)
 
 
 def _set_rotors(model: Model, by_joint: dict[str, Any], given: dict[str, Any], reflected: Any) -> None:

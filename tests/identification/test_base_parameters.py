@@ -42,7 +42,7 @@ def test_numbers_that_leave_the_sums_leave_the_motion(name, count):
     if count is not None:
         assert len(found) == count
     tree = tree_for_identification(model)
-    bodies = [body for body, link in tree.bodies.items() if tree.placed[body][0] >= 0 and link.mass > 0]
+    bodies = [body for body, link in tree.bodies.items() if tree.on[body][0] >= 0 and link.mass > 0]
     columns = [f"{body}.{name}" for body in bodies for name in NAMES]
     sums = np.array([[b.parts.get(column, 0.0) for column in columns] for b in found])
     _, s, V = np.linalg.svd(sums)
