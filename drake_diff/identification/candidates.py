@@ -16,11 +16,12 @@ from scipy import stats
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import SimulationError
-from drake_diff.identification.fit import Fit, FittedMotion, Reduced, Solved
+from drake_diff.identification.fit import Fit, Reduced, Solved
 from drake_diff.identification.identify import Problem
 from drake_diff.identification.judge import (
     HOPELESS,
     freedom_of,
+    freedoms_of,
     intervals_of,
     known_of,
     likelihood_of,
@@ -175,12 +176,12 @@ DELAYS = (0.25, 0.75, 1.5, 3, 5.5, 8)  # in sample periods: initial guesses of a
 LEVELS = (0.85, 0.6, 0.35)  # fractions of an input's largest value: initial guesses of its limit
 CUT = 0.6  # fraction of an input's largest value at which its limit is linearized
 PARTS = (1, 2, 4, 5, 10, 20)  # numbers of Euler steps per sample that are tried
-SETTLING, SETTLES = 8, 0.8  # maximum number of refinement steps of segment starts; required ratio of successive losses
+SETTLING = 3  # maximum number of refinement steps of segment starts
 PLAUSIBLE = 1.5  # times the largest loss of pure noise: a candidate above it is not fitted fully if another one is
 STEPS, ROUNDS = 8, 4  # maximum numbers of Gauss-Newton steps, and of rounds of noise estimation
 SAME_NOISE = 0.03  # relative tolerance; the error changes a score by less than 0.001 times the number of measurements
 LOOKED_AT = 8  # maximum number of candidates that take steps: of one parameter, and also of several
-RACE = (5, 4, 3, 2, 2, 1)  # number of candidates that remain after each Gauss-Newton step
+RACE = 5  # number of candidates far above the noise that take more than one step
 FALLS = 0.7  # a candidate is dropped if a step after its first does not reduce the loss by this factor
 HALVED = 3  # maximum number of halvings of the integration step if a change makes the motion stiff
 CLOSE = 1.0  # decrease of the loss below which no further step is taken before candidates are compared
@@ -229,13 +230,9 @@ class View:
 
     def __init__(self, fit: Fit, unknowns: Unknowns, z: Array, starts: Array, reduced: Reduced):
         self.fit, self.unknowns, self.z, self.starts, self.reduced = fit, unknowns, z, starts, reduced
-        finite = np.isfinite(unknowns.widths)
-        pull = np.where(finite, unknowns.widths, np.inf) ** -2.0  # weak regularization towards the file's values
+        pull = unknowns.widths**-2.0  # weak regularization towards the file's values
         offset = unknowns.z_start - z
-        norms = np.linalg.norm(reduced.R, axis=0)
-        scale = np.where(finite, unknowns.widths, 1e6 / np.where(norms > 0, norms, 1.0))
-        sizes = [np.linalg.svd(reduced.R[:, s] * scale[s], compute_uv=False) for s in unknowns.slices]
-        self.freedoms = tuple(float(np.sum(size**2 / (1 + size**2))) for size in sizes)
+        self.freedoms = freedoms_of(unknowns, reduced.R, unknowns.slices)
         self.matrix = reduced.R.T @ reduced.R + np.diag(pull)
         self.right = reduced.R.T @ reduced.b + pull * offset
         self.most = reduced.rest + float(reduced.b @ reduced.b + np.sum(pull * offset**2))  # loss without a change
@@ -266,7 +263,7 @@ class View:
         dz = np.zeros_like(self.z)
         columns = [range(s.start, s.stop) for s in (self.unknowns.slices[i] for i in promise.members)]
         dz[[column for entries in columns for column in entries]] = promise.step
-        far = np.where(np.isfinite(self.unknowns.widths), self.unknowns.widths / 3, np.inf)
+        far = self.unknowns.widths / 3
         dz = np.clip(dz, -far, far)
         return self.z + dz, self.fit.moved(self.starts, self.reduced, dz, 1.0)
 
@@ -292,6 +289,7 @@ class Runner:
             self.fit = self.fit.by(shorter)
             reduced = self._reduced()
         if reduced is None:
+            self.left = np.inf
             return False
         dz = self.fit.step_of(self.z, reduced)
         self.starts = self.fit.moved(self.starts, reduced, dz, 1.0)
@@ -375,26 +373,15 @@ class Candidates(Ranking):
         The initial guess by cubics ignores inputs, which may change a velocity within a few samples.
         """
         s = fit.segments
-        ends = [
-            int(s.first[k + 1]) if k + 1 < len(s.first) and s.of_piece[k + 1] == p else len(s.pieces[p].times) - 1
-            for k, p in enumerate(s.of_piece)
+        parts = [
+            s.pieces[p].part(int(samples[0]), min(int(samples[-1]) + 1, len(s.pieces[p].times) - 1))
+            for samples, p in zip(s.samples, s.of_piece, strict=True)
         ]
-        parts = [s.pieces[p].part(int(a), b) for a, b, p in zip(s.first, ends, s.of_piece, strict=True)]
         segment_fit = Fit(self.model, fit.law, self.chart, fit.unknowns, parts, fit.noise, fixed=True)
-        left = np.inf
-        for _ in range(SETTLING):
-            here = segment_fit.at(z, starts)
-            if here is None or here.value > SETTLES * left:
-                break
-            reduced, left = segment_fit.reduce(here), here.value
-            best = _squares(here)
-            for fraction in (1.0, 0.3):
-                moved = segment_fit.moved(here.starts, reduced, np.zeros_like(z), fraction)
-                there = segment_fit.at(z, moved)
-                if there is not None:
-                    better = _squares(there) < best
-                    starts, best = np.where(better[:, None], moved, starts), np.where(better, _squares(there), best)
-        return starts
+        try:
+            return segment_fit.solve(z, starts, SETTLING).starts
+        except SimulationError:
+            return starts
 
     def starts_at(self, delay: float) -> Array:
         """Return the refined segment starts for inputs that act later by `delay`."""
@@ -498,32 +485,25 @@ class Candidates(Ranking):
         return Runner(names, fit, z, starts, promise.left, promise.freedom)
 
     def raced(self, runners: list[Runner], base: Tried) -> tuple[list[Tried], list[Runner]]:
-        """Eliminate candidates step by step; return (fitted changes, all candidates, best first)."""
-        alive, there = list(runners), list[Runner]()
-        for most in RACE:
-            most = 1 if most < RACE[0] and self.is_late else most
-            before = {runner.names: runner.left for runner in alive}
-            alive = sorted((runner for runner in alive if runner.step()), key=lambda runner: runner.left)
-            there += [runner for runner in alive if not self.is_hopeless(runner.left)]
-            alive = [
-                runner
-                for runner in alive[:most]
-                if self.is_hopeless(runner.left) and (most == RACE[0] or runner.left < FALLS * before[runner.names])
-            ]
-        self.improve(there)
-        every, candidates = sorted(runners, key=lambda runner: runner.left), list[Tried]()
+        """Take steps, most with the best candidates; return (fitted changes, all candidates, best first)."""
+        first = sorted((runner for runner in runners if runner.step()), key=lambda runner: runner.left)
+        best, candidates = np.inf, list[Tried]()
+        for k, runner in enumerate(first):
+            if k < RACE or not self.is_hopeless(runner.left):
+                self.approach(runner, best)
+                best = min(best, runner.left)
 
         def cost(runner: Runner) -> float:
             return runner.left + self.price * runner.freedom
 
-        finalists = sorted(there + alive, key=cost)
+        finalists = sorted((runner for runner in first if not self.is_hopeless(runner.left)), key=cost)
         for runner in finalists:
             explained = any(candidate.explains for candidate in candidates)
             if explained and self.is_behind(cost(runner), cost(finalists[0])):
                 continue
             if candidates and (self.is_late or runner.left > self.plausible):
                 continue
-            if self.is_hopeless(runner.left) or runner.fit.at(runner.z, runner.starts) is None:
+            if runner.fit.at(runner.z, runner.starts) is None:
                 continue
             try:
                 candidates.append(
@@ -532,19 +512,16 @@ class Candidates(Ranking):
             except (SimulationError, np.linalg.LinAlgError):  # the motion overflows
                 continue
             self.evidence[" and ".join(runner.names)] = base.score - candidates[-1].score
-        return candidates, every
+        return candidates, sorted(runners, key=lambda runner: runner.left)
 
-    def improve(self, there: Sequence[Runner]) -> None:
-        """Take further steps with the candidates near the noise level while the steps help."""
-        best = np.inf
-        for runner in sorted(there, key=lambda runner: runner.left):
-            for _ in range(STEPS):
-                last = runner.left
-                if self.is_late or not runner.step() or last - runner.left < CLOSE:
-                    break
-                if runner.left > FALLS * last and (self.is_behind(runner.left, best) or self.is_hopeless(runner.left)):
-                    break
-            best = min(best, runner.left)
+    def approach(self, runner: Runner, best: float = np.inf) -> None:
+        """Take further steps while they help; far above the noise or the `best` loss, each step must help clearly."""
+        for _ in range(STEPS):
+            last = runner.left
+            if self.is_late or not runner.step() or last - runner.left < CLOSE:
+                break
+            if runner.left > FALLS * last and (self.is_behind(runner.left, best) or self.is_hopeless(runner.left)):
+                break
 
     def solved(
         self, names: tuple[str, ...], unknowns: Unknowns, law: Law, starts: Array, z: Array, most: int = STEPS
@@ -554,7 +531,7 @@ class Candidates(Ranking):
         fit = self.followed(problem, problem.fit(law, pieces, problem.first_noise), z, starts)
         law = fit.law
         for _ in range(ROUNDS):
-            solved = fit.solve(z, starts, most)
+            judged, solved = fit, fit.solve(z, starts, most)
             z, starts = solved.z, solved.starts
             shorter = fit.shorter
             if shorter is not None and not problem.follows(fit, z, starts):
@@ -574,7 +551,7 @@ class Candidates(Ranking):
             if solved.converged and np.max(np.abs(noise[seen] / fit.noise[seen] - 1)) < SAME_NOISE:
                 break
             fit = problem.fit(fit.law, pieces, noise)
-        return self.judge(names, problem, fit, solved)
+        return self.judge(names, problem, judged, solved)
 
     @staticmethod
     def followed(problem: Problem, fit: Fit, z: Array, starts: Array) -> Fit:
@@ -585,8 +562,3 @@ class Candidates(Ranking):
                 break
             fit = fit.by(shorter)
         return fit
-
-
-def _squares(point: FittedMotion) -> Array:
-    """Return the squared residuals (K,) of each segment."""
-    return np.array([float(np.nansum(r**2)) for r in point.residuals])

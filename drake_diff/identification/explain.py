@@ -8,7 +8,7 @@ change is predicted with derivatives at the first one, as a large change alters 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain, combinations
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +19,6 @@ from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import ModelError, SimulationError, UnknownNameError
 from drake_diff.identification.candidates import (
     FALLS,
-    LONGEST_DELAY,
-    LOOKED_AT,
     NO_PROMISE,
     STEPS,
     Candidates,
@@ -135,9 +133,8 @@ class _Search(Candidates):
         """Return (explanation by one change, fit of the unchanged model, its linearization, all candidates)."""
         nothing = self.of(())
         runner = self.running((), nothing, self.starts, nothing.z_start, NO_PROMISE)
-        before = np.inf
-        while runner.step() and self.is_hopeless(runner.left) and runner.left < FALLS * before:
-            before = runner.left
+        if runner.step():
+            self.approach(runner)
         most = 1 if self.is_hopeless(runner.left) else STEPS
         starts = self.starts if most == 1 else runner.starts
         base = self.solved((), nothing, runner.fit.law, starts, runner.z, most)
@@ -231,11 +228,12 @@ class _Search(Candidates):
 
     def paired(self, alone: View, runners: Sequence[Runner], base: Tried) -> list[Tried]:
         """Try pairs with the best single change if it fits well, then the best predicted pairs, then all others."""
-        beside: list[Search] = [partial(self.beside, runner, base) for runner in runners[:BESIDE]]
-        first = 1 if runners and not self.is_hopeless(runners[0].left) else 0
-        promising: list[Search] = [partial(self.at_the_model, alone, base), partial(self.beside_a_delay, base)]
+        delays = [runner for runner in runners if runner.fit.unknowns.delay is not None]
+        singles = [runner for runner in runners if runner.fit.unknowns.delay is None][:BESIDE]
+        first = 1 if singles and not self.is_hopeless(singles[0].left) else 0
+        beside = [partial(self.beside, runner, base) for runner in (*singles[:first], *delays, *singles[first:])]
         candidates: list[Tried] = []
-        for search in chain(beside[:first], promising, beside[first:]):
+        for search in (*beside[:first], partial(self.at_the_model, alone, base), *beside[first:]):
             candidates += search()
             if any(candidate.explains for candidate in candidates) or self.is_late:
                 break
@@ -246,9 +244,7 @@ class _Search(Candidates):
         return self.tried(alone, self.chosen(alone, combinations(moving, 2)), base)[0]
 
     def beside(self, runner: Runner, base: Tried) -> list[Tried]:
-        """Try pairs of a given change, if it is not a delay, with every other."""
-        if runner.fit.unknowns.delay is not None:
-            return []
+        """Try pairs of a given change with every other; a delay is the second one of its pairs."""
         i = [unknown.name for unknown in self.unknowns.each].index(runner.names[0])
         z = self.unknowns.z_start.copy()
         z[self.unknowns.slices[i]] = runner.z
@@ -256,46 +252,9 @@ class _Search(Candidates):
         if seen is None:
             return []
         without = {i, *self.of_inputs} if i in self.of_inputs else {i}
-        others = [(i, k) for k in range(len(seen.freedoms)) if k not in without]
-        return self.tried(seen, self.chosen(seen, others, LOOKED_AT_BESIDE), base)[0]
-
-    def beside_a_delay(self, base: Tried) -> list[Tried]:
-        """Try pairs with a delay: predict each change together with a step of the delay, at several delays."""
-        unknowns, last = self.unknowns.each, self.delay
-        if last is None:
-            return []
-        others = [(i, last) for i in range(len(unknowns)) if i not in self.of_inputs]
-        best: dict[int, tuple[float, View, Promise]] = {}
-        late, least = self.of([unknowns[last].name]), np.inf
-        delay = float(self.from_several((unknowns[last].name,), late, late.z_start, 0, NO_PROMISE).z[0])
-        for _ in range(DELAYS_SEEN):
-            if best and self.is_late:
-                break
-            z = self.unknowns.z_start.copy()
-            delay = max(delay, SHORTEST_DELAY)
-            z[self.unknowns.slices[last]] = delay
-            seen = self.view(self.cut, z, self.starts_at(delay))
-            promises = [] if seen is None else seen.promises(others, self.price)
-            for promise in promises:
-                i, cost = promise.members[0], promise.left + self.price * promise.freedom
-                if seen is not None and (i not in best or cost < best[i][0]):
-                    best[i] = cost, seen, promise
-            if not promises or promises[0].left > least:
-                break
-            least, before = promises[0].left, delay
-            delay = min(delay + float(promises[0].step[-1]), LONGEST_DELAY)
-            if abs(delay - before) < NEAR * delay:
-                break
-        order = sorted(best, key=lambda i: best[i][0])
-        groups = [[i for i in order if (len(unknowns[i].start) == 1) == small][:LOOKED_AT] for small in (True, False)]
-        chosen = [
-            i
-            for group in groups
-            for k, i in enumerate(group)
-            if k < LOOKED_AT_BESIDE or best[i][0] < BEHIND * best[group[0]][0]
-        ]
-        names = {i: (unknowns[i].name, unknowns[last].name) for i in chosen}
-        return self.raced([self.runner(*best[i][1:], names[i]) for i in chosen], base)[0]
+        others = [k for k in range(len(seen.freedoms)) if k not in without]
+        pairs = [(k, i) if i == self.delay else (i, k) for k in others]
+        return self.tried(seen, self.chosen(seen, pairs, LOOKED_AT_BESIDE), base)[0]
 
     def of_model(self, name: str) -> tuple[Array, str]:
         label, quantity = name.rsplit(".", 1)

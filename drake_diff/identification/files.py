@@ -62,7 +62,7 @@ def save(identification: Identification, directory: str | Path, *, meshes: bool 
 
 def write_identification(identification: Identification, folder: Path, *, meshes: bool = True) -> FitRecord:
     """Write the files of `save` into `folder`, which is from `written_whole`."""
-    asked, name = _asked(identification), name_of(folder)
+    asked, name = identification.request, name_of(folder)
     stored = (folder.with_name(name) / RECORDINGS).resolve()
     for recording, given in zip(asked.recordings, asked.files, strict=True):
         if given is not None:
@@ -136,7 +136,7 @@ def _begun(name: str, asked: Request) -> FitRecord:
 
 def record_of(e: Identification, name: str) -> FitRecord:
     """Return the record of an identification, without the list of files."""
-    asked = _asked(e)
+    asked = e.request
     recordings = [_recording(i, e, asked) for i in range(len(asked.recordings))]
     begun = _begun(name, asked)
     fields = {key: getattr(begun, key) for key in FitRecord.model_fields}
@@ -170,14 +170,6 @@ def _data(recordings: Sequence[records.RecordingEvidence]) -> DataBoundary:
     )
     names = [use.name for use in held_out]
     return DataBoundary(statement=statement, seen=seen, judged_on=[*seen, *held_out], held_out=names)
-
-
-def _asked(e: Identification) -> Request:
-    if e.asked is None:
-        raise InputError(
-            "identification", got="an Identification without its request", expected="the result of dd.identify"
-        )
-    return e.asked
 
 
 def _recording(i: int, e: Identification, asked: Request) -> records.RecordingEvidence:
@@ -232,7 +224,7 @@ def _write_trace(path: Path, e: Identification, attachments: Mapping[str, tuple[
     The channels of recording k are /k/measured/state (NaN if not measured), /k/input, /k/fitted/state and, if it was
     computed, /k/before/state. The frames are those of the first recording.
     """
-    asked = _asked(e)
+    asked = e.request
     model, contract = asked.model, asked.model.contract
     known = {p.name for p in list_parameters(model)}
     vector = select(model, {name: value for name, value in e.values.items() if name in known})
@@ -268,7 +260,7 @@ def reproduce(folder: Path, record: FitRecord, models: Path | None) -> Reproduce
     with rebuilt(folder, record, models) as model:
         given, files = zip(*(_stored(folder, record, i, model) for i in range(len(record.recordings))), strict=True)
         again = identify(model, given, record.inputs.parameters, **_options(record.inputs))
-        again = replace(again, asked=replace(_asked(again), files=files))
+        again = replace(again, asked=replace(again.request, files=files))
         made = record_of(again, record.name)
         as_was = {"model": model_as(made.model, record), "contract": contract_as(made.contract, record)}
         made = made.model_copy(update=as_was)
@@ -335,9 +327,9 @@ def _joined(e: Identification, i: int) -> tuple[Array, ...]:
 
 def _motion_plots(e: Identification) -> Iterator[Plot]:
     """Yield plots of the measured motion and of the model's motion."""
-    model = _asked(e).model
+    model = e.request.model
     units = [c.unit for c in (*model.contract.positions, *model.contract.velocities)]
-    for i, recording in enumerate(_asked(e).recordings):
+    for i, recording in enumerate(e.request.recordings):
         times, ys, xs, before = _joined(e, i)
         for j in [j for j in range(model.nx) if np.any(np.isfinite(ys[:, j]))][:MOST_PLOTS]:
             lines = [Line("measured", ys[:, j]), Line("with the estimated values", xs[:, j])]

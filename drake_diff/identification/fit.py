@@ -331,15 +331,13 @@ class Fit:
         """Return the step dz (np,) of the linearized problem, limited to the bounds and to LARGEST."""
         if self.fixed:
             return np.zeros_like(z)
-        widths = self.unknowns.widths
-        norms = np.linalg.norm(reduced.R, axis=0)
-        scale = np.where(np.isfinite(widths), widths, 1 / np.where(norms > 0, norms, 1.0))
+        widths, scale = self.unknowns.widths, self.unknowns.scales(np.linalg.norm(reduced.R, axis=0), 1.0)
         pulls = self.unknowns.pulls
         off, by_z = self.unknowns.prior_rows(z)
         matrix = np.vstack([reduced.R * scale, np.diag(scale / pulls), by_z * scale])
         right = np.concatenate([reduced.b, (self.unknowns.z_start - z) / pulls, -off])
         lower, upper = self.unknowns.bounds
-        far = np.where(np.isfinite(widths), LARGEST / 3 * widths, np.inf)
+        far = LARGEST / 3 * widths
         low, high = np.maximum(lower - z, -far) / scale, np.minimum(upper - z, far) / scale
         low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
         step = np.linalg.lstsq(matrix, right, rcond=1e-13)[0]

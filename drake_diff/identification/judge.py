@@ -1,6 +1,6 @@
 """Identifiability and intervals of the unknowns, and tests whether the model explains the data."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from math import comb
@@ -38,10 +38,8 @@ class Known:
 def known_of(unknowns: Unknowns, z: Array, R: Array) -> Known:
     """Compute `Known` from the Jacobian R (np, np), in units of the noise and with the first states eliminated."""
     R = np.vstack([R, unknowns.prior_rows(z)[1]])
-    norms = np.linalg.norm(R, axis=0)
-    sizes = unknowns.widths / FAR
     # A quantity without a size gets 10 times its deviation if estimated alone, so it is open only in combinations.
-    scale = np.where(np.isfinite(sizes), sizes, 10 / np.where(norms > 0, norms, 1.0))
+    scale = unknowns.scales(np.linalg.norm(R, axis=0), 10 * FAR) / FAR
     _, s, V = np.linalg.svd(R * scale)
     least = NOTHING * max(float(np.max(s, initial=0.0)), 1.0)
     with np.errstate(divide="ignore"):
@@ -109,15 +107,18 @@ class Freedom(NamedTuple):
         return self.numbers - self.of_starts - self.of_unknowns
 
 
+def freedoms_of(unknowns: Unknowns, R: Array, groups: Iterable[slice]) -> tuple[float, ...]:
+    """Return the degrees of freedom that the data determine in each group of columns of the Jacobian R (np, np)."""
+    R = R * unknowns.scales(np.linalg.norm(R, axis=0), 1e6)
+    squares = [np.linalg.svd(R[:, columns], compute_uv=False) ** 2 for columns in groups]
+    return tuple(float(np.sum(square / (1 + square))) for square in squares)
+
+
 def freedom_of(fit: Fit, solved: Solved) -> Freedom:
     """Return the degrees of freedom at the end of a fit."""
     of_starts = sum(float(np.sum(np.abs(np.diag(R)) > 10 * NO_PRIOR)) for R, _, _ in solved.reduced.own)
-    of_unknowns = 0.0
-    if not fit.fixed and len(solved.z):
-        widths, norms = fit.unknowns.widths, np.linalg.norm(solved.reduced.R, axis=0)
-        scale = np.where(np.isfinite(widths), widths, 1e6 / np.where(norms > 0, norms, 1.0))
-        s = np.linalg.svd(solved.reduced.R * scale, compute_uv=False)
-        of_unknowns = float(np.sum(s**2 / (1 + s**2)))
+    unknowns, R = fit.unknowns, solved.reduced.R
+    (of_unknowns,) = (0.0,) if fit.fixed else freedoms_of(unknowns, R, [slice(0, len(solved.z))])
     return Freedom(sum(int(np.isfinite(r).sum()) for r in solved.reduced.residuals), of_starts, of_unknowns)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 from drake_diff._base.arrays import Array
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.comparison.recordings import Recording
+from drake_diff.exceptions import InputError
 from drake_diff.identification.messages import NOISE_IS_LEFT, identification_sentence
 from drake_diff.identification.recordings import Excerpt
 from drake_diff.identification.unknowns import Unknowns
@@ -67,6 +68,14 @@ class Identification(ShowsItsRepr):
     motions: tuple[Followed, ...]  # of the fitted pieces, then of the held-out ones
     at_half_step: Mapping[str, Any] | None = None  # through impacts, the values with half the time step, if available
     asked: Request | None = None  # the request, which `dd.save` writes and `dd.verify` repeats
+
+    @property
+    def request(self) -> Request:
+        """The request. Raises InputError if there is none, as for a result of `identify_contact`."""
+        if self.asked is None:
+            subject, got = "identification", "an Identification without its request"
+            raise InputError(subject, got=got, expected="the result of dd.identify")
+        return self.asked
 
     def __repr__(self) -> str:
         return self.sentence

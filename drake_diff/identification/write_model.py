@@ -74,11 +74,7 @@ def write_model(identification: Identification, path: str | Path) -> Path:
         >>> dd.list_parameters(dd.load_model(path, time_step=0.001))[0]
         hinge.damping = 0.2 N m s/rad, at least 0; derivative by autodiff
     """
-    asked, path = identification.asked, Path(path)
-    if asked is None:
-        raise InputError(
-            "identification", got="an Identification without its request", expected="the result of dd.identify"
-        )
+    asked, path = identification.request, Path(path)
     source = asked.model.source
     kind = None if source is None else next((kind for kind in KINDS if source.name.endswith(kind)), None)
     if source is None or kind is None:
