@@ -6,7 +6,7 @@ bag contains the trace's own channels in ROS 2's messages and encoding, as `ros2
 
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -29,7 +29,7 @@ from drake_diff.logs.channels import (
     nanoseconds,
     state_channel,
 )
-from drake_diff.logs.mcap_file import Channel, McapLog, read_mcap, write_mcap
+from drake_diff.logs.mcap_file import Channel, read_mcap, write_mcap
 from drake_diff.mechanics.coordinates import rotation
 from drake_diff.model.parameters import applied
 from drake_diff.motion.rollout import CONTINUOUS
@@ -91,8 +91,7 @@ def _no_motion(m: Measurement) -> Iterator[Channel]:
     nothing = np.zeros((0, len(m.positions)))
     yield state_channel("/state", nothing[:, 0], nothing, m.positions, m.velocities)
     yield input_channel("/input", nothing[:, 0], nothing, m.inputs)
-    kind = TYPES["Diagnostics"]
-    yield Channel("/diagnostics", kind.cls, [], {"units": kind.units})
+    yield _channel("/diagnostics", TYPES["Diagnostics"], [])
 
 
 def _plan_channels(m: Measurement) -> Iterator[Channel]:
@@ -123,10 +122,9 @@ def _plan_channels(m: Measurement) -> Iterator[Channel]:
 def _solver_channels(m: Measurement) -> Iterator[Channel]:
     """Yield the tables of the solver's iterations, certificates and replays, and the gradient's norm at each step."""
     solution = m.solution
-    kind = TYPES["SolverIteration"]
-    yield _table("/solver/iterations", kind, [_fields(kind, row) for row in solution.iterations], "iteration")
+    yield _table("/solver/iterations", "SolverIteration", solution.iterations, "iteration")
     checks = [_gradient_check(c) for c in solution.certificates]
-    yield _table("/gradient/check", TYPES["GradientCheck"], checks, "certificate")
+    yield _table("/gradient/check", "GradientCheck", checks, "certificate")
     kind = TYPES["GradientNorm"]
     norms = [np.full(len(m.times), np.nan) if n is None else n for n in gradient_norms(solution)]
     known = any(np.any(np.isfinite(n)) for n in norms)
@@ -135,19 +133,21 @@ def _solver_channels(m: Measurement) -> Iterator[Channel]:
         (nanoseconds(float(m.times[k])), kind.cls(step=k, final_state=end, lagrangian=slope))
         for k, (end, slope) in by_knot
     ]
-    yield Channel("/gradient/norm", kind.cls, rows, {"units": kind.units})
-    kind = TYPES["Replay"]
-    yield _table("/replays", kind, [_fields(kind, replay) for replay in m.replays], "replay")
+    yield _channel("/gradient/norm", kind, rows)
+    yield _table("/replays", "Replay", m.replays, "replay")
 
 
-def _fields(kind: MessageType, value: Any) -> Any:
-    """Convert a value with an attribute for each field of the message to the message."""
-    return kind.cls(**{field.name: getattr(value, field.name) for field in kind.cls.DESCRIPTOR.fields})
+def _channel(topic: str, kind: MessageType, rows: Sequence[tuple[int, Any]], **metadata: Any) -> Channel:
+    return Channel(topic, kind.cls, rows, {"units": kind.units, **metadata})
 
 
-def _table(topic: str, kind: MessageType, rows: Sequence[Any], row: str) -> Channel:
-    timed = [(rank * ROW_PERIOD, message) for rank, message in enumerate(rows)]
-    return Channel(topic, kind.cls, timed, {"units": kind.units, "time_axis": f"1 ms per {row}"})
+def _table(topic: str, name: str, rows: Sequence[Any], row: str) -> Channel:
+    """Return the channel of `rows` with an attribute for each field of the message."""
+    kind = TYPES[name]
+    names = [field.name for field in kind.cls.DESCRIPTOR.fields]
+    messages = [kind.cls(**{n: getattr(value, n) for n in names}) for value in rows]
+    timed = [(rank * ROW_PERIOD, message) for rank, message in enumerate(messages)]
+    return _channel(topic, kind, timed, time_axis=f"1 ms per {row}")
 
 
 def _gradient_check(c: Certificate) -> Any:
@@ -178,7 +178,7 @@ def _event_channel(m: Measurement) -> Channel:
     end = float(m.solution.times[-1])
     for f in m.failures:
         rows.append(kind.cls(time=end, kind="failure", failure_label=f.label, code=f.code, message=f.message))
-    return Channel("/events", kind.cls, [(nanoseconds(row.time), row) for row in rows], {"units": kind.units})
+    return _channel("/events", kind, [(nanoseconds(row.time), row) for row in rows])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -232,23 +232,19 @@ def read_trace(path: str | Path) -> Trace:
     if missing:
         raise ArtifactError(f"{path}: no channel {', '.join(sorted(missing))}")
     try:
-        return _trace(log)
+        planned = log.arrays("/planned/state")
+        return Trace(
+            times=frozen(planned["time"]),
+            xs=_states(log.arrays("/state")),
+            us=frozen(log.arrays("/input")["u"]),
+            planned_xs=_states(planned),
+            planned_us=frozen(log.arrays("/planned/input")["u"]),
+            diagnostics={name: frozen(values) for name, values in log.arrays("/diagnostics").items()},
+            metadata=log.metadata.get("run", {}),
+            attachments=log.attachments,
+        )
     except (LookupError, ValueError) as error:
         raise ArtifactError(f"{path}: the channels contradict each other: {error}") from error
-
-
-def _trace(log: McapLog) -> Trace:
-    planned = log.arrays("/planned/state")
-    return Trace(
-        times=frozen(planned["time"]),
-        xs=_states(log.arrays("/state")),
-        us=frozen(log.arrays("/input")["u"]),
-        planned_xs=_states(planned),
-        planned_us=frozen(log.arrays("/planned/input")["u"]),
-        diagnostics={name: frozen(values) for name, values in log.arrays("/diagnostics").items()},
-        metadata=log.metadata.get("run", {}),
-        attachments=log.attachments,
-    )
 
 
 def _states(columns: dict[str, Any]) -> Array:
@@ -259,7 +255,8 @@ TRACE, STATE = "trace.mcap", "/state"
 QUATERNION_POSE = ("qw", "qx", "qy", "qz", "x", "y", "z")  # suffixes of a free body's coordinates
 INFO, ERROR = 20, 40  # levels of rcl_interfaces/Log
 BAG_VERSION = 8  # version of metadata.yaml that Humble and all newer releases read
-Convert = Callable[[dict[str, Any], int, Any, dict[str, Any]], Any]  # ROS types, time [ns], message, channel metadata
+Ros = Callable[..., Any]  # makes the ROS 2 message "package/Type" from the values of its fields, in their order
+Convert = Callable[[Ros, int, Any, dict[str, Any]], Any]  # time [ns], message, channel metadata
 
 
 def export_ros2(run: str | Path, out: str | Path) -> dict[str, int]:
@@ -282,18 +279,22 @@ def export_ros2(run: str | Path, out: str | Path) -> dict[str, int]:
     if out.exists() or not out.parent.is_dir():
         raise InputError("OUT", got=str(out), expected="a new directory in an existing directory")
     store = get_typestore(Stores.ROS2_HUMBLE)
+
+    def ros(name: str, *values: Any) -> Any:
+        return store.types[name.replace("/", "/msg/")](*values)
+
     with Writer(out, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as bag:
         bag.set_custom_data("written_by", "drake_diff")
         written = {topic: (topic, *converted) for topic, converted in CONVERTED.items()}
         written |= _free_bodies(log.channel_metadata.get(STATE, {}))
-        bags = {topic: bag.add_connection(topic, name, typestore=store) for topic, (_, name, _) in written.items()}
-        rows = [
-            (time, topic, message) for topic, (inner, *_) in written.items() for time, message in log.messages[inner]
-        ]
-        for time, topic, message in sorted(rows, key=itemgetter(0)):
-            inner, name, convert = written[topic]
-            converted = convert(store.types, time, message, log.channel_metadata[inner])
-            bag.write(bags[topic], time, store.serialize_cdr(converted, name))
+        rows = []
+        for topic, (inner, name, convert) in written.items():
+            connection = bag.add_connection(topic, name, typestore=store)
+            for time, message in log.messages[inner]:
+                converted = convert(ros, time, message, log.channel_metadata[inner])
+                rows.append((time, connection, store.serialize_cdr(converted, name)))
+        for time, connection, data in sorted(rows, key=itemgetter(0)):
+            bag.write(connection, time, data)
     return {topic: len(log.messages[inner]) for topic, (inner, *_) in written.items()}
 
 
@@ -310,94 +311,88 @@ def _free_bodies(metadata: dict[str, Any]) -> dict[str, tuple[str, str, Convert]
     return result
 
 
-def _odometry(types: dict[str, Any], time: int, message: Any, _: dict[str, Any], *, body: str, i: int, j: int) -> Any:
+def _odometry(ros: Ros, time: int, message: Any, _: dict[str, Any], *, body: str, i: int, j: int) -> Any:
     """Return nav_msgs/Odometry with the twist in the body's frame (REP 105); `i` and `j` are its indices in q and v."""
     w, x, y, z, *p = message.q[i : i + 7]
-    turn = rotation(np.array([w, x, y, z])).T
+    turn, unknown = rotation(np.array([w, x, y, z])).T, np.zeros(36)
     angular, linear = (turn @ np.array(message.v[k : k + 3]) for k in (j, j + 3))
-    vector, unknown = types["geometry_msgs/msg/Vector3"], np.zeros(36)
-    pose = types["geometry_msgs/msg/Pose"](
-        position=types["geometry_msgs/msg/Point"](*p),
-        orientation=types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w),
-    )
-    twist = types["geometry_msgs/msg/Twist"](linear=vector(*map(float, linear)), angular=vector(*map(float, angular)))
-    return types["nav_msgs/msg/Odometry"](
-        header=_header(types, time, "world"), child_frame_id=body,
-        pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=unknown),
-        twist=types["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=unknown),
-    )  # fmt: skip
+    twist = ros("geometry_msgs/Twist", _vector(ros, linear), _vector(ros, angular))
+    pose = ros("geometry_msgs/Pose", ros("geometry_msgs/Point", *p), ros("geometry_msgs/Quaternion", x, y, z, w))
+    poses = ros("geometry_msgs/PoseWithCovariance", pose, unknown)
+    twists = ros("geometry_msgs/TwistWithCovariance", twist, unknown)
+    return ros("nav_msgs/Odometry", _header(ros, time, "world"), body, poses, twists)
 
 
-def _joint_state(types: dict[str, Any], time: int, message: Any, _: dict[str, Any]) -> Any:
+def _vector(ros: Ros, xyz: Iterable[float]) -> Any:
+    return ros("geometry_msgs/Vector3", *map(float, xyz))
+
+
+def _joint_state(ros: Ros, time: int, message: Any, _: dict[str, Any]) -> Any:
     """Return sensor_msgs/JointState; the effort is NaN for an unactuated joint, and empty if no effort is known."""
     joints = message.joints
-    efforts = [j.effort if j.HasField("effort") else np.nan for j in joints]
-    return types["sensor_msgs/msg/JointState"](
-        header=_header(types, time),
-        name=[j.name for j in joints],
-        position=np.array([j.position for j in joints]),
-        velocity=np.array([j.velocity for j in joints]),
-        effort=np.array(efforts if any(j.HasField("effort") for j in joints) else []),
-    )
+    positions, velocities = np.array([j.position for j in joints]), np.array([j.velocity for j in joints])
+    known = any(j.HasField("effort") for j in joints)
+    efforts = [j.effort if j.HasField("effort") else np.nan for j in joints if known]
+    names = [j.name for j in joints]
+    return ros("sensor_msgs/JointState", _header(ros, time), names, positions, velocities, np.array(efforts))
 
 
-def _transforms(types: dict[str, Any], time: int, message: Any, _: dict[str, Any]) -> Any:
-    def pose(t: Any) -> Any:
+def _transforms(ros: Ros, time: int, message: Any, _: dict[str, Any]) -> Any:
+    result = []
+    for t in message.transforms:
         p, r = t.translation, t.rotation
-        return types["geometry_msgs/msg/Transform"](
-            translation=types["geometry_msgs/msg/Vector3"](x=p.x, y=p.y, z=p.z),
-            rotation=types["geometry_msgs/msg/Quaternion"](x=r.x, y=r.y, z=r.z, w=r.w),
-        )
-
-    stamped = types["geometry_msgs/msg/TransformStamped"]
-    result = [stamped(_header(types, time, t.parent_frame_id), t.child_frame_id, pose(t)) for t in message.transforms]
-    return types["tf2_msgs/msg/TFMessage"](transforms=result)
+        turn = ros("geometry_msgs/Quaternion", r.x, r.y, r.z, r.w)
+        transform = ros("geometry_msgs/Transform", _vector(ros, (p.x, p.y, p.z)), turn)
+        header = _header(ros, time, t.parent_frame_id)
+        result.append(ros("geometry_msgs/TransformStamped", header, t.child_frame_id, transform))
+    return ros("tf2_msgs/TFMessage", result)
 
 
-def _input(types: dict[str, Any], _: int, message: Any, metadata: dict[str, Any]) -> Any:
+def _input(ros: Ros, _: int, message: Any, metadata: dict[str, Any]) -> Any:
     """Return std_msgs/Float64MultiArray; the label of its dimension lists the names of the inputs."""
     count = len(message.u)
-    dimension = types["std_msgs/msg/MultiArrayDimension"](", ".join(metadata["names"]["u"]), count, count)
-    layout = types["std_msgs/msg/MultiArrayLayout"](dim=[dimension], data_offset=0)
-    return types["std_msgs/msg/Float64MultiArray"](layout=layout, data=np.array(message.u, dtype=float))
+    dimension = ros("std_msgs/MultiArrayDimension", ", ".join(metadata["names"]["u"]), count, count)
+    layout = ros("std_msgs/MultiArrayLayout", [dimension], 0)
+    return ros("std_msgs/Float64MultiArray", layout, np.array(message.u, dtype=float))
 
 
-def _diagnostics(types: dict[str, Any], time: int, message: Any, metadata: dict[str, Any]) -> Any:
+def _diagnostics(ros: Ros, time: int, message: Any, metadata: dict[str, Any]) -> Any:
     """Return diagnostic_msgs/DiagnosticArray with all numbers as text without rounding, and with their units."""
-    units = metadata["units"]
-    pair = types["diagnostic_msgs/msg/KeyValue"]
-    names = [field.name for field in message.DESCRIPTOR.fields]
-    values = [pair(f"{name} [{units[name]}]", repr(getattr(message, name))) for name in names]
-    content = types["diagnostic_msgs/msg/DiagnosticStatus"]
-    status = content(level=0, name="drake_diff", message="", hardware_id="", values=values)
-    return types["diagnostic_msgs/msg/DiagnosticArray"](header=_header(types, time), status=[status])
+    values = {field.name: getattr(message, field.name) for field in message.DESCRIPTOR.fields}
+    return _statuses(ros, time, [_status(ros, "drake_diff", "", values, metadata)])
 
 
-def _contacts(types: dict[str, Any], time: int, message: Any, metadata: dict[str, Any]) -> Any:
+def _contacts(ros: Ros, time: int, message: Any, metadata: dict[str, Any]) -> Any:
     """Return diagnostic_msgs/DiagnosticArray with a status for each contact, body a on body b, as in `_diagnostics`."""
-    units, pair = metadata["units"], types["diagnostic_msgs/msg/KeyValue"]
-    names = [field.name for field in message.DESCRIPTOR.fields if field.name not in ("body_a", "body_b")]
-    result = [
-        types["diagnostic_msgs/msg/DiagnosticStatus"](
-            level=0, name=f"{a} on {b}", message="contact", hardware_id="",
-            values=[pair(f"{name} [{units[name]}]", repr(getattr(message, name)[i])) for name in names],
-        )
-        for i, (a, b) in enumerate(zip(message.body_a, message.body_b, strict=True))
-    ]  # fmt: skip
-    return types["diagnostic_msgs/msg/DiagnosticArray"](header=_header(types, time), status=result)
+    columns = {field.name: getattr(message, field.name) for field in message.DESCRIPTOR.fields}
+    pairs = zip(columns.pop("body_a"), columns.pop("body_b"), strict=True)
+    rows = [(f"{a} on {b}", {name: column[i] for name, column in columns.items()}) for i, (a, b) in enumerate(pairs)]
+    return _statuses(ros, time, [_status(ros, name, "contact", values, metadata) for name, values in rows])
 
 
-def _event(types: dict[str, Any], time: int, message: Any, _: dict[str, Any]) -> Any:
+def _status(ros: Ros, name: str, message: str, values: Mapping[str, Any], metadata: dict[str, Any]) -> Any:
+    units = metadata["units"]
+    pairs = [ros("diagnostic_msgs/KeyValue", f"{key} [{units[key]}]", repr(value)) for key, value in values.items()]
+    return ros("diagnostic_msgs/DiagnosticStatus", 0, name, message, "", pairs)
+
+
+def _statuses(ros: Ros, time: int, statuses: list[Any]) -> Any:
+    return ros("diagnostic_msgs/DiagnosticArray", _header(ros, time), statuses)
+
+
+def _event(ros: Ros, time: int, message: Any, _: dict[str, Any]) -> Any:
     """Return rcl_interfaces/Log: an error for a failure, else information; its name is the event's kind."""
-    content = message.kind if not message.failure_label else f"{message.kind}: {message.failure_label}"
-    return types["rcl_interfaces/msg/Log"](
-        stamp=_header(types, time).stamp, level=ERROR if message.kind == "failure" else INFO, name=content,
-        msg=message.message, file="", function=message.code, line=0,
-    )  # fmt: skip
+    name = message.kind if not message.failure_label else f"{message.kind}: {message.failure_label}"
+    level = ERROR if message.kind == "failure" else INFO
+    return ros("rcl_interfaces/Log", _time(ros, time), level, name, message.message, "", message.code, 0)
 
 
-def _header(types: dict[str, Any], time: int, frame: str = "") -> Any:
-    return types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](*divmod(time, 1_000_000_000)), frame)
+def _header(ros: Ros, time: int, frame: str = "") -> Any:
+    return ros("std_msgs/Header", _time(ros, time), frame)
+
+
+def _time(ros: Ros, time: int) -> Any:
+    return ros("builtin_interfaces/Time", *divmod(time, 1_000_000_000))
 
 
 CONVERTED: dict[str, tuple[str, Convert]] = {
