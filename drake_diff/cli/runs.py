@@ -80,7 +80,7 @@ def run(
 def _run_into(directory: Path, script: Path, cross_check: bool, options: dict[str, Any], meshes: bool) -> Any:
     """Set up the problem and write the record of its solution; an interrupted run does not replace another run."""
     from drake_diff.runs.directory import written_whole  # late, so that a missing script is reported first
-    from drake_diff.runs.save import record_without_problem
+    from drake_diff.runs.save import IN_THE_SETUP, begin_interrupted
 
     folder = None
     try:
@@ -88,10 +88,9 @@ def _run_into(directory: Path, script: Path, cross_check: bool, options: dict[st
             try:
                 problem, asked = _asked(script, cross_check)
             except KeyboardInterrupt:
-                sentence = "the run was interrupted during the setup of its problem, before the search began"
                 with held_interrupts():
-                    record_without_problem(directory.name, sentence).begin(folder)
-                show(f"{sentence}; its record is in {folder}")
+                    begin_interrupted(folder, None)
+                show(f"{IN_THE_SETUP}; its record is in {folder}")
                 raise typer.Exit(INTERRUPTED) from None
             return _solved_into(directory, folder, problem, asked | options, cross_check, meshes)
     except KeyboardInterrupt:

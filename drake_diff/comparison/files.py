@@ -3,7 +3,6 @@
 Recordings are saved as arrays together with the model file, so that `verify` can repeat the comparison and the causes.
 """
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from hashlib import sha256
@@ -26,15 +25,13 @@ from drake_diff.pages.html import Line, Plot, page_again, page_data, write_page
 from drake_diff.runs import other_records as records
 from drake_diff.runs.differences import Reproduced
 from drake_diff.runs.directory import name_of, written_whole
-from drake_diff.runs.fields import DataBoundary, DataUse, WallClock, canonical
+from drake_diff.runs.fields import DataBoundary, DataUse
 from drake_diff.runs.other_records import ComparisonRecord
 from drake_diff.runs.provenance import (
     contract_of,
     gradient_evidence,
-    model_input,
-    provenance_of,
+    header,
     write_bundle,
-    written_now,
 )
 
 TRACE, REPLAY, PAGE, TEMPLATE = "trace.mcap", "replay.html", "comparison.html", "comparison.html.j2"
@@ -101,7 +98,7 @@ def write_comparison(
     write_comparison_trace(folder / TRACE, comparison)
     write_replay(folder / REPLAY, _scene(comparison), title=f"{record.name}: {record.verdict}")
     view = (folder / REPLAY).read_text(encoding="utf-8")  # shows the engines as ghosts
-    fields, data = _fields_of(record), comparison_data(comparison)
+    fields, data = record.content(), comparison_data(comparison)
     write_page(folder / PAGE, TEMPLATE, record=fields, data=data, view=view, most_plots=MOST_PLOTS)
     return record.write(folder)
 
@@ -128,26 +125,24 @@ def record_of(
             for i, r in enumerate(_saved_recordings(comparison))
         ],
         "refused": [records.RefusedEvidence(**vars(refused)) for refused in comparison.refused],
-        "wall_clock": WallClock(
-            written_utc=written_now(),
-            seconds_per_step={e.engine: e.seconds_per_step for e in comparison.engines},
-            seconds_per_jacobian={e.engine: e.seconds_per_jacobian for e in comparison.engines},
-        ),
     }
-    return _begun(name, comparison.model).model_copy(update=fields)
+    clocks = {
+        kind: {e.engine: getattr(e, kind) for e in comparison.engines}
+        for kind in ("seconds_per_step", "seconds_per_jacobian")
+    }
+    return _begun(name, comparison.model, **clocks).model_copy(update=fields)
 
 
-def _begun(name: str, model: Model) -> ComparisonRecord:
+def _begun(name: str, model: Model, **clock: Any) -> ComparisonRecord:
     steps = {f"step, {precision}": value for precision, value in STEP_TOLERANCE.items()}
     jacobians = {f"jacobian, {precision}": value for precision, value in JACOBIAN_TOLERANCE.items()}
     return ComparisonRecord(
-        name=name, verdict="incomplete",
+        verdict="incomplete",
         sentence="the comparison is still running, or it was killed or failed before its end",
-        tolerances={**steps, **jacobians}, model=model_input(model),
-        contract=contract_of(model),
+        tolerances={**steps, **jacobians}, contract=contract_of(model),
         time_step_s=model.time_step, state_names=list(model.state_names), input_names=list(model.input_names),
-        states=[], engines=[], refused=[], provenance=provenance_of(model),
-        wall_clock=WallClock(written_utc=written_now()),
+        states=[], engines=[], refused=[],
+        **header(name, model, **clock),
     )  # fmt: skip
 
 
@@ -255,11 +250,6 @@ SAME_TIME = 1e-6  # [s] tolerance for clocks in single precision
 MOST_PLOTS = 12  # plots of the coordinates with the largest differences
 
 
-def _fields_of(record: ComparisonRecord) -> dict[str, Any]:
-    fields: dict[str, Any] = json.loads(canonical(record.model_dump(mode="json")))
-    return fields  # in the order of the written record
-
-
 def made_of_record(folder: Path, record: ComparisonRecord) -> Reproduced:
     """Regenerate the sentence and the pages of a record, with the plots and the motion of those in `folder`."""
     from drake_diff.pages.meshcat import replay_again
@@ -269,7 +259,7 @@ def made_of_record(folder: Path, record: ComparisonRecord) -> Reproduced:
     if not {REPLAY, PAGE} <= record.files.keys():
         return made
     replay = replay_again(read_plain(folder / REPLAY).decode(errors="replace"), f"{record.name}: {record.verdict}")
-    fields, view = _fields_of(record), replay.decode()
+    fields, view = record.content(), replay.decode()
     page = page_again(folder / PAGE, TEMPLATE, record=fields, view=view, most_plots=MOST_PLOTS)
     return replace(made, files={REPLAY: replay, PAGE: page})
 

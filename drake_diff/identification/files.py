@@ -3,7 +3,6 @@
 The recordings are stored as they were read, so that `verify` can repeat the fit.
 """
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
@@ -35,11 +34,11 @@ from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.runs import other_records as records
 from drake_diff.runs.differences import Reproduced
 from drake_diff.runs.directory import name_of, written_whole
-from drake_diff.runs.fields import DataBoundary, DataUse, WallClock, canonical, finite, reproducible
+from drake_diff.runs.fields import DataBoundary, DataUse, finite, reproducible
 from drake_diff.runs.other_records import FitRecord
-from drake_diff.runs.provenance import contract_of, model_input, provenance_of, write_bundle, written_now
+from drake_diff.runs.provenance import contract_of, header, write_bundle
 from drake_diff.runs.rebuild import TRACE, rebuilt
-from drake_diff.runs.reproduce import contract_as, model_as
+from drake_diff.runs.reproduce import as_given
 
 REPORT = "report.html"
 MADE = (TRACE, REPORT)  # the files that are regenerated, together with the record
@@ -122,15 +121,12 @@ def _begun(name: str, asked: Request) -> FitRecord:
         },
     )
     return FitRecord(
-        name=name,
         verdict="incomplete",
         sentence="the run is still being written, or writing it was killed or failed",
-        model=model_input(asked.model),
         contract=contract_of(asked.model),
         inputs=inputs,
         recordings=[],
-        provenance=provenance_of(asked.model),
-        wall_clock=WallClock(written_utc=written_now()),
+        **header(name, asked.model),
     )
 
 
@@ -211,7 +207,7 @@ def _correlation(covariance: Array) -> list[list[float | None]]:
 
 def write_made(folder: Path, e: Identification, record: FitRecord) -> None:
     """Write the files of `MADE`."""
-    fields = json.loads(canonical(record.model_dump(mode="json")))  # in the order of the written record
+    fields = record.content()
     _write_trace(folder / TRACE, e, {record.FILE: ("application/json", reproducible(fields).encode())})
     plots = [*_motion_plots(e), *_residual_plots(e)]
     data = page_data(max(float(m.piece.times[-1]) for m in e.motions), plots)
@@ -261,11 +257,7 @@ def reproduce(folder: Path, record: FitRecord, models: Path | None) -> Reproduce
         given, files = zip(*(_stored(folder, record, i, model) for i in range(len(record.recordings))), strict=True)
         again = identify(model, given, record.inputs.parameters, **_options(record.inputs))
         again = replace(again, asked=replace(again.request, files=files))
-        made = record_of(again, record.name)
-        as_was = {"model": model_as(made.model, record), "contract": contract_as(made.contract, record)}
-        made = made.model_copy(update=as_was)
-    fields = {name: getattr(record, name) for name in ("provenance", "wall_clock", "files", "record_sha256")}
-    made = made.model_copy(update=fields)
+        made = as_given(record_of(again, record.name), record)
     with TemporaryDirectory() as location:
         write_made(Path(location), again, made)
         contents = {name: (Path(location) / name).read_bytes() for name in MADE}

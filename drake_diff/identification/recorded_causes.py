@@ -27,7 +27,7 @@ from drake_diff.runs.differences import ABSOLUTE, NUMBER, Reproduced, is_near
 from drake_diff.runs.other_records import CauseEvidence, ComparisonRecord, Numbers
 from drake_diff.runs.provenance import contract_of, model_input
 from drake_diff.runs.rebuild import rebuilt
-from drake_diff.runs.reproduce import contract_as, model_as
+from drake_diff.runs.reproduce import as_given
 
 SAME_VALUE = 2e-3  # tolerance in units of half the interval (see above)
 SAME_DIGIT = 1.01  # tolerance in units of the last digit in a text: a number between two may be rounded to either
@@ -107,13 +107,13 @@ def _odd_recordings(record: ComparisonRecord) -> Iterator[str]:
 def _of_the_model(record: ComparisonRecord, model: Model) -> dict[str, Any]:
     """Return the record's fields about the model, recomputed for the model in the directory."""
     changed: dict[str, Any] = {
-        "model": model_as(model_input(model), record),
-        "contract": contract_as(contract_of(model), record),
+        "model": model_input(model),
+        "contract": contract_of(model),
         "time_step_s": model.time_step,
         "state_names": list(model.state_names),
         "input_names": list(model.input_names),
     }
-    fields = record.model_copy(update=changed).model_dump(mode="json")
+    fields = as_given(record.model_copy(update=changed), record).model_dump(mode="json")
     return {key: fields[key] for key in changed}
 
 

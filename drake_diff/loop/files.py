@@ -63,7 +63,7 @@ from drake_diff.runs.plan_record import ClosedLoopSection, LoopEvidence, PlanRec
 from drake_diff.runs.provenance import contract_of, header, model_input, write_bundle
 from drake_diff.runs.rebuild import GUESS, PLAN, TRACE, rebuilt
 from drake_diff.runs.reproduce import as_given
-from drake_diff.runs.save import REPLAY, REPORT, fields_of
+from drake_diff.runs.save import REPLAY, REPORT
 from drake_diff.runs.sections import describe_problem, rebuild_problem, unknown_functions
 from drake_diff.runs.trace import MEDIA_TYPES
 
@@ -464,7 +464,7 @@ def _write_files(
     folder: Path, run: ClosedLoop, record: PlanRecord, followed: _Followed | None, files: Mapping[str, bytes]
 ) -> None:
     """Write trace, replay and report of `record`."""
-    fields = fields_of(record)
+    fields = record.content()
     _write_trace(folder / TRACE, run, record, followed, {record.FILE: reproducible(fields).encode(), **files})
     times, xs = _times(run.model.time_step, max(2, len(run.xs))), np.clip(run.xs, -FURTHEST, FURTHEST)
     xs = xs if len(xs) > 1 else np.repeat(xs, 2, axis=0)  # the run ended at once

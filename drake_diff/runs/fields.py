@@ -394,6 +394,11 @@ class SealedRecord(ShowsItsRepr, Fields):
         schema = {**_untitled(cls.model_json_schema()), "$comment": READING}
         return (json.dumps(schema, sort_keys=True, indent=2) + "\n").encode()
 
+    def content(self) -> dict[str, Any]:
+        """Return the fields as JSON values, in the order in which they are written."""
+        fields: dict[str, Any] = json.loads(self.to_json())
+        return fields
+
     def to_json(self) -> str:
         """Return the record as canonical JSON; the same record gives the same bytes."""
         return canonical(self.model_dump(mode="json"))

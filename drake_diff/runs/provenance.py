@@ -57,11 +57,12 @@ def header(name: str, model: Model | None = None, seconds: float | None = None, 
     Raises:
         InputError: A name cannot be encoded in UTF-8, the encoding of a run's files and pages.
     """
+    now = datetime.now(UTC).isoformat(timespec="seconds")
     return {
         "name": _checked_name("name", name),
         "model": model_input(model),
         "provenance": provenance_of(model),
-        "wall_clock": WallClock(written_utc=written_now(), duration_s=seconds, **clock),
+        "wall_clock": WallClock(written_utc=now, duration_s=seconds, **clock),
     }
 
 
@@ -138,11 +139,6 @@ def write_bundle(folder: Path, *models: Model | None, meshes: bool = True) -> No
         if not target.exists() and (meshes or not file.is_mesh):
             make_folder(target.parent)
             write_whole(target, file.path.read_bytes())
-
-
-def written_now() -> str:
-    """Return the present time, for the wall clock of a record."""
-    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def packages_here() -> dict[str, str]:

@@ -11,7 +11,7 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -24,14 +24,13 @@ from drake_diff.runs.certificates import certify_model
 from drake_diff.runs.cross_check import NOT_INSTALLED, SIMULATORS, cross_check
 from drake_diff.runs.differences import Reproduced, is_near
 from drake_diff.runs.directory import read_checked
-from drake_diff.runs.fields import ModelInput, SealedRecord, finite, read_fields, reproducible
+from drake_diff.runs.fields import SealedRecord, finite, read_fields, reproducible
 from drake_diff.runs.plan_record import CertificationSection, PhasesSection, PlanRecord
 from drake_diff.runs.rebuild import (
     OPTIONAL,
     PLAN,
     REQUIRED,
     TRACE,
-    directory_of,
     phase_records,
     read_plan,
     rebuilt,
@@ -39,20 +38,22 @@ from drake_diff.runs.rebuild import (
     search_of,
     solve_again,
 )
-from drake_diff.runs.save import RECOVERED, REPLAY, REPORT, fields_of, write_measured
+from drake_diff.runs.save import RECOVERED, REPLAY, REPORT, phases_in, write_measured
 from drake_diff.runs.sections import COSTS, unknown_functions
 from drake_diff.runs.trace import read_trace
 
 # Fields about the record itself and its machine, which cannot be reproduced.
+AnyRecord = TypeVar("AnyRecord", bound=SealedRecord)
 GIVEN = ("name", "provenance", "wall_clock")
-# Fields that depend on the search, and not only on the plan that it found.
-SEARCHED = ("events", "failures", "gradient", "inputs", "sentence", "solver", "verdict")
+# Keys that depend on the search, and not only on the plan that it found, of a record and of one in phases.
+SEARCHED = (
+    *("events", "failures", "gradient", "inputs", "sentence", "solver", "verdict"),
+    *("phases.search", "phases.initial_guess", "phases.phases"),
+)
 SEARCH_TOPICS = ("/solver/", "/gradient/", "/events", "/replays")
 # Keys that depend on constraints that are a user's functions, in addition to the search.
 CONSTRAINED = ("metrics[constraint violation]", "problem.constraints", "problem.couplings")
 JUDGED = ("holds", "failures")  # of each replay
-# Keys of a record in phases that depend on its search, in addition to SEARCHED.
-SEARCHED_IN_PHASES = ("phases.search", "phases.initial_guess", "phases.phases")
 OFFSETS_SINCE = 4  # the first schema version whose replays under TVLQR have offsets for finer steps
 SAME_PLAN = 1e-6  # relative to the largest number of each array: plans within this distance count as equal
 OF_RECOVERED = (
@@ -205,8 +206,9 @@ def _written(solution: Solution, folder: Path, records: Mapping[Path, PlanRecord
     with TemporaryDirectory() as made:
         location = Path(made)
 
-        def amend(again: PlanRecord, folder: Path) -> PlanRecord:
-            recorded = records[folder.relative_to(location)]
+        def amend(again: PlanRecord, made: Path) -> tuple[PlanRecord, dict[str, Any]]:
+            inner = made.relative_to(location)
+            recorded = records[inner]
             again, lacking = _but_for_simulators(as_given(again, recorded), recorded)
             unchecked.extend(lacking)
             if recorded.is_before(OFFSETS_SINCE):
@@ -216,20 +218,15 @@ def _written(solution: Solution, folder: Path, records: Mapping[Path, PlanRecord
                 replays = _open_loop_alone(again.replays, recorded.replays)
                 again = again.model_copy(update={"replays": replays, "metrics": metrics})
                 unchecked.append(f"replays under TVLQR, which had no offsets in version {recorded.schema_version}")
-            return again
-
-        def dump(again: PlanRecord, made: Path) -> dict[str, Any]:
-            inner = made.relative_to(location)
-            if records[inner].is_before(OFFSETS_SINCE):
-                return fields_of(again)
-            return as_written(fields_of(again), read_fields(folder / inner / PlanRecord.FILE))
+                return again, again.content()
+            return again, as_written(again.content(), read_fields(folder / inner / PlanRecord.FILE))
 
         fields: dict[str, Any] = {}
         if _unknown_resets(records[Path()]):  # the link between two phases is a function that is not stored
-            for i, phase in enumerate(solution.phases):
-                write_measured(phase, location / directory_of(i), amend, dump)
+            for inner, phase in phases_in(location, solution):
+                write_measured(phase, inner, amend)
         else:
-            fields = write_measured(solution, location, amend, dump).model_dump(mode="json")
+            fields = write_measured(solution, location, amend).model_dump(mode="json")
         paths = [path for path in location.rglob("*") if path.is_file()]
         files = {path.relative_to(location).as_posix(): path.read_bytes() for path in paths}
     for name in (PlanRecord.FILE, PlanRecord.SCHEMA_FILE):
@@ -257,14 +254,15 @@ def _open_loop_alone(again: Sequence[Any], recorded: Sequence[Any]) -> list[Any]
     return [taken.get(r.variant, r) if r.control == OPEN_LOOP else r for r in recorded]
 
 
-def as_given(again: PlanRecord, record: PlanRecord) -> PlanRecord:
+def as_given(again: AnyRecord, record: AnyRecord) -> AnyRecord:
     """Return `again` with the fields that cannot be reproduced copied from `record`."""
     given = {name: getattr(record, name) for name in GIVEN}
     if not record.is_before(OFFSETS_SINCE):  # an earlier minor version only lacks fields
         given["schema_version"] = record.schema_version
-    contract = contract_as(again.contract, record)
-    made = again.model_copy(update={**given, "model": model_as(again.model, record), "contract": contract})
-    if made.phases is None or record.phases is None:
+    if record.is_before(4, 1):  # such a record lists fewer files, which `rebuilt` has checked
+        given |= {"model": record.model, "contract": _contract_with_paths(again, record)}
+    made = again.model_copy(update=given)
+    if not (isinstance(made, PlanRecord) and isinstance(record, PlanRecord) and made.phases and record.phases):
         return made
     links = [  # records of 2.x lack the values of an impact
         link.model_copy(update={"reset": was.reset}) if was.reset == {"impact": {}} else link
@@ -273,12 +271,12 @@ def as_given(again: PlanRecord, record: PlanRecord) -> PlanRecord:
     return made.model_copy(update={"phases": made.phases.model_copy(update={"links": links})})
 
 
-def contract_as(again: Mapping[str, Any], record: SealedRecord) -> dict[str, Any]:
-    """Return the contract of a reloaded model; before version 4.1 it and its notes contain the model file's path."""
-    recorded = record.model_dump().get("contract") or {}
+def _contract_with_paths(made: SealedRecord, record: SealedRecord) -> dict[str, Any]:
+    """Return the contract in `made`; before version 4.1 it and its notes contain the model file's path."""
+    again, recorded = (side.model_dump().get("contract") or {} for side in (made, record))
     source = recorded.get("source")
-    if not record.is_before(4, 1) or not again or source is None:
-        return dict(again)
+    if not again or source is None:
+        return again
     name = Path(source).name
     paths = re.compile(rf"{re.escape(source)}|[^\s'\"(]*/{re.escape(name)}")
     notes = [paths.sub(lambda _: name, str(note)) for note in recorded["notes"]]
@@ -293,17 +291,12 @@ def as_written(fields: Any, recorded: Any) -> Any:
     return {key: as_written(value, recorded.get(key)) for key, value in known.items()}
 
 
-def model_as(again: ModelInput, record: SealedRecord) -> ModelInput:
-    """Return a reloaded model's input; before version 4.1, which lists fewer files, the one that `rebuilt` checks."""
-    return record.model if record.is_before(4, 1) else again
-
-
 def _without_the_search(
     recorded: Solution, folder: Path, records: Mapping[Path, PlanRecord], unrepeated: tuple[str, ...]
 ) -> Reproduced:
     """Reproduce a directory from its plan alone, without the parts that depend on the search."""
     again = _written(recorded, folder, records, 0.0)
-    missing = [*SEARCHED, *SEARCHED_IN_PHASES]
+    missing = [*SEARCHED]
     for record in records.values():
         costs, constraints = unknown_functions(record)
         if costs:

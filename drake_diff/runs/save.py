@@ -4,7 +4,6 @@ The directory is written next to its final place and then moved there. record.js
 a killed run says that it is incomplete. A solve in phases has a directory phase_0, phase_1, ... for each phase.
 """
 
-import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from importlib import import_module
@@ -35,15 +34,7 @@ from drake_diff.runs.directory import (
     writing,
     written_whole,
 )
-from drake_diff.runs.fields import (
-    Event,
-    SealedRecord,
-    canonical,
-    evidence,
-    files_below,
-    finite,
-    reproducible,
-)
+from drake_diff.runs.fields import Event, SealedRecord, evidence, files_below, finite, reproducible
 from drake_diff.runs.measurement import Measurement, failure_of, measure, replay_evidence
 from drake_diff.runs.plan_record import ChainEvidence, LinkEvidence, PhaseEvidence, PhasesSection, PlanRecord
 from drake_diff.runs.provenance import gradient_evidence, header, write_bundle
@@ -59,14 +50,6 @@ from drake_diff.runs.rebuild import (
     write_plan,
 )
 from drake_diff.runs.sections import asked, found, solver_of, unknown_functions
-
-
-def unfinished_record(folder: Path, problem: Problem | PhasedProblem, sentence: str, **fields: Any) -> PlanRecord:
-    """Return the record of a run that has no measured solution."""
-    if isinstance(problem, PhasedProblem):
-        fields |= {"phases": PhasesSection(**_asked_of_all(problem)), **header(name_of(folder))}
-        return PlanRecord(verdict="incomplete", sentence=sentence, **fields)
-    return _record(folder, problem, verdict="incomplete", sentence=sentence, **asked(problem), **fields)
 
 
 def _asked_of_all(problem: PhasedProblem) -> dict[str, Any]:
@@ -137,15 +120,25 @@ REPLAY, REPORT = "replay.html", "report.html"
 # Modules of higher-level packages, which are not loaded to save a solve.
 SAVED_BY = {"Identification": "drake_diff.identification.files", "ClosedLoop": "drake_diff.loop.files"}
 UNDER_WAY = "the run has started and not finished: it is still running, or it was killed or broke off"
+IN_THE_SETUP = "the run was interrupted during the setup of its problem, before the search began"
 BEFORE_THE_SEARCH = "the run was interrupted before the search began: there is no plan"
 NOT_MEASURED = "the search has ended, and its plan is not measured yet"
 RECOVERED = "recovered from what a run left that did not end: its search is not made again"  # end of its sentence
 FILES = (PLAN, TRACE, REPLAY, REPORT)  # the files that `save` writes besides the record and its schema
 
 
-def begin(folder: Path, problem: Problem | PhasedProblem, sentence: str = UNDER_WAY) -> None:
-    """Mark `folder` as a run in progress: its record says "incomplete" until the run ends."""
-    unfinished_record(folder, problem, sentence).begin(folder)
+def begin(folder: Path, problem: Problem | PhasedProblem | None, sentence: str = UNDER_WAY, /, **fields: Any) -> None:
+    """Write the record of a run without a measured solution, which says "incomplete" until the run ends.
+
+    `problem` is None for a run that ended before there was a problem. `fields` are further fields of the record.
+    """
+    if isinstance(problem, PhasedProblem):
+        fields["phases"] = PhasesSection(**_asked_of_all(problem))
+    elif problem is not None:
+        fields |= asked(problem)
+    model = problem.moved if isinstance(problem, Problem) else None
+    sections = header(name_of(folder), model) | fields
+    PlanRecord(verdict="incomplete", sentence=sentence, **sections).begin(folder)
 
 
 @overload
@@ -207,40 +200,36 @@ def _save_other(result: Any, directory: str | Path, meshes: bool) -> Any:
 def write_run(solution: Solution | PhasedSolution, folder: Path, *, meshes: bool = True) -> PlanRecord:
     """Write the files of `save` into `folder`, which `written_whole` gave."""
     keep_plan(solution, folder)  # the measurement may take long
-    phases = solution.phases if isinstance(solution, PhasedSolution) else (solution,)
-    write_bundle(folder, *(phase.problem.moved for phase in phases), meshes=meshes)
+    write_bundle(folder, *(phase.problem.moved for phase in solution.phases), meshes=meshes)
     return write_measured(solution, folder)
+
+
+# A function of a measured record and its folder: the record to write, and its fields for the pages and the trace.
+Amend = Callable[[PlanRecord, Path], tuple[PlanRecord, dict[str, Any]]]
+
+
+def phases_in(folder: Path, solution: Solution | PhasedSolution) -> list[tuple[Path, Solution]]:
+    """Return the folder of each phase with its solution, or `folder` itself for a solution in one phase."""
+    if not isinstance(solution, PhasedSolution):
+        return [(folder, solution)]
+    return [(folder / directory_of(i), phase) for i, phase in enumerate(solution.phases)]
 
 
 def write_measured(
     solution: Solution | PhasedSolution,
     folder: Path,
-    amend: Callable[[PlanRecord, Path], PlanRecord] = lambda record, folder: record,
-    dump: Callable[[PlanRecord, Path], dict[str, Any]] = lambda record, folder: fields_of(record),
+    amend: Amend = lambda record, _: (record, record.content()),
 ) -> PlanRecord:
-    """Measure `solution` and write it to `folder`; `amend` changes each record before it is used.
-
-    `dump` returns the fields of a record for the pages and the trace.
-    """
+    """Measure `solution` and write it to `folder`."""
+    for inner, phase in phases_in(folder, solution):
+        measurement = measure(phase)
+        record, fields = amend(record_of(measurement, inner), inner)
+        make_folder(inner)
+        write_files(inner, measurement, fields)
+        record = record.write(inner)
     if isinstance(solution, PhasedSolution):
-        for i, phase in enumerate(solution.phases):
-            write_measured(phase, folder / directory_of(i), amend, dump)
-        return amend(record_of_phases(folder, solution), folder).write(folder)
-    measurement = measure(solution)
-    record = amend(record_of(measurement, folder), folder)
-    make_folder(folder)
-    write_files(folder, measurement, dump(record, folder))
-    return record.write(folder)
-
-
-def record_without_problem(name: str, sentence: str) -> PlanRecord:
-    """Return the record of a run that ended before there was a problem, with the reason, the time and the versions."""
-    return PlanRecord(
-        verdict="incomplete",
-        sentence=sentence,
-        **header(name),
-        events=[Event(t_s=None, kind="failure", message=sentence)],
-    )
+        record = amend(record_of_phases(folder, solution), folder)[0].write(folder)
+    return record
 
 
 def keep_plan(solution: Solution | PhasedSolution, folder: Path) -> None:
@@ -249,17 +238,14 @@ def keep_plan(solution: Solution | PhasedSolution, folder: Path) -> None:
     Signals are deferred until both are written.
     """
     with held_interrupts():
-        sentence = f"{NOT_MEASURED}: {solution.message}"
+        for inner, phase in phases_in(folder, solution):
+            make_folder(inner)
+            write_plan(inner / PLAN, phase, partial=True)
+            incomplete: dict[str, Any] = {"verdict": "incomplete", "sentence": f"{NOT_MEASURED}: {phase.message}"}
+            incomplete |= asked(phase.problem, phase) | found(phase, measured=False)
+            _record(inner, phase.problem, phase.wall_time, **incomplete).begin(inner)
         if isinstance(solution, PhasedSolution):
-            for i, phase in enumerate(solution.phases):
-                keep_plan(phase, folder / directory_of(i))
-            unfinished_record(folder, solution.problem, sentence).begin(folder)
-            return
-        make_folder(folder)
-        write_plan(folder / PLAN, solution, partial=True)
-        sections = asked(solution.problem, solution) | found(solution, measured=False)
-        incomplete: dict[str, Any] = {"verdict": "incomplete", "sentence": sentence, **sections}
-        _record(folder, solution.problem, solution.wall_time, **incomplete).begin(folder)
+            begin(folder, solution.problem, f"{NOT_MEASURED}: {solution.message}")
 
 
 @contextmanager
@@ -275,13 +261,12 @@ def plan_kept(solution: Solution | PhasedSolution, name: str, folder: Path | Non
 
 
 def _has_plan(folder: Path, solution: Solution | PhasedSolution) -> bool:
-    if isinstance(solution, PhasedSolution):
-        return all(_has_plan(folder / directory_of(i), phase) for i, phase in enumerate(solution.phases))
     try:
-        plan = read_plan(folder / PLAN, partial=True)
+        plans = [(read_plan(inner / PLAN, partial=True), phase) for inner, phase in phases_in(folder, solution)]
     except ArtifactError:
         return False
-    return all(np.array_equal(plan[name], getattr(solution, name), equal_nan=True) for name in ("xs", "us"))
+    pairs = [(plan[name], getattr(phase, name)) for plan, phase in plans for name in ("xs", "us")]
+    return all(np.array_equal(written, array, equal_nan=True) for written, array in pairs)
 
 
 def _kept_elsewhere(solution: Solution | PhasedSolution, name: str) -> str:
@@ -297,12 +282,6 @@ def _kept_elsewhere(solution: Solution | PhasedSolution, name: str) -> str:
     return "the plan could not be saved: no temporary folder can be written"
 
 
-def fields_of(record: PlanRecord) -> dict[str, Any]:
-    """Return the fields of a record in the order in which they are written."""
-    fields: dict[str, Any] = json.loads(canonical(record.model_dump(mode="json")))
-    return fields
-
-
 def write_files(folder: Path, measurement: Measurement, fields: dict[str, Any]) -> None:
     """Write `FILES`, that is, all files except the record with these `fields` and its schema."""
     from drake_diff.runs.page import write_pages
@@ -313,8 +292,11 @@ def write_files(folder: Path, measurement: Measurement, fields: dict[str, Any]) 
     write_pages(folder / REPLAY, folder / REPORT, measurement, fields)
 
 
-def begin_interrupted(folder: Path, problem: Problem | PhasedProblem) -> None:
+def begin_interrupted(folder: Path, problem: Problem | PhasedProblem | None) -> None:
     """Mark the run in `folder` as interrupted, before the search if it has no record yet."""
+    if problem is None:
+        begin(folder, None, IN_THE_SETUP, events=[Event(t_s=None, kind="failure", message=IN_THE_SETUP)])
+        return
     if record_path(folder) is None:
         begin(folder, problem, BEFORE_THE_SEARCH)
         return
@@ -327,7 +309,7 @@ def begin_failure(error: BaseException, folder: Path, problem: Problem | PhasedP
     failure = failure_of(error)
     event = Event(t_s=None, kind="failure", message=failure.message)
     sentence = f"the run ended with an error: {failure.message}"
-    unfinished_record(folder, problem, sentence, failures=[failure], events=[event]).begin(folder)
+    begin(folder, problem, sentence, failures=[failure], events=[event])
 
 
 def record_of(m: Measurement, folder: Path) -> PlanRecord:
@@ -418,7 +400,7 @@ def _measured(folder: Path, record: PlanRecord, target: Path) -> PlanRecord:
     with rebuilt(folder, record, ANYWHERE) as model, written_whole(target) as whole:
         measurement = measure(resolve(record, model, plan).told(iterations=rows_of(plan)))
         made = _with_the_search(record_of(measurement, whole), record)
-        write_files(whole, measurement, fields_of(made))
+        write_files(whole, measurement, made.content())
         write_bundle(whole, model)
         return made.write(whole)
 

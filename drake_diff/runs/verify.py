@@ -38,7 +38,6 @@ from drake_diff.runs.reproduce import (
     SAME_PLAN,
     SEARCH_TOPICS,
     SEARCHED,
-    SEARCHED_IN_PHASES,
     contradictions,
     is_below,
     odd_metrics,
@@ -248,19 +247,17 @@ def require_readable(function: str, folder: Path, models: str | Path | None) -> 
         raise ArtifactError(f"{folder}: {answer.error}")
 
 
-def verify_own(directory: Path) -> Verification:
-    """Verify a directory that this process just wrote, in this process, without limits, and with its model anywhere."""
+def verify_own(directory: Path, models: Path | None = ANYWHERE) -> Verification:
+    """Verify a directory in this process without limits, which needs trust; its model may be anywhere."""
     result = _looked_at(directory)
     if result.complaints or result.undecided or result.record is None:
         return result
-    return _run_again(result, result.record, ANYWHERE)
+    return _run_again(result, result.record, models)
 
 
 def _apart(directory: str, models: str | None) -> dict[str, Any]:
-    """Verify a directory whose files are unchanged; `verify` calls this in a child process."""
-    result = _looked_at(Path(directory))
-    if result.record is not None and not (result.complaints or result.undecided):
-        result = _run_again(result, result.record, None if models is None else Path(models))
+    """Verify a directory; `verify` calls this in a child process."""
+    result = verify_own(Path(directory), None if models is None else Path(models))
     return {name: getattr(result, name) for name in (*MADE_APART, "checked")}
 
 
@@ -268,7 +265,13 @@ def _looked_at(folder: Path) -> Verification:
     """Check a directory without reproducing it."""
     path = record_path(folder)
     if is_partial(folder):
-        return _of_a_part(folder)
+        try:
+            unfinished: SealedRecord | None = load_record(folder)
+        except ArtifactError:
+            unfinished = None
+        why = "no record" if unfinished is None else unfinished.sentence
+        reason = f"the run is incomplete and was not moved to its directory: {why}"
+        return Verification(folder, unfinished, undecided=(reason,))
     if path is None:
         return Verification(folder, None, complaints=(f"no record: {SealedRecord.FILE} is missing",))
     try:
@@ -282,16 +285,6 @@ def _looked_at(folder: Path) -> Verification:
     if record.state == "incomplete" or unsolved:
         return replace(result, undecided=(f"there is nothing to reproduce: {record.sentence}",))
     return result
-
-
-def _of_a_part(folder: Path) -> Verification:
-    """Verify a run that was not moved to its final directory."""
-    try:
-        record: SealedRecord | None = load_record(folder)
-    except ArtifactError:
-        record = None
-    why = "no record" if record is None else record.sentence
-    return Verification(folder, record, undecided=(f"the run is incomplete and was not moved to its directory: {why}",))
 
 
 def _run_again(verification: Verification, record: SealedRecord, models: Path | None) -> Verification:
@@ -491,7 +484,7 @@ def _told_of_a_solve(
 def _is_searched(d: Difference) -> bool:
     """Return whether a difference is in the claims about the search, or in a page, which shows them too."""
     if d.file.endswith(SealedRecord.FILE):
-        return is_below(d.key, (*SEARCHED, *SEARCHED_IN_PHASES))
+        return is_below(d.key, SEARCHED)
     if d.key.startswith(DRAWN):
         return False
     return not d.file.endswith(TRACE) or d.key.startswith((*SEARCH_TOPICS, "attachment ", "metadata "))

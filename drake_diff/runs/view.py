@@ -241,12 +241,21 @@ SECOND = Rgba(0.85, 0.4, 0.05, 0.45)  # similar to the colour of its lines
 
 @dataclass(frozen=True, eq=False)
 class _Curve:
-    """A column of a plan: its unit, values at `times`, and limits."""
+    """A column of a plan: its unit, values at `times`, and limits; `held` is true for an input."""
 
     unit: str
     times: Array
     values: Array
     limits: tuple[float | None, float | None]
+    held: bool
+
+    def sample(self, times: Array) -> Array:
+        """Interpolate the values at other times, linearly or as a step function; NaN after the end."""
+        if self.held:
+            result = self.values[np.searchsorted(self.times, times, side="right") - 1]
+        else:
+            result = np.interp(times, self.times, self.values)
+        return np.where(times > self.times[-1], np.nan, result)
 
 
 def write_runs_page(path: Path, a: str | Path, b: str | Path, *, models: str | Path | None = None) -> None:
@@ -260,73 +269,58 @@ def write_runs_page(path: Path, a: str | Path, b: str | Path, *, models: str | P
     names = [record.name for record in records]
     if names[0] == names[1]:
         names = [str(folder) for folder in folders]
-    states, inputs = zip(*(_curves(r, folder) for r, folder in zip(records, folders, strict=True)), strict=True)
-    plots = [*_plots("Positions and velocities", names, states), *_plots("Inputs", names, inputs, held=True)]
-    ends = [float(max(c.times[-1] for c in item.values())) for item in states]
+    curves = [_curves(record, folder) for record, folder in zip(records, folders, strict=True)]
+    ends = [float(max(c.times[-1] for c in by_name.values())) for by_name in curves]
     view, caption = _replay(folders, names, models)
     runs = [
         {"name": n, "verdict": r.verdict, "sentence": r.sentence, "duration_s": end}
         for n, r, end in zip(names, records, ends, strict=True)
     ]
-    record = {"runs": runs, **asdict(result), "sentence": _sentence(names, states)}
-    data = page_data(max(ends), plots)
+    record = {"runs": runs, **asdict(result), "sentence": _sentence(names, curves)}
+    data = page_data(max(ends), [*_plots(names, curves)])
     path.parent.mkdir(parents=True, exist_ok=True)
     write_page(path, "compare_runs.html.j2", record=record, data=data, view=view, caption=caption)
 
 
-def _curves(record: PlanRecord, folder: Path) -> tuple[dict[str, _Curve], dict[str, _Curve]]:
+def _curves(record: PlanRecord, folder: Path) -> dict[str, _Curve]:
     """Return the states and the inputs of a run's plan, by name."""
-    log, p = read_mcap(folder / TRACE, links=False), dict[str, Any](record.problem)
+    log, p, curves = read_mcap(folder / TRACE, links=False), dict[str, Any](record.problem), dict[str, _Curve]()
     if not log.messages.get("/planned/state"):
         raise ArtifactError(f"{folder / TRACE} has no plan")
-
-    def curves(topic: str, parts: str, lower: list[Any], upper: list[Any]) -> dict[str, _Curve]:
+    for topic, symbols, kind in (("/planned/state", "qv", "x"), ("/planned/input", "u", "u")):
         columns, metadata = log.arrays(topic), log.channel_metadata[topic]
-        values = np.hstack([columns[symbol] for symbol in parts])
-        pairs = [(name, metadata["units"][symbol][name]) for symbol in parts for name in metadata["names"][symbol]]
-        return {
-            name: _Curve(unit, columns["time"], values[:, i], (lower[i], upper[i]))
-            for i, (name, unit) in enumerate(pairs)
-        }
-
-    states = curves("/planned/state", "qv", p["x_lower"], p["x_upper"])
-    return states, curves("/planned/input", "u", p["u_lower"], p["u_upper"])
+        values = np.hstack([columns[symbol] for symbol in symbols])
+        pairs = [(name, metadata["units"][symbol][name]) for symbol in symbols for name in metadata["names"][symbol]]
+        limits = list(zip(p[f"{kind}_lower"], p[f"{kind}_upper"], strict=True))
+        for i, (name, unit) in enumerate(pairs):
+            title = f"input {name}" if kind == "u" else name
+            curves[title] = _Curve(unit, columns["time"], values[:, i], limits[i], kind == "u")
+    return curves
 
 
-def _plots(group: str, names: Sequence[str], both: Sequence[dict[str, _Curve]], held: bool = False) -> Iterator[Plot]:
-    """Yield a plot for each column of either run, with limits if they agree."""
-    for title in dict.fromkeys([*both[0], *both[1]]):
-        curves = [item.get(title) for item in both]
-        known = [c for c in curves if c is not None]
-        times = np.unique(np.concatenate([c.times for c in known]))
-        lines = [
-            Line(name, np.full(len(times), np.nan) if c is None else _curve_values(times, c, held), held=held)
-            for name, c in zip(names, curves, strict=True)
-        ]
+def _plots(names: Sequence[str], both: Sequence[dict[str, _Curve]]) -> Iterator[Plot]:
+    """Yield a plot for each column of either run, first the states, with limits if they agree."""
+    for title in sorted(both[0] | both[1], key=lambda title: (both[0] | both[1])[title].held):
+        known = [by_name[title] for by_name in both if title in by_name]
+        held, times = known[0].held, np.unique(np.concatenate([c.times for c in known]))
+        lines = []
+        for name, by_name in zip(names, both, strict=True):
+            values = by_name[title].sample(times) if title in by_name else np.full(len(times), np.nan)
+            lines.append(Line(name, values, held=held))
         limits = known[0].limits if all(c.limits == known[0].limits for c in known) else (None, None)
         odd = len({c.unit for c in known}) > 1
         unit = " and ".join(dict.fromkeys(c.unit for c in known))
-        heading = f"input {title}" if held else title
-        yield Plot(heading, unit, times, lines, limits=limits, percent=held and not odd, group=group)
+        group = "Inputs" if held else "Positions and velocities"
+        yield Plot(title, unit, times, lines, limits=limits, percent=held and not odd, group=group)
 
 
-def _curve_values(times: Array, curve: _Curve, held: bool) -> Array:
-    """Interpolate a curve at other times, linearly or as a step function (`held`); NaN after its end."""
-    if held:
-        result = curve.values[np.searchsorted(curve.times, times, side="right") - 1]
-    else:
-        result = np.interp(times, curve.times, curve.values)
-    return np.where(times > curve.times[-1], np.nan, result)
-
-
-def _sentence(names: Sequence[str], states: Sequence[dict[str, _Curve]]) -> str:
+def _sentence(names: Sequence[str], both: Sequence[dict[str, _Curve]]) -> str:
     """State where the plans are furthest apart, in their common states and relative to the states' largest value."""
-    shared = [name for name in states[0] if name in states[1]]
     worst, sentence = -1.0, "the two plans have no state in common"
-    for name in shared:
-        item, other = states[0][name], states[1][name]
+    for name in (name for name, c in both[0].items() if name in both[1] and not c.held):
+        item, other = both[0][name], both[1][name]
         times = np.unique(np.concatenate([item.times, other.times]))
-        gap = np.abs(_curve_values(times, item, False) - _curve_values(times, other, False))
+        gap = np.abs(item.sample(times) - other.sample(times))
         if not np.any(np.isfinite(gap)):
             continue
         k = int(np.nanargmax(gap))

@@ -163,7 +163,7 @@ def _page_facts(folder: Path, record: PlanRecord) -> dict[str, Any]:
     reason = trial["reason"] or "it succeeds, but it ends furthest from the goal of all trials"
     much = sized(trial["perturbation"], trial["level"])
     return {
-        "record": json.loads(canonical(record.model_dump(mode="json"))),  # in the order of the file
+        "record": record.content(),
         "view": read_plain(folder / worst / REPLAY).decode(errors="replace"),
         "caption": f"The worst trial of {trial['perturbation']} {much}, with the plan as a ghost: {reason}.",
         "enough": ENOUGH,

@@ -17,7 +17,7 @@ from drake_diff.model.named_files import lay_out, named_files
 from drake_diff.runs.fields import canonical, files_below, own_sha256
 from drake_diff.runs.measurement import measure
 from drake_diff.runs.provenance import write_bundle
-from drake_diff.runs.save import fields_of, record_of, write_files
+from drake_diff.runs.save import record_of, write_files
 from drake_diff.runs.view import scene_of_run
 
 pytestmark = pytest.mark.solve
@@ -191,7 +191,7 @@ def forged(arm, folder, change):
     named = {file.path: file for file in honest.model.named}
     named = change(named, folder / "model") or named
     record = honest.model_copy(update={"model": honest.model.model_copy(update={"named": list(named.values())})})
-    write_files(folder, measurement, fields_of(record))
+    write_files(folder, measurement, record.content())
     record.write(folder)
     return dd.verify(folder)
 
