@@ -4,7 +4,7 @@
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -219,39 +219,34 @@ def _metrics_of_the_replay(
     solution: Solution, motion: Rollout | None, states: Sequence[CoordinateTerms], positions: Sequence[CoordinateTerms]
 ) -> Iterator[Metric]:
     here, x, position = ON_THE_PLANT[solution.problem.motion], _unit(states), _unit(positions)
-    measures = (
-        ("replay end error", f"largest distance of the final state {here} from the plan's", x),
-        (HALF_STEP, "the same, in steps half as long", x),
-        ("energy drift", f"lasting energy that no force explains (actuators, damping, contact, limits), {here}", "J"),
-        ("energy oscillation", f"largest oscillation of that energy about its drift, {here}", "J"),
-        ("energy scale", f"range of kinetic plus potential energy {here}", "J"),
-        ("penetration", f"largest overlap of two geometries {here}", "m"),
-        ("joint limit violation", f"largest excess over a joint limit or of a quaternion's norm {here}", position),
-    )
-    values, reason = [math.inf] * len(measures), NO_REPLAY
-    if motion is not None:
-        reason = "not finite"
-        values = [
-            float(np.abs(motion.xs[-1] - solution.xs[-1]).max()),
-            solution.half_step_error,
-            abs(motion.energy_drift),
-            motion.energy_oscillation,
-            float(np.ptp(motion.energy)),
-            float(np.max(motion.penetration)),
-            float(np.max(motion.constraint_violation)),
-        ]
-    bounds = {}
+
+    def on_replay(
+        name: str, definition: str, value: Callable[[Rollout], Any], unit: str, tolerance: float | None = None
+    ) -> Metric:
+        if motion is None:
+            return measured(name, definition, math.inf, unit, reason=NO_REPLAY)
+        return measured(name, definition, float(value(motion)), unit, tolerance)
+
+    tolerance = None
     judged = solution.judged_replay  # a replay that holds has passed its own energy check
     rests_on_it = judged is None or judged.motion is None or judged.motion is motion
     if motion is not None and rests_on_it and np.all(np.isfinite(motion.constraint_violation)):  # else may lose energy
-        bounds["energy drift"] = energy_tolerance(motion)
+        tolerance = energy_tolerance(motion)
     if motion is not None and solution.problem.has_model and solution.problem.model.file_facts.held_points:
         loop = loop_check(solution.problem.model, motion)
         yield measured("loop gap", f"largest distance of points that a loop holds together {here}", loop.value, "m")
-    for (name, definition, unit), value in zip(measures, values, strict=True):
-        if name == HALF_STEP and solution.problem.motion != STEPS:
-            continue  # continuous time has no steps
-        yield measured(name, definition, value, unit, bounds.get(name), reason=reason)
+    definition = f"largest distance of the final state {here} from the plan's"
+    yield on_replay("replay end error", definition, lambda m: np.abs(m.xs[-1] - solution.xs[-1]).max(), x)
+    if solution.problem.motion == STEPS:  # continuous time has no steps
+        yield on_replay(HALF_STEP, "the same, in steps half as long", lambda _: solution.half_step_error, x)
+    definition = f"lasting energy that no force explains (actuators, damping, contact, limits), {here}"
+    yield on_replay("energy drift", definition, lambda m: abs(m.energy_drift), "J", tolerance)
+    definition = f"largest oscillation of that energy about its drift, {here}"
+    yield on_replay("energy oscillation", definition, lambda m: m.energy_oscillation, "J")
+    yield on_replay("energy scale", f"range of kinetic plus potential energy {here}", lambda m: np.ptp(m.energy), "J")
+    yield on_replay("penetration", f"largest overlap of two geometries {here}", lambda m: np.max(m.penetration), "m")
+    definition = f"largest excess over a joint limit or of a quaternion's norm {here}"
+    yield on_replay("joint limit violation", definition, lambda m: np.max(m.constraint_violation), position)
 
 
 def _failures(solution: Solution, metrics: Sequence[Metric]) -> Iterator[Failure]:

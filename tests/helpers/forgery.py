@@ -35,9 +35,23 @@ def seal(folder: Path, fields: dict[str, Any], *, attach: bool = True) -> None:
         name: {"path": name, "bytes": len(data), "sha256": sha256(data).hexdigest(), "reason": None}
         for name, data in sorted(files.items())
     }
-    fields["record_sha256"] = ""
-    fields["record_sha256"] = sha256(canonical(fields).encode()).hexdigest()
-    (folder / "record.json").write_text(canonical(fields))
+    (folder / "record.json").write_text(sealed(fields))
+
+
+def sealed(fields: dict[str, Any]) -> str:
+    """Return the text of a record with its own hash."""
+    own = sha256(canonical({**fields, "record_sha256": ""}).encode()).hexdigest()
+    return canonical({**fields, "record_sha256": own})
+
+
+def edit(folder: Path, change: Callable[[dict[str, Any]], Any], *, files: bool = False) -> None:
+    """Change the fields of a record, with its hash and, with `files`, the hashes of all files, but not the trace."""
+    fields = json.loads((folder / "record.json").read_text())
+    change(fields)
+    if files:
+        seal(folder, fields, attach=False)
+    else:
+        (folder / "record.json").write_text(sealed(fields))
 
 
 def rewrite(

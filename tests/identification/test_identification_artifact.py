@@ -1,13 +1,13 @@
 """Check an identification's directory: its contents, that verification reproduces it, and that forgeries fail."""
 
 import io
-import json
 import shutil
 from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.forgery import edit
 from helpers.models import MODELS
 from helpers.table import each_row, slow_after
 from scipy.integrate import solve_ivp
@@ -17,7 +17,6 @@ import drake_diff as dd
 from drake_diff.cli.main import app
 from drake_diff.exceptions import ArtifactError, InputError
 from drake_diff.logs.mcap_file import read_mcap
-from drake_diff.runs.fields import own_sha256
 
 pytestmark = pytest.mark.solve
 
@@ -108,18 +107,6 @@ def test_arrays_in_place_of_a_file_are_kept_and_hold(tmp_path):
     assert dd.verify(tmp_path / "run").holds
 
 
-def reseal(directory, change):
-    """Apply a change to the record and recompute all hashes."""
-    path = directory / "record.json"
-    fields = json.loads(path.read_text())
-    change(fields)
-    for name, evidence in fields["files"].items():
-        data = (directory / name).read_bytes()
-        evidence |= {"bytes": len(data), "sha256": sha256(data).hexdigest()}
-    fields["record_sha256"] = own_sha256(fields)
-    path.write_text(json.dumps(fields, sort_keys=True, indent=2) + "\n")
-
-
 def by(section, key, factor):
     def change(fields):
         fields[section][0][key] *= factor
@@ -159,7 +146,7 @@ def to(key, value):
 )
 def test_what_is_forged_and_hashed_again_is_refused(run, tmp_path, change, words):
     copy = shutil.copytree(run, tmp_path / "copy", dirs_exist_ok=True)  # overwrites the copy of the previous row
-    reseal(copy, change)
+    edit(copy, change, files=True)
     verified = dd.verify(copy)
     assert verified.verdict == "broken"
     assert any(words in line for line in verified.complaints), verified.complaints
@@ -172,9 +159,9 @@ def test_a_changed_recording_is_refused_however_it_is_hashed(copy):
     def own_hash(fields):
         fields["recordings"][0]["sha256"] = sha256(place.read_bytes()).hexdigest()
 
-    reseal(copy, lambda fields: None)
+    edit(copy, lambda fields: None, files=True)
     assert any("the recording does not match its hash" in line for line in dd.verify(copy).complaints)
-    reseal(copy, own_hash)
+    edit(copy, own_hash, files=True)
     verified = dd.verify(copy)
     assert verified.verdict == "broken"
     assert any("estimates[hinge.damping].value" in line for line in verified.complaints)
@@ -186,7 +173,7 @@ def test_a_fit_that_explains_nothing_cannot_be_sold_as_one_that_does(tmp_path):
     record = dd.save(dd.identify(model, log, ["hinge.damping"]), tmp_path / "run")
     assert (record.verdict, record.explained) == ("fail", False)
     assert dd.verify(tmp_path / "run").holds  # the record is valid, although the fit failed
-    reseal(tmp_path / "run", lambda f: f.update(verdict="pass", explained=True))
+    edit(tmp_path / "run", lambda f: f.update(verdict="pass", explained=True), files=True)
     verified = dd.verify(tmp_path / "run")
     assert verified.verdict == "broken"
     assert any("explained: recorded true, recomputed false" in line for line in verified.complaints)
@@ -202,7 +189,7 @@ def test_another_file_beside_the_record_is_refused(run, tmp_path, name):
         changed = (copy / "recordings" / "0" / "lab.csv").read_bytes()
     assert changed != data
     (copy / name).write_bytes(changed)
-    reseal(copy, lambda fields: None)
+    edit(copy, lambda fields: None, files=True)
     assert dd.verify(copy).verdict == "broken"
 
 

@@ -1,15 +1,15 @@
 """Check the directory of a solve in phases: verification repeats the solve and refuses forgeries."""
 
 import io
-import json
-from hashlib import sha256
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.forgery import edit
 from helpers.models import MODELS
 
 import drake_diff as dd
-from drake_diff.runs.fields import canonical, own_sha256
 
 pytestmark = [pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning"), pytest.mark.solve]
 
@@ -62,36 +62,18 @@ def bounced(tmp_path_factory):
     return folder
 
 
-def copied(folder, to):
-    for path in folder.rglob("*"):
-        if path.is_file():
-            there = to / path.relative_to(folder)
-            there.parent.mkdir(parents=True, exist_ok=True)
-            there.write_bytes(path.read_bytes())
-    return to
+def forged(folder, change, phase=""):
+    """Change the record of a phase or of the whole run, with all hashes, and verify the run."""
 
+    def change_section(fields):
+        section = fields["phases"] or {}
+        flat = {**fields, **section}
+        change(flat)
+        fields |= {key: value for key, value in flat.items() if key not in section}
+        fields["phases"] = {key: flat[key] for key in section} or None
 
-def sealed_again(folder, name):
-    """Update the hashes of the changed files, then that of the record."""
-    fields = json.loads((folder / name).read_text())
-    for path, entry in fields["files"].items():
-        data = (folder / path).read_bytes()
-        entry["bytes"], entry["sha256"] = len(data), sha256(data).hexdigest()
-    fields["record_sha256"] = own_sha256(fields)
-    (folder / name).write_text(canonical(fields))
-
-
-def forged(folder, change, name="record.json"):
-    fields = json.loads((folder / name).read_text())
-    section = fields["phases"] or {}
-    flat = {**fields, **section}
-    change(flat)
-    fields |= {key: value for key, value in flat.items() if key not in section}
-    fields["phases"] = {key: flat[key] for key in section} or None
-    (folder / name).write_text(canonical(fields))
-    if name != "record.json":
-        sealed_again(folder / name.split("/")[0], "record.json")
-    sealed_again(folder, "record.json")
+    edit(folder / phase, change_section, files=True)
+    edit(folder, lambda fields: None, files=True)
     return dd.verify(folder)
 
 
@@ -112,9 +94,8 @@ def test_a_stance_is_made_again(tmp_path):
     assert dd.verify(tmp_path / "run").verdict == "holds"
     contacts = dd.load_record(tmp_path / "run" / "phase_0").problem["fixed_contacts"]
     assert contacts == {"points": {"foot": [0.0, 0.0, -0.05]}, "axes": "xyz"}
-    found = forged(
-        tmp_path / "run", lambda f: f["problem"].update(fixed_contacts={**contacts, "axes": "z"}), "phase_0/record.json"
-    )
+    change = {**contacts, "axes": "z"}
+    found = forged(tmp_path / "run", lambda f: f["problem"].update(fixed_contacts=change), "phase_0")
     assert found.verdict == "broken"
 
 
@@ -161,7 +142,7 @@ FORGED = {
 @pytest.mark.slow
 @pytest.mark.parametrize("what", FORGED)
 def test_a_forged_record_of_the_whole_is_refused(swung, tmp_path, what):
-    found = forged(copied(swung, tmp_path / "run"), FORGED[what])
+    found = forged(Path(shutil.copytree(swung, tmp_path / "run")), FORGED[what])
     assert found.verdict == "broken", (what, repr(found))
 
 
@@ -169,7 +150,7 @@ def test_a_forged_record_of_the_whole_is_refused(swung, tmp_path, what):
 @pytest.mark.parametrize("seed", range(3))
 def test_a_plan_that_was_moved_is_refused(swung, tmp_path, seed):
     random = np.random.default_rng(seed)
-    folder = copied(swung, tmp_path / "run")
+    folder = Path(shutil.copytree(swung, tmp_path / "run"))
     phase = folder / f"phase_{seed % 2}"
     with np.load(phase / "plan.npz") as file:
         arrays = {name: np.array(file[name]) for name in file.files}
@@ -179,9 +160,7 @@ def test_a_plan_that_was_moved_is_refused(swung, tmp_path, seed):
     buffer = io.BytesIO()
     np.savez(buffer, **dict(sorted(arrays.items())))
     (phase / "plan.npz").write_bytes(buffer.getvalue())
-    sealed_again(phase, "record.json")
-    sealed_again(folder, "record.json")
-    assert dd.verify(folder).verdict == "broken"
+    assert forged(folder, lambda fields: None, phase.name).verdict == "broken"
 
 
 def metric(name, value):
@@ -194,18 +173,18 @@ def metric(name, value):
 @pytest.mark.parametrize(
     ("what", "where", "change"),
     [
-        ("a link's error", "record.json", of_links),
-        ("a goal error", "phase_1/record.json", metric("goal error", 1e-7)),
-        ("a start", "phase_0/record.json", metric("initial state error", 1e-7)),
-        ("another goal", "phase_1/record.json", lambda f: f["problem"].update(x_goal=[0.7, 0.0])),
-        ("another start", "phase_0/record.json", lambda f: f["problem"].update(x0=[1.1, 0.0])),
-        ("tighter bounds", "phase_0/record.json", lambda f: f["problem"].update(x_lower=[0.5, None])),
-        ("a phase's cost", "record.json", lambda f: f["phases"][0].update(cost=1.0)),
-        ("another reset", "record.json", lambda f: f["links"][0]["reset"]["matrix"]["rows"][1].__setitem__(1, -0.9)),
+        ("a link's error", "", of_links),
+        ("a goal error", "phase_1", metric("goal error", 1e-7)),
+        ("a start", "phase_0", metric("initial state error", 1e-7)),
+        ("another goal", "phase_1", lambda f: f["problem"].update(x_goal=[0.7, 0.0])),
+        ("another start", "phase_0", lambda f: f["problem"].update(x0=[1.1, 0.0])),
+        ("tighter bounds", "phase_0", lambda f: f["problem"].update(x_lower=[0.5, None])),
+        ("a phase's cost", "", lambda f: f["phases"][0].update(cost=1.0)),
+        ("another reset", "", lambda f: f["links"][0]["reset"]["matrix"]["rows"][1].__setitem__(1, -0.9)),
     ],
 )
 def test_what_functions_do_not_decide_is_refused_where_they_are_unknown(bounced, tmp_path, what, where, change):
-    found = forged(copied(bounced, tmp_path / "run"), change, where)
+    found = forged(Path(shutil.copytree(bounced, tmp_path / "run")), change, where)
     assert found.verdict == "broken", (what, repr(found))
 
 
@@ -218,10 +197,6 @@ def test_a_failed_run_is_saved_as_one(tmp_path):
     record = dd.save(solution, tmp_path / "run")
     assert record.verdict == "fail"
     assert not solution.success
-    fields = json.loads((tmp_path / "run" / "record.json").read_text())
-    fields["verdict"] = "pass"
-    (tmp_path / "run" / "record.json").write_text(canonical(fields))
-    sealed_again(tmp_path / "run", "record.json")
-    found = dd.verify(tmp_path / "run")
+    found = forged(tmp_path / "run", lambda fields: fields.update(verdict="pass"))
     assert found.verdict == "broken"
     assert 'a verdict "pass" with' in found.complaints[0]

@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.forgery import edit, sealed
 from helpers.models import MODELS, ROOT
 
 import drake_diff as dd
 from drake_diff.comparison import save_comparison
 from drake_diff.runs import certify_model
 from drake_diff.runs.directory import upgraded
-from drake_diff.runs.fields import SCHEMA_VERSION, canonical, own_sha256
+from drake_diff.runs.fields import SCHEMA_VERSION
 from drake_diff.trials import save_robustness
 
 pytestmark = pytest.mark.solve
@@ -69,7 +70,7 @@ def downgraded(folder, copy):
         fields.pop(name, None)
     (copy / "record.json").unlink()
     fields |= {"schema_version": "2.2.0", "kind": kind}
-    (copy / f"{kind}.json").write_text(canonical({**fields, "record_sha256": own_sha256(fields)}))
+    (copy / f"{kind}.json").write_text(sealed(fields))
     return copy
 
 
@@ -102,11 +103,8 @@ def test_a_run_of_version_2_4_is_read_and_measured_again():
 
 
 def test_a_lie_in_a_run_of_version_2_4_is_found(tmp_path):
-    copy = Path(shutil.copytree(OLD, tmp_path / "run"))
-    fields = json.loads((copy / "record.json").read_bytes())
-    fields["metrics"][0]["value"] *= 0.99  # the cost
-    (copy / "record.json").write_text(canonical({**fields, "record_sha256": own_sha256(fields)}))
-    found = dd.verify(copy)
+    cost = dd.load_record(OLD).metrics[0].value
+    found = edited(OLD, tmp_path / "run", lambda fields: fields["metrics"][0].update(value=0.99 * cost))
     assert found.verdict == "undecided"  # another version wrote the run
     assert any("metrics" in line for line in found.undecided)
 
@@ -128,10 +126,7 @@ def test_the_held_points_of_version_2_are_fixed_contacts():
 
 def edited(folder, copy, change):
     """Copy a directory, change the record and its hash but not the trace, and verify the copy."""
-    shutil.copytree(folder, copy)
-    fields = json.loads((copy / "record.json").read_bytes())
-    change(fields)
-    (copy / "record.json").write_text(canonical({**fields, "record_sha256": own_sha256(fields)}))
+    edit(Path(shutil.copytree(folder, copy)), change)
     return dd.verify(copy)
 
 
