@@ -214,6 +214,10 @@ MOST_READ = 4 * GIB  # of all these files together; a sparse file occupies no di
 SURROGATE = re.compile("[\ud800-\udfff]")
 
 
+class TooManyFilesError(ArtifactError):
+    """A directory has more files than are checked, which does not say that one of them is damaged."""
+
+
 @contextmanager
 def plain_file(path: Path, most: int = MOST_FILE, *, links: bool = False) -> Iterator[io.BufferedReader]:
     """Open the file at `path`; raise ArtifactError if it is not a regular file, over `most` bytes, or unreadable.
@@ -268,7 +272,7 @@ def sha256_of(path: Path, most: int = MOST_FILE) -> tuple[int, str]:
 def files_in(folder: Path) -> dict[str, os.DirEntry[str]]:
     """Return all entries below a folder that are not folders, by their paths in it, without following links.
 
-    Raises ArtifactError if there are more than `MOST_FILES`, or if a folder cannot be read.
+    Raises TooManyFilesError if there are more than `MOST_FILES`, and ArtifactError if a folder cannot be read.
     """
     entries_by_path: dict[str, os.DirEntry[str]] = {}
     waiting, seen = [(folder, "")], 0
@@ -279,7 +283,7 @@ def files_in(folder: Path) -> dict[str, os.DirEntry[str]]:
                 for entry in entries:
                     seen += 1
                     if seen > MOST_FILES:
-                        raise ArtifactError(f"{folder}: expected at most {MOST_FILES} files, got more")
+                        raise TooManyFilesError(f"{folder}: expected at most {MOST_FILES} files, got more")
                     if entry.is_dir(follow_symlinks=False):
                         waiting.append((Path(entry.path), f"{before}{entry.name}/"))
                     else:

@@ -27,6 +27,7 @@ from pydantic import ValidationError
 from drake_diff._base.files import (
     MOST_READ,
     MOST_TEXT,
+    TooManyFilesError,
     exchange,
     files_in,
     locked,
@@ -187,7 +188,10 @@ def parse_record(path: Path, fields: Mapping[str, Any]) -> SealedRecord:
 
 
 def read_checked(path: Path) -> tuple[SealedRecord, tuple[str, ...]]:
-    """Return the record in a file, and the problems of the record and of the other files in its directory."""
+    """Return the record in a file, and the problems of the record and of the other files in its directory.
+
+    Raises TooManyFilesError if the record has no problem, and its directory has too many files to check them.
+    """
     problems = []
     try:
         fields = read_fields(path)
@@ -201,7 +205,11 @@ def read_checked(path: Path) -> tuple[SealedRecord, tuple[str, ...]]:
     except RecursionError as error:
         raise ArtifactError(f"{path.name}: nested too deep") from error
     if record.subject != "trial":
-        problems += _damage_of_files(path, record)
+        try:
+            problems += _damage_of_files(path, record)
+        except TooManyFilesError:
+            if not problems:
+                raise
     return record, tuple(problems)
 
 

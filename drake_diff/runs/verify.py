@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from drake_diff._base.arrays import positive_float
-from drake_diff._base.files import read_plain
+from drake_diff._base.files import TooManyFilesError, read_plain
 from drake_diff._base.sandbox import CallOutcome, call
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError, DrakeDiffError, InputError, MissingDependencyError, ModelError
@@ -276,6 +276,8 @@ def _looked_at(folder: Path) -> Verification:
         return Verification(folder, None, complaints=(f"no record: {SealedRecord.FILE} is missing",))
     try:
         record, problems = read_checked(path)
+    except TooManyFilesError as error:
+        return Verification(folder, load_record(folder), undecided=(f"the files were not checked: {error}",))
     except ArtifactError as error:
         return Verification(folder, None, complaints=(str(error),))
     result = Verification(folder, record, problems, claimed=claims_of(record), notes=_other_versions(record))

@@ -479,6 +479,18 @@ def test_a_panel_whose_files_do_not_follow_from_its_trials_is_broken(write, tmp_
     assert any("summary.json: the content (2 bytes)" in line for line in dd.verify(plain).complaints)
 
 
+def test_a_panel_of_too_many_trials_to_check_is_undecided_and_not_broken(write, tmp_path, monkeypatch):
+    made = run_panel(write("fails"), out=tmp_path / "out", workers=1).directory
+    monkeypatch.setattr("drake_diff._base.files.MOST_FILES", 6)
+    verification = dd.verify(made)
+    assert (verification.verdict, verification.record.subject) == ("undecided", "panel")
+    assert "the files were not checked" in verification.sentence
+    assert "expected at most 6 files, got more" in verification.sentence
+    path = made / "record.json"
+    path.write_text(path.read_text().replace('"fail"', '"pass"', 1))  # without a new hash
+    assert dd.verify(made).verdict == "broken"
+
+
 def cell(name, successes, trials, cost=None, errors=0):
     rate = success_rate(successes, trials)
     return {
