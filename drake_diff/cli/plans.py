@@ -124,7 +124,7 @@ def check(
     replays must end at its last state. The limits of the robot file apply. Exit status 0 only if every check passes.
     """
     from drake_diff.optimize.check_plan import check_plan
-    from drake_diff.planning.given import recorded_plan
+    from drake_diff.planning.guesses import recorded_plan
     from drake_diff.runs.save import save
 
     goals = numbers_in("--goal", goal or (), "NAME=x,y,z or NAME=number", counts=range(1, 100))
