@@ -228,11 +228,14 @@ def _does_not_shrink(gap: Array, least: Array, noise: Array, steepest: float) ->
     i, j = np.nonzero(tells[3:].any(axis=0))
     last = len(DIFFERENCES.steps) - 1 - np.argmax(tells[::-1, i, j], axis=0)
     i, j, last = (numbers[last >= 3] for numbers in (i, j, last))
-    gaps = gap[last + np.arange(-3, 1)[:, None], i, j]
+    fitted = last + np.arange(-3, 1)[:, None]
+    gaps = gap[fitted, i, j]
+    # Across a break, the change of the value is as large at the larger steps; a single one is an outlier of the noise.
+    alone = tells[fitted, i, j].sum(axis=0) < 3
     # If the gap should exceed the noise at the next smaller step but does not, the break is not at the point.
     after = np.minimum(last + 1, len(DIFFERENCES.steps) - 1)
     ends_early = (last + 1 < len(DIFFERENCES.steps)) & (gaps[-1] * np.array(DIFFERENCES.steps)[after] > 2 * noise[i])
-    significant = ~ends_early & (gaps[-1] > least[i, j]) & (gaps.min(axis=0, initial=np.inf) > 0)
+    significant = ~ends_early & ~alone & (gaps[-1] > least[i, j]) & (gaps.min(axis=0, initial=np.inf) > 0)
     # The slope of the line through the four points, whose steps are half a decade apart.
     slope = np.array([1.5, 0.5, -0.5, -1.5]) @ np.log(gaps[:, significant]) / (5 * np.log(10) / 2)
     i, j, last = (numbers[significant][slope < steepest] for numbers in (i, j, last))

@@ -163,6 +163,19 @@ def test_what_a_solver_leaves_unsolved_is_no_jump():
     assert verdict(rounded, 1.01 * float(np.cos(0.3)), x=0.3, solver_tolerance=1e-6) != "agree"
 
 
+@pytest.mark.parametrize(("jump", "verdict"), [(0.0, "agree"), (1e-9, "discontinuous")])
+def test_single_outliers_of_the_noise_are_no_jump_and_a_real_jump_is(jump, verdict):
+    """A solver's values are off by 4e-12 at two of the steps, beside rounding. A jump is as large at every step."""
+
+    def value(x):
+        step = float(x[0]) - 1.0
+        at_an_outlier = 2.5e-8 < abs(step) < 4e-8 or 0.9e-6 < abs(step) < 1.1e-6
+        return np.array([1.0 + 0.017 * step + 4e-12 * at_an_outlier + jump * (step > 0)])
+
+    certificate = certify_jacobian(value, np.ones(1), lambda x: np.array([[0.017]]))
+    assert certificate.verdict == verdict, str(certificate)
+
+
 def test_a_derivative_that_is_not_finite_is_refused():
     with pytest.raises(GradientError, match="not finite"):
         certify_jacobian(np.sin, [0.0], [[np.nan]])
