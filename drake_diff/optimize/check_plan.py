@@ -96,7 +96,7 @@ def check_plan(
     arguments = {"method": GIVEN, "plant": chosen, "tolerance": tolerance}
     scheme = "step" if chosen == "steps" or problem.motion == CONTINUOUS else DEFAULT_SCHEME
     fields["scheme"] = MAP if problem.is_map else scheme
-    return checked(Solution(problem, GIVEN, "none", Status.FAILED, "", **fields), arguments)
+    return checked(Solution(problem, GIVEN, "no search", Status.FAILED, "", **fields), arguments)
 
 
 def checked(plan: Solution, arguments: dict[str, Any]) -> Solution:

@@ -15,6 +15,7 @@ from drake_diff._base.arrays import Array
 from drake_diff.model.contract import CoordinateTerms
 from drake_diff.optimize.goal_markers import Colour, colours_of, meaning_of
 from drake_diff.optimize.live import differ, scene_of_plan
+from drake_diff.optimize.measure import GIVEN
 from drake_diff.optimize.messages import joined
 from drake_diff.optimize.replay import OPEN_LOOP
 from drake_diff.optimize.solution import Status
@@ -52,6 +53,8 @@ def checks_of(m: Measurement, record: Mapping[str, Any]) -> list[PageCheck]:
     ended = "stopped at a solution" if at_solution else status.value.replace("_", " ")
     stopped = status in (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
     result = [PageCheck("Solver", "pass" if stopped else "fail", f"{ended} after {rounds}")]
+    if m.solution.method == GIVEN:
+        result = [PageCheck("Solver", "info", "a given plan, without a search")]
     decided = [m for m in (*record["metrics"], *record["invariants"]) if m["verdict"] != "info"]
     broken = [m["name"] for m in decided if m["verdict"] != "pass"]
     failed = any(m["verdict"] == "fail" for m in decided)

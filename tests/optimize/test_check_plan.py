@@ -179,6 +179,7 @@ def test_a_checked_plan_is_saved_and_verified(tmp_path, in_drake):
     assert record.verdict == "pass"
     assert record.solver.method == "check_plan"
     assert dd.verify(tmp_path / "run").verdict == "holds"
+    assert "a given plan, without a search" in (tmp_path / "run" / "report.html").read_text()
     failing = dd.save(dd.check_plan(pendulum(), *in_drake, plant="steps"), tmp_path / "steps")
     assert failing.verdict == "fail"
     assert dd.verify(tmp_path / "steps").verdict == "holds"
