@@ -25,6 +25,7 @@ from drake_diff.optimize.verification import judged, refused
 
 PLANTS = ("steps", "continuous")
 SAME_TIME = 1e-6  # of an interval: knots of a trajectory that are this near to each other are one knot
+LARGEST_TOLERANCE = 1e-2  # that of replays in the plan's own plant
 NOT_SEARCHED = "a given plan: no better plan was searched for"
 
 
@@ -45,7 +46,7 @@ def check_plan(
     under TVLQR. `solution.checks` lists all checks. The plan is not compared with better plans.
 
     Args:
-        problem: the task, with its start, goal, bounds, constraints and costs. It may have no cost.
+        problem: the task, with its start, goal, bounds, constraints and costs. It needs a goal, a constraint or a cost.
         xs: (N+1, nx) the states at the problem's knots; or a Drake trajectory, as `ReconstructStateTrajectory` returns.
         us: the inputs: (N, nu) held over each step, (N+1, nu) at the knots of an input that is linear in between, or a
             Drake trajectory. None for a system without inputs.
@@ -53,8 +54,8 @@ def check_plan(
             breaks, and trajectories of models with contact, constraints or PD control are in steps. Other plans are
             continuous. A trajectory in "steps" is sampled at the problem's knots, its input in the middle of each step.
         horizon: [s] the duration of arrays, if the problem's horizon is free. A trajectory has its own duration.
-        tolerance: relative tolerance of the start, goal, bounds, constraints and steps at the knots. Solvers of others
-            stop at larger residuals than ours, and files are often written with few digits.
+        tolerance: relative tolerance, at most 0.01, of the start, goal, bounds, constraints and steps at the knots.
+            Solvers of others stop at larger residuals than ours, and files are often written with few digits.
 
     Returns:
         A `Solution` whose method is "check_plan". `success` is true if every check passes. It can be saved, compared,
@@ -77,7 +78,7 @@ def check_plan(
     if not isinstance(problem, Problem):
         expected = "a Problem without phases" if isinstance(problem, PhasedProblem) else "a Problem"
         raise InputError("problem", got=type(problem).__name__, expected=expected)
-    tolerance = positive_float("tolerance", tolerance)
+    tolerance = _check_tolerance(tolerance)
     if plant is not None and plant not in PLANTS:
         raise UnknownNameError("plant", got=plant, known=PLANTS)
     if us is None and problem.nu == 0:
@@ -101,6 +102,7 @@ def check_plan(
 
 def checked(plan: Solution, arguments: dict[str, Any]) -> Solution:
     """Certify and judge a plan; `arguments` are those of `check_plan`, to repeat the call from the stored plan."""
+    _check_tolerance(arguments["tolerance"])
     start, certificates = time.monotonic(), tuple[Certificate, ...]()
     draft = replace(plan, search=Search(arguments))
     error: Exception | None = None
@@ -113,6 +115,13 @@ def checked(plan: Solution, arguments: dict[str, Any]) -> Solution:
     result = NlpResult(np.zeros(0), Outcome.SOLVED, "", (), note=NOT_SEARCHED)
     solution = judged(draft, result) if error is None else refused(draft, error)
     return solution.told(wall_time=time.monotonic() - start)
+
+
+def _check_tolerance(given: Any) -> float:
+    tolerance = positive_float("tolerance", given)
+    if tolerance > LARGEST_TOLERANCE:
+        raise InputError("tolerance", got=given, expected=f"at most {LARGEST_TOLERANCE:g}, a part of each range")
+    return tolerance
 
 
 def _certify(plan: Solution) -> tuple[Certificate, ...]:

@@ -197,5 +197,7 @@ def test_what_is_no_plan_is_refused_by_name(in_drake):
         dd.check_plan(replace(pendulum(), num_steps=20), *in_drake)
     with pytest.raises(dd.exceptions.UnknownNameError, match="plant"):
         dd.check_plan(slide(), xs, us, plant="step")
+    with pytest.raises(dd.exceptions.InputError, match=r"at most 0\.01"):
+        dd.check_plan(slide(), xs, us, tolerance=0.1)
     with pytest.raises(dd.exceptions.InputError, match="without phases"):
         dd.check_plan(dd.optimize.PhasedProblem([slide(), replace(slide(), x0=[1, 0])]), xs, us)
