@@ -114,6 +114,11 @@ class Contract:
     constraints: int  # couplers, balls, welds, distances, tendons
     notes: tuple[str, ...]
 
+    @property
+    def is_unconstrained(self) -> bool:
+        """Whether no constraint and no PD control acts on the model; joint limits and contact are not considered."""
+        return not self.constraints and all(actuator.kp is None for actuator in self.actuators)
+
     def to_dict(self) -> dict[str, Any]:
         """Return dicts and lists for JSON; an absent (infinite) limit is None."""
         plain: dict[str, Any] = plain_numbers(asdict(self))

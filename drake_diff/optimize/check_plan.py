@@ -143,8 +143,7 @@ def _default_plant(problem: Problem, us: Any) -> str:
     if not problem.has_model or problem.motion == CONTINUOUS:
         return "continuous"
     contract = problem.model.contract
-    driven = any(actuator.kp is not None for actuator in contract.actuators)
-    if contract.contact.collision_pairs or contract.constraints or driven:
+    if contract.contact.collision_pairs or not contract.is_unconstrained:
         return "steps"
     if isinstance(us, Trajectory):
         return "steps" if _is_held(us) else "continuous"
@@ -216,8 +215,8 @@ def _breaks(signal: Trajectory) -> Array:
 
 def _mesh(count: int, breaks: Sequence[Array]) -> Array:
     """Return the problem's own knots and the breaks within the motion, as fractions of its duration."""
-    own = np.linspace(0, 1, count + 1)
+    uniform = np.linspace(0, 1, count + 1)
     others = np.unique(np.concatenate(breaks))
-    near = np.abs(others[:, None] - own[None]).min(axis=1, initial=np.inf) <= SAME_TIME / count
+    near = np.abs(others[:, None] - uniform[None]).min(axis=1, initial=np.inf) <= SAME_TIME / count
     others = others[~near & (others > 0) & (others < 1)]
-    return np.sort(np.concatenate([own, others[np.diff(others, prepend=-1) > SAME_TIME / count]]))
+    return np.sort(np.concatenate([uniform, others[np.diff(others, prepend=-1) > SAME_TIME / count]]))

@@ -31,8 +31,8 @@ from drake_diff.optimize.transcription.collocation import Collocated, collocated
 
 SAME_COST = 1e-2  # largest relative difference in cost between searches that reach one optimum on different meshes
 SAME_MOTION = 5e-2  # largest RMS difference over the knots, as a fraction of each state's range
-# Fields that no measure depends on.
 NO_INPUT = PiecewisePolynomial(np.zeros((0, 1)))  # of a system without inputs
+# Fields that no measure depends on.
 OF_THE_SEARCH = ("iterations", "optima", "options", "search", "solver_message", "wall_time")
 TOLD = ("cross_checks", "message", "notes", "status", *OF_THE_SEARCH)
 

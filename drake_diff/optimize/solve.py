@@ -520,13 +520,16 @@ def _from_other_starts(task: _Task, asked: Attempt, first: Solution) -> Solution
     chain = [*first.options.get("chain", ()), {**OTHER_STARTS, "ended": str(starts)}]
     best = first
     for guess in starts.cheaper[:MOST_VERIFIED]:
-        if (best.success and best is not first) or task.is_late or starts.ended:
+        if starts.ended or task.is_late:
             break
         task.converted.clear()
         attempt, rows = asked.by("collocation", f"a cheaper motion, {guess.message}"), list[dict[str, str]]()
         solution = task.prepare(attempt, guess, _conversion(task, asked, rows))()
         chain += [{**attempt.told(False), "ended": solution.status.value}, *rows]
-        best = min((best, _in_steps(task, asked, solution, chain)), key=_preference)
+        last = _in_steps(task, asked, solution, chain)
+        best = min((best, last), key=_preference)
+        if last.status in ENDED:
+            break
     note = f"{LOCAL}: {starts}{', not verified' if starts.cheaper and best is first else ''}"
     best = best.told(options=best.options | {"chain": chain})
     return best.noted(note) if best.success else best
@@ -669,10 +672,7 @@ def _is_free_at_first(problem: Problem) -> bool:
     A collocated motion with overlapping geometries is not verified, so that a verified one has no contact.
     """
     model = problem.model
-    contract = model.contract
-    if contract.constraints or any(actuator.kp is not None for actuator in contract.actuators):
-        return False
-    if np.linalg.matrix_rank(model.actuation) < model.nv:
+    if not model.contract.is_unconstrained or np.linalg.matrix_rank(model.actuation) < model.nv:
         return False
     set_state(model.double, problem.x0)
     return penetration(model) <= 0
@@ -785,7 +785,7 @@ def choose_method(problem: Problem) -> tuple[str, str]:
     if problem.motion == CONTINUOUS:
         reason = "the motion is in continuous time, which collocation does not take"
         return "ilqr" if takes(problem) else "shooting", reason
-    smooth = not contract.constraints and all(actuator.kp is None for actuator in contract.actuators)
+    smooth = contract.is_unconstrained
     if not problem.optimizes_controls:
         return "shooting", "the controls are not optimized"
     if problem.trajectory_cost is not None:

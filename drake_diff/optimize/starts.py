@@ -5,11 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drake_diff._base.clock import noted_interrupts
 from drake_diff.optimize.guess import another_guess
 from drake_diff.optimize.program import Limits, Outcome, Report
 from drake_diff.optimize.run import arrays_of
 from drake_diff.optimize.solution import Solution, Status
-from drake_diff.optimize.transcription.collocation import FOUND, Transcription
+from drake_diff.optimize.transcription.collocation import FOUND, Transcribed, Transcription
 
 MOST_STARTS, FEWEST_STARTS = 12, 3  # if the first few all lead to the plan's cost, the others are not tried
 # Of all starts together, times the knots' states and inputs, so that they take about as long for robots as for small
@@ -34,10 +35,11 @@ class Starts:
     def __str__(self) -> str:
         tried = f"{self.starts} random first guesses in {self.iterations} iterations"
         costs = ", ".join(f"{_cost(motion):.4g}" for motion in self.cheaper)
-        return f"{tried} led to {f'cheaper motions, at cost {costs}' if costs else 'no cheaper motion'}"
+        result = f"{tried} led to {f'cheaper motions, at cost {costs}' if costs else 'no cheaper motion'}"
+        return f"{result}, before the user or the time limit ended the search" if self.ended else result
 
 
-def search_cheaper(plan: Solution, seed: int, limits: Callable[[], Limits], report: Report | None) -> Starts:
+def search_cheaper(plan: Solution, seed: int, limits: Callable[[], Limits], report: Report) -> Starts:
     """Search from random guesses by `seed` for motions that cost less than a collocated `plan`.
 
     The number of starts depends on iterations alone, so that the same seed gives the same result on all machines.
@@ -49,30 +51,32 @@ def search_cheaper(plan: Solution, seed: int, limits: Callable[[], Limits], repo
     scale = max(abs(first), problem.least_cost(plan.xs[0], plan.time_step))
     motions: list[Solution] = []
     used, number, alike, ended = 0, 0, True, False
-    while number < MOST_STARTS and used < most and not (number >= FEWEST_STARTS and alike) and not ended:
-        number += 1
-        xs, us, *horizon = another_guess(problem, seed, number)
-        guess = transcription.begin(0, (xs, us), horizon=horizon[0] if horizon else None)
-        few = replace(limits(), max_iterations=min(MOST_OF_A_START, most - used, limits().max_iterations))
-        motion = transcription.solve([guess], limits=few, report=None)
-        used += len(motion.result.iterations)
-        ended = motion.result.outcome in ENDED_BY_THE_USER
-        if motion.result.outcome not in FOUND:
-            alike = False
-            continue
-        phase = motion.phases[0]
-        fields = {"scheme": plan.scheme, "multipliers": motion.result.multipliers, **arrays_of(phase)}
-        by = problem, "collocation", "ipopt", Status.FAILED, f"random {number} of seed {seed}"
-        motions.append(Solution(*by, phase.xs, phase.us[:-1], **fields))
-        alike = alike and abs(phase.quadrature - first) <= CHEAPER * scale
-        if report is not None:
-            report.say(f"random first guess {number}: cost {phase.quadrature:.6g}")
+    with noted_interrupts() as interrupted:  # the plan is returned whatever ends the search
+        while number < MOST_STARTS and used < most and not (number >= FEWEST_STARTS and alike) and not ended:
+            number += 1
+            xs, us, *horizon = another_guess(problem, seed, number)
+            guess = transcription.begin(0, (xs, us), horizon=horizon[0] if horizon else None)
+            few = replace(limits(), max_iterations=min(MOST_OF_A_START, most - used, limits().max_iterations))
+            motion = transcription.solve([guess], limits=few, report=None)
+            used += len(motion.result.iterations)
+            if motion.result.outcome in FOUND:
+                motions.append(_solution(plan, motion, f"random {number} of seed {seed}"))
+                report.say(f"random first guess {number}: cost {_cost(motions[-1]):.6g}")
+            alike = alike and motion.result.outcome in FOUND and abs(_cost(motions[-1]) - first) <= CHEAPER * scale
+            ended = motion.result.outcome in ENDED_BY_THE_USER or interrupted.is_set()
     cheaper: list[Solution] = []
     for candidate in sorted(motions, key=_cost):  # a plan of each cost
         last = _cost(cheaper[-1]) if cheaper else -np.inf
         if last + CHEAPER * scale < _cost(candidate) < first - CHEAPER * scale:
             cheaper.append(candidate)
     return Starts(tuple(cheaper), number, used, ended)
+
+
+def _solution(plan: Solution, motion: Transcribed, name: str) -> Solution:
+    """Return a motion for the problem of `plan` as a solution that is not verified."""
+    phase = motion.phases[0]
+    fields = {"scheme": plan.scheme, "multipliers": motion.result.multipliers, **arrays_of(phase)}
+    return Solution(plan.problem, "collocation", "ipopt", Status.FAILED, name, phase.xs, phase.us[:-1], **fields)
 
 
 def _cost(plan: Solution) -> float:

@@ -7,7 +7,7 @@ from pydrake.examples import AcrobotPlant, CompassGait, PendulumPlant, VanDerPol
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder, LeafSystem, LeafSystem_
-from pydrake.systems.primitives import LinearSystem
+from pydrake.systems.primitives import LinearSystem, Multiplexer
 from pydrake.systems.scalar_conversion import TemplateSystem
 
 import drake_diff as dd
@@ -37,7 +37,7 @@ def Slide_(T):
 
         def DoCalcTimeDerivatives(self, context, derivatives):
             x, u = context.get_continuous_state_vector().CopyToVector(), self.get_input_port(0).Eval(context)
-            push = self.gust * context.get_time()
+            push = self.gust * context.get_time() * u[0]
             derivatives.get_mutable_vector().SetFromVector([x[1], u[0] + push])
 
     return Impl
@@ -73,6 +73,26 @@ def test_a_slide_in_python_and_as_a_linear_system_has_its_least_effort(system):
     rows = [c for c in solution.checks if c.plant == "Drake's Simulator"]
     assert [c.what for c in rows] == ["integration"]
     assert rows[0].value < 1e-6
+
+
+def test_an_input_that_is_fixed_in_the_context_keeps_its_value():
+    """Of two forces on a unit mass, 1 N is constant: at rest with no other force, it accelerates by 1 m/s^2."""
+    system = LinearSystem([[0, 1], [0, 0]], [[0, 0], [1, 1]], np.eye(2), np.zeros((2, 2)))
+    builder = DiagramBuilder()
+    mass = builder.AddSystem(system)
+    both = builder.AddSystem(Multiplexer([1, 1]))
+    builder.Connect(both.get_output_port(), mass.get_input_port())
+    builder.ExportInput(both.get_input_port(0), "force")
+    builder.ExportInput(both.get_input_port(1), "wind")
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    diagram.GetInputPort("wind").FixValue(context, [1.0])
+    dynamics = dd.Dynamics.from_system(diagram, context=context)
+    assert dynamics.input_names == ("force",)
+    assert dynamics([0, 0], [0]).tolist() == [0, 1]
+    solution = plan_of(dynamics)
+    assert solution.success, solution.message  # the Simulator has the wind too
+    assert np.mean(solution.us) == pytest.approx(-1, abs=0.5)  # the mean force of a motion from rest to rest is 0
 
 
 def test_an_event_that_the_rates_do_not_show_is_found_by_the_simulator():

@@ -1,5 +1,8 @@
 """The random first guesses of "auto": a pendulum with several optima, a convex problem, and their limits."""
 
+import os
+import signal
+
 import numpy as np
 import pytest
 from helpers.models import MODELS
@@ -45,6 +48,17 @@ def test_other_starts_are_never_worse_and_only_without_a_given_guess_or_number(m
     assert same.success
     assert same.cost == plain.cost
     assert "led to no cheaper motion" in same.options["chain"][-1]["ended"]
+
+
+def test_ctrl_c_during_the_other_starts_returns_the_verified_plan():
+    def interrupt(line):
+        if "random first guess 1" in line:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    solution = dd.solve(weak_pendulum(40), progress=interrupt)
+    assert solution.success
+    assert solution.cost == dd.solve(weak_pendulum(40), restarts=0).cost
+    assert "before the user or the time limit ended the search" in solution.notes[-1]
 
 
 def test_a_run_with_other_starts_is_repeated_exactly(tmp_path):

@@ -16,6 +16,7 @@ from drake_diff._base.arrays import Array
 from drake_diff.exceptions import GradientError, InputError, UnknownNameError
 
 TIMES = (0.0, 1.0)  # [s] the rates must be equal at both
+OFFSETS = (0.0, 0.1)  # of states and inputs from the state of the context, in their units
 ACCURACY = 1e-8  # of Drake's integrator, relative
 
 
@@ -42,16 +43,19 @@ class DrakeSystem:
             raise GradientError(message) from error
         self.carrying = self.converted.CreateDefaultContext()
         self.carrying.SetTimeStateAndParametersFrom(self.context)
-        for i in range(system.num_input_ports()):  # other inputs keep their fixed values
+        self.fixed = {}  # other inputs keep the values that they have in the context
+        for i in range(system.num_input_ports()):
             port = system.get_input_port(i)
-            if (
-                port not in self.ports
-                and port.HasValue(self.context)
-                and port.get_data_type() == PortDataType.kVectorValued
-            ):
-                self.converted.get_input_port(i).FixValue(self.carrying, port.Eval(self.context))
+            is_vector = port.get_data_type() == PortDataType.kVectorValued
+            if is_vector and port not in self.ports and port.HasValue(self.context):
+                self.fixed[i] = np.array(port.Eval(self.context))
+        self._fix(self.converted, self.carrying)
         if not self.is_discrete and self._changes_in_time():
             raise InputError("system", got="rates that change in time", expected="rates that depend on x and u alone")
+
+    def _fix(self, system: Any, context: Any) -> None:
+        for i, value in self.fixed.items():
+            system.get_input_port(i).FixValue(context, value)
 
     @property
     def state(self) -> Array:
@@ -82,11 +86,12 @@ class DrakeSystem:
         return system.EvalTimeDerivatives(context).CopyToVector()
 
     def _changes_in_time(self) -> bool:
-        """Return whether the rates of the context's state, without inputs, depend on time."""
+        """Return whether the rates depend on time, at the context's state without inputs or beside it with inputs."""
         rates, state = [], self.state
         for t in TIMES:
             self.context.SetTime(t)
-            rates.append(np.array(self._evaluated(self.system, self.context, state, np.zeros(self.nu))))
+            points = ((state + offset, np.full(self.nu, offset)) for offset in OFFSETS)
+            rates.append([np.array(self._evaluated(self.system, self.context, x, u)) for x, u in points])
         self.context.SetTime(TIMES[0])
         return not np.array_equal(rates[0], rates[1], equal_nan=True)
 
@@ -104,6 +109,7 @@ class DrakeSystem:
         simulator.get_mutable_integrator().set_target_accuracy(ACCURACY)
         context = copy.GetMyMutableContextFromRoot(simulator.get_mutable_context())
         context.SetStateAndParametersFrom(self.context)
+        self._fix(copy, context)
         return simulator, context
 
     def simulated(self, inputs: PiecewisePolynomial, times: Array, xs: Array) -> Array:
