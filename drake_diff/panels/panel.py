@@ -246,10 +246,13 @@ def _ray(workers: int | None, address: str | None) -> Iterator[tuple[int, type[B
         if address is None and ray.util.get_node_ip_address() != "127.0.0.1":
             expected = "no import of ray before run_panel, so that Ray listens on loopback only"
             raise InputError("ray", got="an earlier import", expected=expected)
+        available = int(ray.cluster_resources().get("CPU", 1))
+        if workers is not None and workers > available:
+            raise InputError("workers", got=workers, expected=f"at most {available}, the cores of the cluster")
         # Ray restarts a process that died, and evaluates its trial once more.
         options = {"max_restarts": -1, "max_task_retries": 1, "scheduling_strategy": "SPREAD"}
         with joblib.parallel_config(backend="ray", ray_remote_args=options):
-            yield workers or int(ray.cluster_resources().get("CPU", 1)), ray.exceptions.RayError
+            yield workers or available, ray.exceptions.RayError
     finally:
         ray.shutdown()
 

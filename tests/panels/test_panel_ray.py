@@ -131,7 +131,9 @@ def start_node(monkeypatch):
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         nodes.append(subprocess.Popen(command, env=os.environ | {"NODE": name}, start_new_session=True, **quiet))
         wait_for(lambda: listens(port) and has_raylet(nodes[-1]), 120)
-        return nodes[-1], f"127.0.0.1:{port}"
+        address = f"127.0.0.1:{port}"
+        wait_for(lambda: cores(address) == 2 * len(nodes), 120)  # a panel uses the nodes that have joined before it
+        return nodes[-1], address
 
     yield start
     for node in nodes:
@@ -148,6 +150,12 @@ def processes(node):
 
 def has_raylet(node):
     return any("raylet/raylet" in words for _, words in processes(node))
+
+
+def cores(address):
+    count = f"import ray; ray.init({address!r}, log_to_driver=False); print(int(ray.cluster_resources()['CPU']))"
+    done = subprocess.run([sys.executable, "-c", count], capture_output=True, text=True, timeout=60)
+    return int(done.stdout or 0)
 
 
 def kill(node):
@@ -171,11 +179,15 @@ def wait_for(condition, seconds=60):
 
 def test_a_cluster_that_runs_already_gives_the_table_of_local_processes(write, tmp_path, start_node):
     write("cheap")
-    for options in (["--out", "ray", "--engine", "ray", "--address", start_node("head")[1]], ["--out", "local"]):
+    _, address = start_node("head")
+    for options in (["--out", "ray", "--engine", "ray", "--address", address], ["--out", "local"]):
         done = panel(tmp_path, *options)
         assert done.returncode == 1, done.stderr
         assert "200 trials, 2 errors" in done.stdout
     assert files(tmp_path / "ray") == files(tmp_path / "local")
+    done = panel(tmp_path, "--out", "more", "--engine", "ray", "--address", address, "--workers", "3")
+    assert done.returncode == 2
+    assert "workers: expected at most 2, the cores of the cluster" in done.stderr
 
 
 NODES = """
