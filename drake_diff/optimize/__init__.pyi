@@ -1,6 +1,8 @@
 from .options import Options as Options
+from .path_timing import PathTiming as PathTiming
 from .phased import PhasedSolution as PhasedSolution
 from .problem.cost import TrackingCost as TrackingCost
+from .problem.coupling import Acceleration as Acceleration
 from .problem.coupling import Coupling as Coupling
 from .problem.coupling import InputRate as InputRate
 from .problem.coupling import Jerk as Jerk

@@ -26,7 +26,10 @@ from drake_diff.optimize.verification import judged, refused
 PLANTS = ("steps", "continuous")
 SAME_TIME = 1e-6  # of an interval: knots of a trajectory that are this near to each other are one knot
 LARGEST_TOLERANCE = 1e-2  # that of replays in the plan's own plant
-NOT_SEARCHED = "a given plan: no better plan was searched for"
+NOTES = {  # by the name of the search that made the plan
+    None: "a given plan: no better plan was searched for",
+    "PathTiming": "the least time along a given path: other paths were not searched",
+}
 
 
 def check_plan(
@@ -101,7 +104,10 @@ def check_plan(
 
 
 def checked(plan: Solution, arguments: dict[str, Any]) -> Solution:
-    """Certify and judge a plan; `arguments` are those of `check_plan`, to repeat the call from the stored plan."""
+    """Certify and judge a plan; `arguments` are those of `check_plan`, to repeat the call from the stored plan.
+
+    "search" in `arguments` is the name of the search that made the plan, if it was not given.
+    """
     _check_tolerance(arguments["tolerance"])
     start, certificates = time.monotonic(), tuple[Certificate, ...]()
     draft = replace(plan, search=Search(arguments))
@@ -112,7 +118,7 @@ def checked(plan: Solution, arguments: dict[str, Any]) -> Solution:
     except (GradientError, SimulationError) as refusal:
         error = refusal
     draft = replace(draft, certificates=certificates)
-    result = NlpResult(np.zeros(0), Outcome.SOLVED, "", (), note=NOT_SEARCHED)
+    result = NlpResult(np.zeros(0), Outcome.SOLVED, "", (), note=NOTES.get(arguments.get("search"), NOTES[None]))
     solution = judged(draft, result) if error is None else refused(draft, error)
     return solution.told(wall_time=time.monotonic() - start)
 

@@ -66,7 +66,8 @@ def _knot_checks(s: Any) -> Iterator[Check]:
         scales = problem.feasibility_scales(xs, s.us, s.vector.values, s.knots)
     scales = {name: _feasibility(s) * scale for name, scale in scales.items()}
     limits = np.array([scales[name] for name in problem.state_names])
-    if s.method != GIVEN or s.transcribed is None or problem.is_map:  # a given plan has no scheme: it is integrated
+    by_scheme = s.method != GIVEN or s.transcribed is None or problem.is_map
+    if by_scheme:  # a given plan has no scheme: it is integrated
         knots = np.flatnonzero(~np.all(s.defects_of_states <= limits, axis=1))
         worst, i = _worst(s.defects_of_states, limits)
         after = f"knots {_spans(knots)}" if len(knots) else f"knot {worst}" if len(s.defects) else "none"
@@ -82,7 +83,8 @@ def _knot_checks(s: Any) -> Iterator[Check]:
             what, where = (name, problem.state_names[i]) if is_end else ("constraint", f"{name} at knot {row}")
             yield check(what, where, off[i], limits[i], units_of(problem)[i])
     yield from _excess_checks("bound", s.bound_excess, scales)
-    rest = {name: excess for name, excess in s.constraint_excess.items() if name not in wanted}
+    judged = {*wanted, *({limit.label for limit in problem.rate_limits} if not by_scheme else ())}
+    rest = {name: excess for name, excess in s.constraint_excess.items() if name not in judged}
     yield from _excess_checks("constraint", rest, scales)
     where = "the whole motion"
     if s.transcribed is not None:

@@ -530,8 +530,7 @@ def regulator_weights(plan: ReplayPlan, us: Array) -> tuple[Array, Array, Array]
     effort = plan.problem.input_scales(us)
     effort = np.maximum(effort, LEAST_EFFORT * np.max(effort, initial=0.0))
     Q = np.diag(1 / space.scale(plan.scale) ** 2)
-    smooth = any(not limit.of_inputs for limit in plan.problem.rate_limits)
-    return Q, EFFORT_WEIGHT * np.diag(1 / effort**2), (1.0 if smooth else FINAL_WEIGHT) * Q
+    return Q, EFFORT_WEIGHT * np.diag(1 / effort**2), (1.0 if plan.problem.limits_jerk else FINAL_WEIGHT) * Q
 
 
 # Checks of a motion.

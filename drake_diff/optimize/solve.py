@@ -22,6 +22,7 @@ from drake_diff.optimize.continuation import check_schedule
 from drake_diff.optimize.guess import another_guess, first_guesses, other_guess, sampled
 from drake_diff.optimize.ilqr.ilqr import check_problem, takes
 from drake_diff.optimize.options import Options
+from drake_diff.optimize.path_timing import PathTiming
 from drake_diff.optimize.phased import PhasedSolution
 from drake_diff.optimize.problem.cost import changes_in_time
 from drake_diff.optimize.problem.phases import PhasedProblem
@@ -51,11 +52,11 @@ Progress = Callable[[str], None]
 
 
 @overload
-def solve(problem: Problem, **asked: Any) -> Solution: ...
+def solve(problem: Problem | PathTiming, **asked: Any) -> Solution: ...
 @overload
 def solve(problem: PhasedProblem, **asked: Any) -> PhasedSolution: ...
 def solve(  # type: ignore[misc]  # only this signature lists the keywords
-    problem: Problem | PhasedProblem,
+    problem: Problem | PhasedProblem | PathTiming,
     *,
     method: str = "auto",
     initial_guess: Any = None,
@@ -79,7 +80,8 @@ def solve(  # type: ignore[misc]  # only this signature lists the keywords
 
     Args:
         problem: the problem of a model or of plain `Dynamics`, or an `optimize.PhasedProblem`, which requires
-            collocation and whose solution is an `optimize.PhasedSolution`.
+            collocation and whose solution is an `optimize.PhasedSolution`; or an `optimize.PathTiming`, for which only
+            `max_iterations` and `time_limit` apply.
         method: "collocation" (in continuous time, for models without contact and for plain dynamics), "shooting"
             (through Drake's own steps, contact included), "ilqr" (the same by Riccati sweeps) or "auto".
         initial_guess: None (a straight line to the goal with inputs near zero, or a `TrackingCost`'s reference), a
@@ -134,6 +136,12 @@ def solve(  # type: ignore[misc]  # only this signature lists the keywords
         np.inf if time_limit is None else positive_float("time_limit [s]", time_limit),
         chosen.tolerance,
     )
+    if isinstance(problem, PathTiming):
+        unused = {"method": method != "auto", "initial_guess": initial_guess is not None, "restarts": bool(restarts)}
+        unused |= {"options": options is not None, "callback": callback is not None, "view": view is not False}
+        for name in (name for name, is_given in unused.items() if is_given):
+            raise InputError(name, got="a value", expected="no value for a PathTiming")
+        return problem.solved(limits)
     report = Report(
         print if progress is True else (progress or None),
         callback and partial(noted, "callback", callback),
@@ -215,10 +223,10 @@ def _solved(
 
 
 def _check_common(problem: Any, seed: Any, callback: Any, progress: Any, view: Any) -> None:
-    if not isinstance(problem, (Problem, PhasedProblem)):
-        raise InputError("problem", got=type(problem).__name__, expected="a Problem or a PhasedProblem")
+    if not isinstance(problem, (Problem, PhasedProblem, PathTiming)):
+        raise InputError("problem", got=type(problem).__name__, expected="a Problem, a PhasedProblem or a PathTiming")
     count("seed", seed, 0, LARGEST_SEED)
-    for phase in problem.phases:
+    for phase in () if isinstance(problem, PathTiming) else problem.phases:
         phase.check_derivatives()
         if phase.has_model and phase.nu == 0 and set(phase.optimize) == {"controls"} and phase.horizon is None:
             raise InputError("optimize", got='"controls", but the model has no actuators', expected="an actuated model")

@@ -54,7 +54,9 @@ def checks_of(m: Measurement, record: Mapping[str, Any]) -> list[PageCheck]:
     stopped = status in (Status.CONVERGED, Status.CONVERGED_NOT_VERIFIED)
     result = [PageCheck("Solver", "pass" if stopped else "fail", f"{ended} after {rounds}")]
     if m.solution.method == GIVEN:
-        result = [PageCheck("Solver", "info", "a given plan, without a search")]
+        is_timing = "search" in (record["inputs"].get("search") or {})
+        text = "the timing of a given path, by IPOPT" if is_timing else "a given plan, without a search"
+        result = [PageCheck("Solver", "info", text)]
     decided = [m for m in (*record["metrics"], *record["invariants"]) if m["verdict"] != "info"]
     broken = [m["name"] for m in decided if m["verdict"] != "pass"]
     failed = any(m["verdict"] == "fail" for m in decided)

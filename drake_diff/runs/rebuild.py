@@ -49,6 +49,7 @@ REQUIRED, OPTIONAL = ("xs", "us", "parameters"), ("us_mid", "u_final", "mesh", "
 ROWS = "iterations"  # the solver's table of iterations in a run that is not measured yet; later it is in trace.mcap
 COLUMNS = ("iteration", "objective", "primal_infeasibility", "dual_infeasibility", "step")  # columns of that table
 START = "start_us"  # the problem's initial guess of the inputs
+CHECK = ("method", "plant", "tolerance", "search")  # arguments of a check without a search in this run
 REMOVED = ("segments",)  # options of `solve` in records before version 3
 GUESS = "guess_"  # prefix of the arrays of the initial guess of `solve`
 GUESSED = ("xs", "us", "us_mid", "u_final", "mesh", "horizon", "num_steps", "multipliers", "row_multipliers")
@@ -298,7 +299,7 @@ def solve_again(record: PlanRecord, recorded: Solution, plan: dict[str, Array]) 
     with _refusing_a_problem():
         arguments: dict[str, Any] = dict(search_of(record) or {})
         if recorded.method == GIVEN:
-            return checked(recorded, {name: arguments[name] for name in ("method", "plant", "tolerance")})
+            return checked(recorded, {name: arguments[name] for name in CHECK if name in arguments})
         kind, options = arguments.pop("initial_guess", None), arguments.pop("options")
         chosen = Options.from_dict({name: value for name, value in options.items() if name not in REMOVED})
         limit, guess = arguments.pop("time_limit"), _rebuild_guess(recorded.problem, kind, plan)

@@ -17,7 +17,7 @@ from drake_diff.model.parameters import select
 from drake_diff.motion.rollout import STEPS
 from drake_diff.optimize.problem.constraint import Bounds, Constraint
 from drake_diff.optimize.problem.cost import ConstantCost, CostToGo, QuadraticCost, SumOfCosts, TrackingCost
-from drake_diff.optimize.problem.coupling import InputRate, Jerk, Periodic
+from drake_diff.optimize.problem.coupling import Acceleration, InputRate, Jerk, Periodic
 from drake_diff.optimize.problem.dynamics import units_of
 from drake_diff.optimize.problem.fixed_contacts import QUANTITIES, FixedContacts, recorded_quantity
 from drake_diff.optimize.problem.goals import (
@@ -54,7 +54,7 @@ GUESS = ("initial_guess", "initial_guess_sha256")
 KINDS_OF_GOALS = (FrameGoal, FrameVelocityGoal, JointGoal, CenterOfMassGoal, KeepLevel, Dwell, TerminalSet)
 KINDS_OF_OBSTACLES = (ContactSchedule, SphereObstacle, BoxObstacle, SelfCollision)
 GOALS: dict[str, Any] = {kind.__name__: kind for kind in (*KINDS_OF_GOALS, *KINDS_OF_OBSTACLES)}
-COUPLINGS: dict[str, Any] = {kind.__name__: kind for kind in (Periodic, InputRate, Jerk)}
+COUPLINGS: dict[str, Any] = {kind.__name__: kind for kind in (Periodic, InputRate, Acceleration, Jerk)}
 # Costs with their attributes, which are also the arguments of their constructors.
 KINDS_OF_COSTS: dict[str, tuple[Any, tuple[str, ...]]] = {
     "ConstantCost": (ConstantCost, ("rate",)),

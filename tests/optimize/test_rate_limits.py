@@ -9,7 +9,7 @@ from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError, UnknownNameError
-from drake_diff.optimize import InputRate, Jerk
+from drake_diff.optimize import Acceleration, InputRate, Jerk
 
 pytestmark = pytest.mark.solve
 
@@ -34,6 +34,31 @@ def test_the_least_time_from_rest_to_rest_is_that_of_the_s_curve(way, limit):
     assert solution.success
     assert solution.horizon == pytest.approx(wanted, rel=1e-3)  # the input switches between the knots of 40 intervals
     assert solution.horizon > wanted * (1 - 1e-6)
+
+
+def test_a_limit_of_acceleration_gives_the_time_of_bang_bang_motion():
+    """With |a| <= A alone, the least time over a distance is 2 sqrt(way / A)."""
+    solution = dd.solve(least_time(1.0, 100.0, 0.0, Acceleration({"x1": 4.0}), constraints=()))
+    assert solution.success
+    assert solution.horizon == pytest.approx(1.0, rel=1e-3)  # parabolas switch within an interval
+    us = np.array(solution.us)
+    us[3] = 4.5
+    assert replace(solution, us=us).constraint_excess["acceleration"][0] == pytest.approx(0.5, abs=1e-6)
+
+
+@pytest.mark.slow
+@each_row("method", ["collocation", "shooting"])
+def test_a_pendulum_accelerates_within_its_limit(method):
+    """Without the limit, the motion from 0 to 1 rad in 1 s has a larger acceleration."""
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.025)
+    problem = dd.Problem(
+        model, x0=[0, 0], x_goal=[1, 0], num_steps=40, running_cost=EFFORT, couplings=Acceleration(4.5)
+    )
+    solution = dd.solve(problem, method=method)
+    assert solution.success, solution.message
+    assert np.max(np.abs(np.diff(solution.xs[:, 1]))) <= 4.5 * 0.025 + 1e-6
+    free = dd.solve(replace(problem, couplings=()), method=method)
+    assert np.max(np.abs(np.diff(free.xs[:, 1]))) > 5.0 * 0.025
 
 
 @pytest.mark.slow
@@ -107,13 +132,13 @@ def test_a_record_of_it_is_verified_and_one_that_breaks_it_fails(tmp_path):
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
     problem = dd.Problem(
         model, x0=[0, 0], x_goal=[1, 0], num_steps=20, running_cost=EFFORT,
-        couplings=[InputRate({"motor": 60.0}), Jerk(300.0)],
+        couplings=[InputRate({"motor": 60.0}), Acceleration(30.0), Jerk(300.0)],
     )  # fmt: skip
     solution = dd.solve(problem)
     assert dd.save(solution, tmp_path / "a").verdict == "pass"
     found = dd.verify(tmp_path / "a")
     assert found.holds
-    assert sum("coupling" in line for line in found.claimed) == 2
+    assert sum("coupling" in line for line in found.claimed) == 3
     us = np.array(solution.us)
     us[5] += 1.0
     assert dd.save(replace(solution, us=us), tmp_path / "b").verdict == "fail"
@@ -125,6 +150,7 @@ def test_a_record_of_it_is_verified_and_one_that_breaks_it_fails(tmp_path):
         (lambda: InputRate(0), InputError, "above 0"),
         (lambda: InputRate({}), InputError, "no names"),
         (lambda: Jerk(-1.0), InputError, "above 0"),
+        (lambda: Acceleration({"x5": 3.0}), UnknownNameError, "x5"),
         (lambda: InputRate({"none": 1.0}), UnknownNameError, "none"),
         (lambda: Jerk(3.0), InputError, "by name"),
         (lambda: Jerk({"x5": 3.0}), UnknownNameError, "x5"),
@@ -135,7 +161,7 @@ def test_what_is_no_limit_is_refused_at_once(couplings, error, told):
         least_time(1.0, 1.0, 1.0, couplings())
 
 
-@each_row("limit, by", [(InputRate(8.0), "goal"), (Jerk(40.0), ["pole.mass"])])
+@each_row("limit, by", [(InputRate(8.0), "goal"), (Acceleration(5.0), ["pole.mass"]), (Jerk(40.0), ["pole.mass"])])
 def test_a_sensitivity_counts_them(limit, by):
     """Check this also for jerks, whose rows change with the parameters of the model."""
     model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)

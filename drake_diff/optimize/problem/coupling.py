@@ -1,9 +1,9 @@
 """Constraints that join several knots of a motion: general couplings, periodic motions, and limits of rates.
 
 `Coupling.bound` returns a `BoundCoupling`, one `Constraint` on the concatenated states, and inputs, of its knots, so
-that every method can treat it as an ordinary constraint. A limit on the rate of inputs or accelerations bounds the
-slopes of the input and of x' within each interval of a motion in continuous time. In discrete motions, inputs change
-from one step to the next, and the acceleration is (v_(k+1) - v_k) / h.
+that every method can treat it as an ordinary constraint. A limit on accelerations, or on the rate of inputs or
+accelerations, bounds x' or the slopes of the input or of x' within each interval of a motion in continuous time. In
+discrete motions, inputs change from one step to the next, and the acceleration is (v_(k+1) - v_k) / h.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -266,10 +266,11 @@ System = Model | Dynamics
 
 
 class RateLimit(Couples):
-    """The base of `InputRate` and `Jerk`. `limit` is a number [per s], or a mapping from names to such numbers."""
+    """The base of `InputRate`, `Acceleration` and `Jerk`. `limit` is a number, or a mapping from names to numbers."""
 
     limit: Any
-    of_inputs: bool
+    of_inputs = False
+    of_slopes = True  # limits the slopes of the input or of x', or else x' itself
 
     def __post_init__(self) -> None:
         subject, limit = f"{type(self).__name__}.limit", self.limit
@@ -302,11 +303,16 @@ class RateLimit(Couples):
             first, other = np.split(u, 2)
             return (other[places] - first[places]) / time_step
 
+        def acceleration(x: Any) -> Any:
+            first, other = np.split(x, 2)
+            return (other[places] - first[places]) / time_step
+
         def change_of_acceleration(x: Any) -> Any:
             first, other, last = np.split(x, 3)
             return (last[places] - 2 * other[places] + first[places]) / time_step**2
 
-        function, knots = (change_of_input, 2) if self.of_inputs else (change_of_acceleration, 3)
+        function: Any = change_of_input if self.of_inputs else acceleration
+        function, knots = (change_of_acceleration, 3) if self.of_slopes and not self.of_inputs else (function, 2)
         count = num_steps if self.of_inputs else num_steps + 1
         rows = Constraint(function, -limits, limits, name=self.label)
         return BoundCoupling(rows, np.arange(max(count - knots + 1, 0))[:, None] + np.arange(knots))
@@ -347,8 +353,53 @@ class InputRate(RateLimit):
         return {name: i for i, name in enumerate(system.input_names)}
 
 
+class _OfVelocities(RateLimit):
+    """The base of limits on the derivatives of velocities."""
+
+    def _known(self, system: System) -> dict[str, int]:
+        if not isinstance(system, Model):
+            return {name: i for i, name in enumerate(system.state_names)} if isinstance(self.limit, dict) else {}
+        indices = {name: system.nq + i for i, name in enumerate(system.velocity_names)}
+        for name, joint in labelled(joints(system.plant)).items():
+            _, velocities = system.places(joint)
+            if joint.num_velocities() == 1 and len(velocities) == 1:  # excludes a joint that is coupled to another
+                indices.setdefault(name, system.nq + velocities[0])
+        return indices
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Jerk(RateLimit):
+class Acceleration(_OfVelocities):
+    """A limit on accelerations: |dv/dt| <= limit, or |v_(k+1) - v_k| <= limit * h in steps.
+
+    In collocation dv/dt is the polynomial of its scheme. The verdict uses the accelerations of the dynamics between the
+    knots. Collocation and shooting support it.
+
+    Args:
+        limit: [velocity's unit per s], for all velocities of a model; or a mapping to limits from names of velocities,
+            or of joints with one velocity. For plain dynamics, a name is that of a state with a limited x'.
+
+    Raises:
+        InputError: A limit that is not positive.
+        UnknownNameError: The Problem has no such velocity.
+
+    Example:
+        >>> block = dd.Dynamics(lambda x, u: [x[1], u[0]], nx=2, nu=1)
+        >>> problem = dd.Problem(
+        ...     block, x0=[0, 0], x_goal=[1, 0], num_steps=20, horizon=(0.5, 5.0), running_cost=1.0,
+        ...     couplings=dd.optimize.Acceleration({"x1": 4.0}),
+        ... )
+        >>> solution = dd.solve(problem)
+        >>> solution.success, round(solution.cost, 4)
+        (True, 1.0)
+    """
+
+    limit: Any
+    name: str = "acceleration"
+    of_slopes = False
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Jerk(_OfVelocities):
     """A limit on the rate of accelerations: |dv'/dt| <= limit, or |v_(k+2) - 2 v_(k+1) + v_k| <= limit * h^2 in steps.
 
     In collocation v' is the polynomial of its scheme, whose slope is bounded at every time. The verdict uses the
@@ -374,14 +425,3 @@ class Jerk(RateLimit):
 
     limit: Any
     name: str = "jerk"
-    of_inputs = False
-
-    def _known(self, system: System) -> dict[str, int]:
-        if not isinstance(system, Model):
-            return {name: i for i, name in enumerate(system.state_names)} if isinstance(self.limit, dict) else {}
-        indices = {name: system.nq + i for i, name in enumerate(system.velocity_names)}
-        for name, joint in labelled(joints(system.plant)).items():
-            _, velocities = system.places(joint)
-            if joint.num_velocities() == 1 and len(velocities) == 1:  # excludes a joint that is coupled to another
-                indices.setdefault(name, system.nq + velocities[0])
-        return indices

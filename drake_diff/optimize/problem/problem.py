@@ -438,6 +438,11 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         """The couplings of all pairs or triples of successive knots."""
         return tuple(c for c in self.couplings if isinstance(c, RateLimit))
 
+    @property
+    def limits_jerk(self) -> bool:
+        """Whether a rate limit applies to the slopes of x'."""
+        return any(limit.of_slopes and not limit.of_inputs for limit in self.rate_limits)
+
     def coupled_steps(self, time_step: float | None = None) -> tuple[BoundCoupling, ...]:
         """Return all couplings of a motion in steps of `time_step` [s], by default the step where a search starts."""
         h = self.start_horizon / self.num_steps if time_step is None else time_step
@@ -740,7 +745,8 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         return tuple(constraint.resolved(self.x0, np.zeros(self.nu)) for constraint in given)
 
     def _check_couplings(self) -> tuple[Couples, ...]:
-        couplings = several("couplings", self.couplings, Couples, "Periodic, Coupling, InputRate, Jerk, or several")
+        kinds = "Periodic, Coupling, InputRate, Acceleration, Jerk, or several"
+        couplings = several("couplings", self.couplings, Couples, kinds)
         self._set("couplings", couplings)
         taken = {c.label for c in self.constraints}
         for c in couplings:

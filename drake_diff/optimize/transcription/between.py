@@ -75,7 +75,7 @@ def violation_between_nodes(motion: Collocated) -> Excess:
     for limit in task.problem.rate_limits:
         _, most = limit.entries(task.problem.system)
         rates, when = motion.rates_of(limit)
-        extent = _extent(rates) if limit.of_inputs else JERK_TOLERANCE / EXCESS_TOLERANCE * most
+        extent = _extent(rates) if limit.of_inputs or not limit.of_slopes else JERK_TOLERANCE / EXCESS_TOLERANCE * most
         tolerance = _tolerance(extent, most)
         groups.append(_beyond("constraint", (limit.label,) * len(most), rates, -most, most, tolerance, when))
     k, tau = np.repeat(np.arange(count), len(DENSE)), np.tile(DENSE, count)

@@ -153,13 +153,14 @@ class Collocated:
             quantity = self.nodes[:, self.task.dynamics.nx :] if limit.of_inputs else self._rates
             entries, limits = limit.entries(self.task.problem.system)
             values = self.task.scheme.at(SLOPED) @ self.task.scheme.per_interval(quantity[:, entries])
-            excess = np.maximum(np.abs(self._slopes(values)) - limits, 0.0)
+            values = self._slopes(values) if limit.of_slopes else values
+            excess = np.maximum(np.abs(values) - limits, 0.0)
             worst = np.nan_to_num(np.max(excess, axis=(1, 2)), nan=np.inf)
             excesses[limit.label] = float(np.max(worst)), int(np.argmax(worst))
         return excesses
 
     def rates_of(self, limit: RateLimit) -> tuple[Array, Array]:
-        """Return time derivatives (S, n) of `limit`'s quantity in all intervals, with their ends, and times (S,).
+        """Return the values (S, n) that `limit` bounds in all intervals, with their ends, and times (S,).
 
         Accelerations are those of the dynamics at the plan's states and inputs.
         """
@@ -169,8 +170,9 @@ class Collocated:
         with np.errstate(all="ignore"):
             quantity = us if limit.of_inputs else self.task.dynamics.values(np.hstack([xs, us]))
         entries, _ = limit.entries(self.task.problem.system)
-        slopes = self._slopes(quantity[:, entries].reshape(count, len(SLOPED), -1))
-        return slopes.reshape(len(k), -1), self.times(k, tau)
+        values = quantity[:, entries].reshape(count, len(SLOPED), -1)
+        values = self._slopes(values) if limit.of_slopes else values
+        return values.reshape(len(k), -1), self.times(k, tau)
 
     def _slopes(self, values: Array) -> Array:
         """Return the time derivatives of `values` (N, S, n), exact for parabolas."""
@@ -663,8 +665,7 @@ def finer_mesh(motion: Collocated, exceeded: Sequence[int], most: int) -> Array 
     lacking = np.zeros(len(motion.mesh) - 1)
     lacking[list(exceeded)] = 1.0
     tolerance = motion.largest_error / 2 ** (motion.task.scheme.order + 1)  # the effect of halving all intervals
-    smooth = any(not limit.of_inputs for limit in motion.task.problem.rate_limits)
-    if smooth and len(exceeded) and motion.largest_error <= ACCURATE:
+    if motion.task.problem.limits_jerk and len(exceeded) and motion.largest_error <= ACCURATE:
         tolerance = np.inf
     mesh = _split(motion, max(tolerance, SMALLEST_ERROR), lacking)
     return None if len(mesh) - 1 > most or len(mesh) == len(motion.mesh) else mesh

@@ -240,9 +240,16 @@ class TranscribedProgram(BlockProgram):
     def _add_slopes(self, phase: Phase, dynamics: Term, limit: RateLimit) -> None:
         """Constrain |slopes| <= limit at the ends of all intervals, where the slope of a line or parabola is largest.
 
-        The rows are weights @ values within limit * T. With a free T each limit has two rows, one for each side.
+        The rows are weights @ values within limit * T. With a free T each limit has two rows, one for each side. An
+        `Acceleration` limits the Bernstein coefficients of the scheme's x', between which x' stays.
         """
         scheme, (entries, limits) = phase.task.scheme, limit.entries(phase.task.problem.system)
+        if not limit.of_slopes:
+            coefficients = scheme.bernstein
+            most = np.broadcast_to(limits, (len(phase.mesh) - 1, len(coefficients), len(entries)))
+            rows = self.add_rows(-most.ravel(), most.ravel()).reshape(*most.shape[:2], 1, len(entries))
+            dynamics.weigh(rows, _nodes(phase)[:, None, :, None] * phase.nx + entries, coefficients[None, :, :, None])
+            return
         ends = np.array([[-1.0, 0.0, 1.0]]) if limit.of_inputs and scheme.input_is_linear else scheme.end_slopes
         most = np.broadcast_to(limits, (len(phase.mesh) - 1, len(ends), len(entries)))
         weights = ends[None, :, :, None] / np.diff(phase.mesh)[:, None, None, None]

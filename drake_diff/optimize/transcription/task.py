@@ -19,6 +19,7 @@ import copy
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from math import comb
 from typing import Any
 
 import numpy as np
@@ -75,6 +76,13 @@ class Scheme:
         tau = np.array([0.0, 1.0] if self.basis.shape[1] > 2 else [0.0])
         powers = np.arange(1, self.basis.shape[1])
         return np.asarray(tau[:, None] ** (powers - 1) * powers @ self.basis[:, 1:].T)
+
+    @cached_property
+    def bernstein(self) -> Array:
+        """The weights (s+1, s+1) of nodes in the Bernstein coefficients of their polynomial."""
+        count = self.basis.shape[1]
+        rows = [[comb(j, i) / comb(count - 1, i) for i in range(count)] for j in range(count)]
+        return np.asarray(np.array(rows) @ self.basis.T)
 
     def at(self, tau: Array) -> Array:
         """Return the weights (S, s+1) of the nodes' values at `tau` (S,) within an interval."""

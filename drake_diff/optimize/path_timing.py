@@ -1,0 +1,461 @@
+"""The least time along a given path of a robot's positions, within limits of speed, acceleration, effort and jerk.
+
+The path is q(s), where s from 0 to 1 is its length. The motion is s(t), a piecewise cubic of N intervals of the same
+duration, so that its acceleration is continuous. IPOPT minimizes the duration over s, ds/dt and d2s/dt2 at the knots.
+All limits are then compared with the exact path between the knots, and the motion is slowed down by the excess that is
+left. The result is a plan of the model, with the verification of `check_plan`.
+"""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from pydrake.trajectories import PiecewisePolynomial, Trajectory
+from scipy.interpolate import BSpline, make_interp_spline
+
+from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
+from drake_diff.exceptions import InputError, ShapeError
+from drake_diff.model.model import Model
+from drake_diff.optimize.check_plan import checked
+from drake_diff.optimize.guess import trajectory_values
+from drake_diff.optimize.measure import GIVEN
+from drake_diff.optimize.problem.constraint import Bounds, plant_limits, resolve_bounds
+from drake_diff.optimize.problem.coupling import Acceleration, Jerk
+from drake_diff.optimize.problem.dynamics import bounds_of
+from drake_diff.optimize.problem.problem import Problem
+from drake_diff.optimize.program import Limits, Outcome
+from drake_diff.optimize.solution import Solution, Status
+from drake_diff.optimize.transcription.program import OUTCOMES
+from drake_diff.optimize.transcription.task import DEFAULT_SCHEME
+from drake_diff.optimize.verification import ended, status_of
+
+SUBJECT = "PathTiming.path"
+SAMPLES = (100, 400, 1600)  # numbers of places on the path that its spline interpolates; more if it is not accurate
+GRID = 801  # places on the path at which the search knows its slopes and efforts
+OFF_PATH = 1e-5  # of the range of a position: allowed distance of the spline from the path
+DEGREE = 5  # of the path's spline, so that its third derivative is continuous
+GAUSS, NEWTON = 5, 5  # places of the quadrature in a cell, and steps to the place with a given length
+FRACTIONS = (0.0, 1 / 3, 2 / 3)  # of an interval: places at which the search satisfies the limits
+PLACES, ASIDE = 12, 1e-9  # places in an interval that are compared with the exact path, and a distance from a knot
+SLOWER, SLOWEST = 1.2, 60  # the factor between two first durations, and their number
+TOLERANCE, WIDEST = 1e-7, 1e3  # of IPOPT, and the factor from the first duration to its bounds
+KEPT, ROUNDS = 1e-9, 60  # of a limit: an excess that is rounding; and the largest number of slower motions
+QUARTERS = np.arange(5) / 4  # of an interval
+HALVINGS, SAME_INPUT = 5, 1e-4  # of intervals, and the error of an input's parabola, in its range over an interval
+TINY = 1e-300  # stands for a limit of 0
+WAYPOINTS = 10  # parts of the motion between the waypoints of the solution's problem
+LEAST_DRIVE = 1e-9  # of the actuation's largest singular value
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PathTiming:
+    """The least time along a given path, as a problem for `solve`.
+
+    The speed and effort limits of the model apply, and those that are given here, also between the knots. The solution
+    is a plan of the model in continuous time, judged by all checks of `check_plan`. Its problem has the limits, both
+    ends and some waypoints of the path.
+
+    Args:
+        model: a model whose velocities are the rates of its positions, with a motor for each of them.
+        path: the positions as a Drake trajectory (nq), such as a `BsplineTrajectory` or the result of
+            `KinematicTrajectoryOptimization` or `GcsTrajectoryOptimization`, whose own timing is ignored; or waypoints
+            (K, nq), joined by a cubic spline. It has no corners.
+        num_steps: number N of intervals.
+        acceleration: [velocity's unit per s] a limit for all velocities, or a mapping from names to limits. If it is
+            not given, the acceleration limits of the model apply.
+        jerk: [velocity's unit per s^2] the same for the rate of the accelerations, which then are 0 at both ends.
+        bounds: other limits of the states and inputs, as in `Problem`.
+
+    Raises:
+        InputError: the model or the path does not fit, or no limit applies.
+        ShapeError: the path does not have the size of the positions.
+
+    Source:
+        Verscheure et al., "Time-optimal path tracking for robots", IEEE Transactions on Automatic Control 54(10), 2009.
+
+    Example:
+        >>> pendulum = dd.example_model("pendulum")
+        >>> timing = dd.optimize.PathTiming(pendulum, [[0.0], [1.0]], acceleration=4.0)
+        >>> solution = dd.solve(timing)
+        >>> solution.success, round(solution.horizon, 2)  # 2 sqrt(1 / 4)
+        (True, 1.0)
+    """
+
+    model: Model
+    path: Any
+    _: KW_ONLY
+    num_steps: int = 100
+    acceleration: Any = None
+    jerk: Any = None
+    bounds: Bounds | Mapping[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        model, subject = self.model, "PathTiming.model"
+        if not isinstance(model, Model):
+            raise InputError(subject, got=type(model).__name__, expected="a Model")
+        positive_int("num_steps", self.num_steps)
+        if not (model.contract.is_unconstrained and model.plant.IsVelocityEqualToQDot()):
+            expected = "an open chain of joints whose inputs are efforts"
+            raise InputError(subject, got="closed loops, PD control or a floating body", expected=expected)
+        size = np.linalg.svd(model.actuation, compute_uv=False)
+        if model.nu < model.nv or size[-1] <= LEAST_DRIVE * size[0]:
+            raise InputError(subject, got=f"{model.nu} motors", expected=f"a motor for each of {model.nv} velocities")
+        self._check_path()
+        if not self.couplings:
+            b, nq = self.limits, model.nq
+            if not any(np.isfinite(side).all() for side in ([b.x_lower[nq:], b.x_upper[nq:]], [b.u_lower, b.u_upper])):
+                expected = "acceleration=, jerk=, or limits of all speeds or all efforts"
+                raise InputError("PathTiming", got="a motion without limits", expected=expected)
+
+    def __repr__(self) -> str:
+        return f"PathTiming of {self.model.name}: {self.num_steps} intervals along a path of {self.model.nq} positions"
+
+    @cached_property
+    def couplings(self) -> tuple[Acceleration | Jerk, ...]:
+        """The limits of accelerations and jerks."""
+        acceleration = self.acceleration
+        if acceleration is None:
+            most = zip(self.model.velocity_names, self.model.plant.GetAccelerationUpperLimits(), strict=True)
+            acceleration = {name: float(limit) for name, limit in most if np.isfinite(limit)} or None
+        couplings = [] if acceleration is None else [Acceleration(acceleration)]
+        every = (*couplings, *([] if self.jerk is None else [Jerk(self.jerk)]))
+        for coupling in every:
+            coupling.entries(self.model)
+        return every
+
+    @cached_property
+    def limits(self) -> Bounds:
+        """The limits of all states and inputs."""
+        model = self.model
+        given = bounds_of(model, self.bounds)
+        return resolve_bounds(given, plant_limits(model), model.state_names, model.input_names)
+
+    @cached_property
+    def spline(self) -> BSpline:
+        """The path q(s) as a spline of degree 5, where s from 0 to 1 is proportional to its length."""
+        path = _trajectory(self.path, self.model.nq)
+        for count in SAMPLES:
+            spline, off = _along(path, count)
+            if off <= OFF_PATH:
+                return spline
+        got = f"a corner: a spline through {count} of its places leaves it by {off:.2g} of the motion"
+        raise InputError(SUBJECT, got=got, expected="a smooth path")
+
+    def _check_path(self) -> None:
+        """Raise InputError if the path leaves the limits of the positions."""
+        nq, q = self.model.nq, self.spline(np.linspace(0, 1, GRID))
+        lower, upper = self.limits.x_lower[:nq], self.limits.x_upper[:nq]
+        beyond = np.maximum(lower - q, q - upper)
+        k, i = np.unravel_index(np.argmax(beyond), beyond.shape)
+        if beyond[k, i] > KEPT * np.ptp(q[:, i]):
+            expected = f"{lower[i]:.6g} to {upper[i]:.6g}"
+            raise InputError(SUBJECT, got=f"{self.model.state_names[i]} = {q[k, i]:.6g}", expected=expected)
+
+    def solved(self, limits: Limits) -> Solution:
+        """Return the verified plan of least time; see `solve`."""
+        start = time.monotonic()
+        outcome, iterations, timing = _Search(self).run(limits)
+        knots = self._knots(timing)
+        rows = timing.at(_halves(knots))
+        rows[[0, -1], :2] = [[0.0, 0.0], [1.0, 0.0]]  # without rounding
+        xs, us = self.motion(rows)
+        xs = np.clip(xs, self.limits.x_lower, self.limits.x_upper)
+        fields: dict[str, Any] = {"xs": frozen(xs[::2]), "us": frozen(us[:-1:2]), "u_final": frozen(us[-1])}
+        fields |= {"us_mid": frozen(us[1::2]), "mesh": frozen(knots / self.num_steps)}
+        problem = self._problem(xs[::2][knots == knots.round()], timing.duration)
+        fields |= {"scheme": DEFAULT_SCHEME, "free_horizon": timing.duration}
+        plan = Solution(problem, GIVEN, "IPOPT", Status.FAILED, "", **fields)
+        words = f"IPOPT: {outcome.value} after {iterations} iterations"
+        solution: Solution = ended(plan, status_of(outcome) or Status.FAILED, words)
+        if outcome is Outcome.SOLVED:
+            arguments = {"method": GIVEN, "plant": "continuous", "tolerance": 1e-4, "search": type(self).__name__}
+            solution = checked(plan, arguments)
+        return solution.told(wall_time=time.monotonic() - start)
+
+    def _knots(self, timing: "_Timing") -> Array:
+        """Return knots, as places from 0 to N, between which parabolas follow the inputs of a timing."""
+        knots = np.arange(self.num_steps + 1.0)
+        for _ in range(HALVINGS):
+            ends, lengths = knots[:-1], np.diff(knots)
+            every = self.motion(timing.at((ends[:, None] + lengths[:, None] * QUARTERS).ravel()))[1]
+            first, other, middle, _, last = every.reshape(len(ends), len(QUARTERS), -1).transpose(1, 0, 2)
+            off = np.abs(other - (3 * first + 6 * middle - last) / 8)
+            coarse = np.max(off / np.maximum(np.ptp(every, axis=0), TINY), axis=1) > SAME_INPUT * lengths
+            if not np.any(coarse):
+                break
+            knots = np.sort(np.append(knots, (ends + lengths / 2)[coarse]))
+        return knots
+
+    def _problem(self, xs: Array, duration: float) -> Problem:
+        """Return the problem of a motion xs (N+1, nx)."""
+        chosen = np.unique(np.linspace(0, self.num_steps, WAYPOINTS + 1).round().astype(int))[1:-1]
+        waypoints = {int(k): np.append(xs[k, : self.model.nq], np.full(self.model.nv, np.nan)) for k in chosen}
+        return Problem(
+            self.model,
+            x0=xs[0],
+            x_goal=xs[-1],
+            num_steps=self.num_steps,
+            horizon=duration,
+            running_cost=1.0,
+            bounds=self.bounds,
+            waypoints=waypoints,
+            couplings=self.couplings,
+        )
+
+    def motion(self, s: Array) -> tuple[Array, Array]:
+        """Return the states (K, nx) and the smallest inputs (K, nu) for rows (K, 3) of s, ds/dt and d2s/dt2."""
+        q, slope, curvature = (self.spline(s[:, 0], nu=i) for i in range(3))
+        xs = np.hstack([q, slope * s[:, 1:2]])
+        accelerations = slope * s[:, 2:3] + curvature * s[:, 1:2] ** 2
+        twin, needed = self.model.double, np.empty((len(xs), self.model.nv))
+        for k, (x, acceleration) in enumerate(zip(xs, accelerations, strict=True)):
+            twin.set_state(x)
+            needed[k] = twin.inverse_dynamics(acceleration)
+        return xs, np.asarray(needed @ np.linalg.pinv(self.model.actuation).T)
+
+
+def _halves(knots: Array) -> Array:
+    """Return knots (N+1,) with the places in the middle between them (2N+1,)."""
+    return np.interp(np.arange(2 * len(knots) - 1) / 2, np.arange(len(knots)), knots)
+
+
+def _trajectory(path: Any, nq: int) -> Trajectory:
+    """Return a path, or the cubic spline through its waypoints (K, nq), as a Drake trajectory."""
+    if isinstance(path, Trajectory):
+        if (path.rows(), path.cols()) != (nq, 1):
+            raise ShapeError(SUBJECT, got=(path.rows(), path.cols()), expected=(nq, 1))
+        if not 0 < path.end_time() - path.start_time() < np.inf:
+            raise InputError(SUBJECT, got=f"{path.start_time()} to {path.end_time()}", expected="a finite range")
+        return path
+    points = finite_array(SUBJECT, path, ("K", nq))
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    if not (len(lengths) and np.all(lengths > 0)):
+        raise InputError(SUBJECT, got="one waypoint, or two equal ones", expected="two or more different waypoints")
+    breaks = np.append(0.0, np.cumsum(lengths))
+    if len(points) == 2:
+        return PiecewisePolynomial.FirstOrderHold(breaks, points.T)
+    return PiecewisePolynomial.CubicWithContinuousSecondDerivatives(breaks, points.T)
+
+
+def _along(path: Trajectory, count: int) -> tuple[BSpline, float]:
+    """Return the path as a spline of its length from 0 to 1, and the largest distance of the spline from the path.
+
+    Lengths and distances are relative to the range of each position. The spline interpolates `count` + 1 places.
+    """
+    rate = path.MakeDerivative()
+    cells = np.linspace(path.start_time(), path.end_time(), 4 * count + 1)
+    ranges = np.ptp(trajectory_values(SUBJECT, path, cells), axis=0)
+    if not np.max(ranges) > 0:
+        raise InputError(SUBJECT, got="constant positions", expected="a motion")
+    weights = np.divide(1.0, ranges, out=np.zeros_like(ranges), where=ranges > 0)
+    nodes, shares = np.polynomial.legendre.leggauss(GAUSS)
+
+    def speeds(when: Array) -> Array:
+        return np.asarray(np.linalg.norm(rate.vector_values(when.ravel()).T * weights, axis=1).reshape(when.shape))
+
+    def lengths_of(start: Array, end: Array) -> Array:
+        half = (end - start)[:, None] / 2
+        return np.asarray((speeds((start + end)[:, None] / 2 + half * nodes) * half) @ shares)
+
+    lengths = np.append(0.0, np.cumsum(lengths_of(cells[:-1], cells[1:])))
+    targets = np.linspace(0, lengths[-1], 2 * count + 1)
+    when = np.interp(targets, lengths, cells)
+    k = np.clip(np.searchsorted(lengths, targets, side="right") - 1, 0, len(cells) - 2)
+    for _ in range(NEWTON):
+        speed = speeds(when)
+        left = targets - lengths[k] - lengths_of(cells[k], when)
+        when = when + np.divide(left, speed, out=np.zeros_like(speed), where=speed > 0)
+        when = np.clip(when, cells[k], cells[k + 1])
+    values, s = trajectory_values(SUBJECT, path, when), targets / lengths[-1]
+    spline = make_interp_spline(s[::2], values[::2], DEGREE)
+    return spline, float(np.max(np.abs(spline(s[1::2]) - values[1::2]) * weights))
+
+
+@dataclass(frozen=True)
+class _Timing:
+    """The values (N+1, 3) of s, ds/dt [1/s] and d2s/dt2 [1/s^2] at the knots of a motion of `duration` [s]."""
+
+    values: Array
+    duration: float
+
+    def at(self, places: Array) -> Array:
+        """Return s and its three time derivatives (K, 4) at `places` (K,), in intervals from 0 to N."""
+        k = np.minimum(places.astype(int), len(self.values) - 2)
+        h = self.duration / (len(self.values) - 1)
+        jerks = (self.values[k + 1, 2] - self.values[k, 2]) / h
+        s, v, a = self.values[k].T
+        return np.array([*_within(s, v, a, jerks, h * (places - k)), jerks]).T
+
+    def slower(self, factor: float) -> "_Timing":
+        """Return the same motion in `factor` times the duration."""
+        return _Timing(self.values / factor ** np.arange(3), self.duration * factor)
+
+
+def _within(s: Any, v: Any, a: Any, jerk: Any, t: Any) -> tuple[Any, Any, Any]:
+    """Return s and two derivatives at the time t [s] after (s, v, a) with a constant jerk."""
+    return s + t * (v + t * (a / 2 + t * jerk / 6)), v + t * (a + t * jerk / 2), a + t * jerk
+
+
+@dataclass(frozen=True)
+class _Limit:
+    """Limits of a quantity (n,), whose ratio to them to the power `power` is the factor of a motion's duration."""
+
+    lower: Array
+    upper: Array
+    power: float
+
+    @cached_property
+    def centre(self) -> Array:
+        """The middle (n,) of the limits, or 0 if one of them is infinite."""
+        with np.errstate(invalid="ignore"):
+            return np.nan_to_num((self.lower + self.upper) / 2, posinf=0.0, neginf=0.0)
+
+    @cached_property
+    def reach(self) -> Array:
+        """The distances (2, n) of the limits from the centre."""
+        return np.maximum([self.centre - self.lower, self.upper - self.centre], TINY)
+
+    def rows(self, value: Any) -> tuple[Any, Array, Array]:
+        """Return a CasADi expression of the limited entries over their smaller reach, and its limits."""
+        scale = np.min(self.reach, axis=0)
+        chosen = np.flatnonzero(np.isfinite(scale)).tolist()
+        below, above = (self.reach[:, chosen] / scale[chosen]).tolist()
+        rows = ca.vertcat(*(((value - self.centre) / scale)[i] for i in chosen))
+        return rows, -np.array(below), np.array(above)
+
+    def ratio(self, values: Array) -> float:
+        """Return the largest distance of `values` (K, n) from the centre, relative to the reach on its side."""
+        off = values - self.centre
+        return float(np.max(np.where(off < 0, -off / self.reach[0], off / self.reach[1]), initial=0.0))
+
+
+class _Search:
+    """The program of a `PathTiming` in s, ds/dt and d2s/dt2 at the knots, and the duration."""
+
+    def __init__(self, task: PathTiming):
+        self.task, nq, b = task, task.model.nq, task.limits
+        self.grid = np.linspace(0, 1, GRID)
+        self.kinds = [_Limit(b.x_lower[nq:], b.x_upper[nq:], 1.0), _Limit(b.u_lower, b.u_upper, 0.5)]
+        for coupling in task.couplings:
+            entries, limits = coupling.entries(task.model)
+            most = np.full(nq, np.inf)
+            most[entries - nq] = limits
+            self.kinds.append(_Limit(-most, most, 0.5 if isinstance(coupling, Acceleration) else 1 / 3))
+        table = [*(task.spline(self.grid, nu=i) for i in (1, 2, 3)), *self._efforts()]
+        symbols = [ca.SX.sym(f"c{i}", column.shape[1]) for i, column in enumerate(table)]
+        v, a, jerk = (ca.SX.sym(name) for name in ("v", "a", "jerk"))
+        *slopes, m, c, d, f, g = symbols
+        values = self._limited(slopes, v, a, jerk, m * a + c * v**2 + d * v + f + g)
+        rows, lower, upper = zip(*map(_Limit.rows, self.kinds, values), strict=True)
+        self.lower, self.upper = np.concatenate(lower), np.concatenate(upper)
+        limited = ca.Function("limited", [ca.vertcat(*symbols), v, a, jerk], [ca.vertcat(*rows)])
+        spline = ca.interpolant("path", "bspline", [self.grid], np.hstack(table).ravel())
+        z = [ca.MX.sym(name) for name in ("s", "v", "a", "jerk")]
+        self.limited = ca.Function("limited", z, [limited(spline(z[0]), *z[1:])])
+
+    def _limited(self, slopes: Sequence[Any], v: Any, a: Any, jerk: Any, inputs: Any) -> list[Any]:
+        """Return the limited quantities in the order of `kinds`; `slopes` are the path's first three derivatives."""
+        q1, q2, q3 = slopes
+        by_power = {0.5: q1 * a + q2 * v**2, 1 / 3: q1 * jerk + 3 * q2 * v * a + q3 * v**3}
+        return [q1 * v, inputs, *(by_power[kind.power] for kind in self.kinds[2:])]
+
+    def _efforts(self) -> Iterator[Array]:
+        """Yield m, c, d, f and g (M, nu), with which the inputs are m a + c v^2 + d v + f + g for v = ds/dt > 0.
+
+        The term g is for the robot at rest, d for damping, f for dry friction, and a is d2s/dt2.
+        """
+        speed = self._speed
+
+        def inputs(v: float, a: float) -> Array:
+            rows = np.tile([0.0, v, a], (len(self.grid), 1))
+            rows[:, 0] = self.grid
+            return self.task.motion(rows)[1]
+
+        rest = inputs(0.0, 0.0)
+        (ahead, back), twice = (inputs(v, 0.0) for v in (speed, -speed)), [inputs(2 * v, 0.0) for v in (speed, -speed)]
+        odd = (ahead - back) / 2
+        damping = ((twice[0] - twice[1]) / 2 - odd) / speed
+        yield inputs(0.0, 1.0) - rest
+        yield ((ahead + back) / 2 - rest) / speed**2
+        yield damping
+        yield odd - damping * speed
+        yield rest
+
+    @cached_property
+    def _speed(self) -> float:
+        """A typical speed along the path [1/s]."""
+        with np.errstate(divide="ignore"):
+            fastest = np.min(self.kinds[0].upper / np.abs(self.task.spline(self.grid, nu=1)), axis=1)
+        return float(np.median(fastest)) if np.isfinite(fastest).all() else 1.0
+
+    def run(self, limits: Limits) -> tuple[Outcome, int, _Timing]:
+        """Return IPOPT's outcome and iterations, and its timing within the limits, or else the first timing."""
+        count, guess = self.task.num_steps, self._first()
+        s, v, a = (ca.MX.sym(name, count + 1) for name in "sva")
+        duration = ca.MX.sym("duration")
+        h = duration / count
+        jerk = (a[1:] - a[:-1]) / h
+        end = _within(s[:-1], v[:-1], a[:-1], jerk, h)
+        every = self.limited.map(count)
+        kept = [s[1:] - end[0], v[1:] - end[1]]
+        for fraction in FRACTIONS:
+            place = (*_within(s[:-1], v[:-1], a[:-1], jerk, fraction * h), jerk)
+            kept.append(ca.vec(every(*(z.T for z in place))))
+        kept.append(self.limited(s[-1], v[-1], a[-1], jerk[-1]))
+        number, free = len(FRACTIONS) * count + 1, np.full(count + 1, np.inf)
+        lower = np.concatenate([np.zeros(2 * count + 2), -free, [guess.duration / WIDEST]])
+        upper = np.concatenate([np.ones(count + 1), free, free, [guess.duration * WIDEST]])
+        ends = [0, count, count + 1, 2 * count + 1] + [2 * count + 2, 3 * count + 2] * (self.task.jerk is not None)
+        lower[ends] = upper[ends] = [0.0, 1.0] + [0.0] * (len(ends) - 2)
+        options = {"print_level": 0, "sb": "yes", "max_iter": limits.max_iterations, "tol": TOLERANCE}
+        if np.isfinite(limits.time_limit):
+            options["max_wall_time"] = limits.time_limit
+        nlp = {"x": ca.vertcat(s, v, a, duration), "f": duration / guess.duration, "g": ca.vertcat(*kept)}
+        solver = ca.nlpsol("timing", "ipopt", nlp, {"ipopt": options, "print_time": False})
+        result = solver(
+            x0=np.append(guess.values.T.ravel(), guess.duration),
+            lbx=lower,
+            ubx=upper,
+            lbg=np.append(np.zeros(2 * count), np.tile(self.lower, number)),
+            ubg=np.append(np.zeros(2 * count), np.tile(self.upper, number)),
+        )
+        z, stats = np.array(result["x"]).ravel(), solver.stats()
+        outcome = OUTCOMES.get(stats["return_status"], Outcome.FAILED)
+        if outcome is not Outcome.SOLVED:
+            return outcome, stats["iter_count"], guess
+        return outcome, stats["iter_count"], self._slowed(_Timing(z[:-1].reshape(3, -1).T, float(z[-1])))
+
+    def _first(self) -> _Timing:
+        """Return a motion from rest to rest within the limits, or else the slowest that was tried."""
+        tau = np.linspace(0, 1, self.task.num_steps + 1)
+        left = 1 - tau
+        values = [tau**3 * (10 - 15 * tau + 6 * tau**2), 30 * (tau * left) ** 2, 60 * tau * left * (1 - 2 * tau)]
+        timing = _Timing(np.array(values).T, 1.0).slower(1 / self._speed)
+        for _ in range(SLOWEST):
+            if self._factor(timing) <= 1:
+                break
+            timing = timing.slower(SLOWER)
+        return timing
+
+    def _factor(self, timing: _Timing) -> float:
+        """Return the factor by which a timing is too fast for the limits on the exact path; at most 1 within them."""
+        places = np.linspace(0, self.task.num_steps, PLACES * self.task.num_steps + 1)
+        s = timing.at(places)
+        slopes = [self.task.spline(s[:, 0], nu=i) for i in (1, 2, 3)]
+        us = self.task.motion(s)[1]
+        before = timing.at(np.maximum(places - ASIDE, 0.0))[:, 3:]  # jerks differ on the sides of a knot
+        every = [self._limited(slopes, s[:, 1:2], s[:, 2:3], jerk, us) for jerk in (s[:, 3:], before)]
+        return max(k.ratio(value) ** k.power for values in every for k, value in zip(self.kinds, values, strict=True))
+
+    def _slowed(self, timing: _Timing) -> _Timing:
+        """Return the timing, slowed down until it is within the limits."""
+        for _ in range(ROUNDS):
+            factor = self._factor(timing)
+            if factor <= 1 + KEPT:
+                break
+            timing = timing.slower(factor)
+        return timing
