@@ -40,7 +40,7 @@ OFF_PATH = 1e-5  # of the range of a position: allowed distance of the spline fr
 DEGREE = 5  # of the path's spline, so that its third derivative is continuous
 GAUSS, NEWTON = 5, 5  # places of the quadrature in a cell, and steps to the place with a given length
 FRACTIONS = (0.0, 1 / 3, 2 / 3)  # of an interval: places at which the search satisfies the limits
-PLACES, ASIDE = 12, 1e-9  # places in an interval that are compared with the exact path, and a distance from a knot
+PLACES, ASIDE = 40, 1e-9  # places in an interval that are compared with the exact path, and a distance from a knot
 SLOWER, SLOWEST = 1.2, 60  # the factor between two first durations, and their number
 TOLERANCE, WIDEST = 1e-7, 1e3  # of IPOPT, and the factor from the first duration to its bounds
 KEPT, ROUNDS = 1e-9, 60  # of a limit: an excess that is rounding; and the largest number of slower motions
@@ -122,7 +122,7 @@ class PathTiming:
             most = zip(self.model.velocity_names, self.model.plant.GetAccelerationUpperLimits(), strict=True)
             acceleration = {name: float(limit) for name, limit in most if np.isfinite(limit)} or None
         couplings = [] if acceleration is None else [Acceleration(acceleration)]
-        every = (*couplings, *([] if self.jerk is None else [Jerk(self.jerk)]))
+        every: tuple[Acceleration | Jerk, ...] = (*couplings, *([] if self.jerk is None else [Jerk(self.jerk)]))
         for coupling in every:
             coupling.entries(self.model)
         return every
