@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from pydrake.trajectories import PiecewisePolynomial, Trajectory
+from pydrake.trajectories import PiecewisePolynomial, StackedTrajectory, Trajectory
 
 from drake_diff._base.arrays import Array, finite_array, positive_float
 from drake_diff.derivatives.step import differentiate_step
@@ -30,7 +30,7 @@ NOISE = 1e-3  # noise on a stationary guess, as a fraction of the input limits, 
 WANDER = (1.0, 0.3)  # deviation of a random guess from the straight line, as a fraction of max(1, distance to the goal)
 WAVES = 4
 LONGER = 3.0  # largest factor between a random horizon and the first horizon, in both directions
-FORMS = "None, (xs, us), two Drake trajectories (state, input), a state's trajectory or a Solution"
+FORMS = "None, (xs, us), two Drake trajectories (state, input), one of states or positions, or a Solution"
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,9 +140,10 @@ def _means(us: Array, ends: Array) -> Array:
 def sampled(problem: Problem, method: str, given: Any) -> Any:
     """Return `given`, with two Drake trajectories sampled at the problem's knots.
 
-    Held inputs are sampled in the middle of each step. States alone get the inputs of a default guess.
+    Held inputs are sampled in the middle of each step. States alone get the inputs of a default guess, and positions of
+    a model alone also get their rates.
     """
-    given = (given, None) if isinstance(given, Trajectory) else given
+    given = (_with_rates(problem, given), None) if isinstance(given, Trajectory) else given
     if not isinstance(given, (tuple, list)):
         return given
     if len(given) >= 2 and (given[1] is None or _is_empty(given[1])):
@@ -169,6 +170,16 @@ def sampled(problem: Problem, method: str, given: Any) -> Any:
     if method == "collocation" or problem.horizon:  # collocation takes a free horizon
         return _guessed("state", state, knots), _guessed("input", held, knots), end - start
     return _guessed("state", state, knots), _guessed("input", held, (knots[:-1] + knots[1:]) / 2)
+
+
+def _with_rates(problem: Problem, signal: Trajectory) -> Trajectory:
+    """Return a trajectory of states, with the rates of the positions if it is one of a model's positions alone."""
+    if not (problem.has_model and problem.model.plant.IsVelocityEqualToQDot() and signal.rows() == problem.model.nq):
+        return signal
+    states = StackedTrajectory()
+    states.Append(signal)
+    states.Append(signal.MakeDerivative())
+    return states
 
 
 def _is_empty(signal: Any) -> bool:

@@ -45,7 +45,8 @@ SLOWER, SLOWEST = 1.2, 60  # the factor between two first durations, and their n
 TOLERANCE, WIDEST = 1e-7, 1e3  # of IPOPT, and the factor from the first duration to its bounds
 KEPT, ROUNDS = 1e-9, 60  # of a limit: an excess that is rounding; and the largest number of slower motions
 QUARTERS = np.arange(5) / 4  # of an interval
-HALVINGS, SAME_INPUT = 5, 1e-4  # of intervals, and the error of an input's parabola, in its range over an interval
+# Of intervals; and the error of an input's parabola over its range in an interval, without and with a jerk limit.
+HALVINGS, SAME_INPUT, SAME_RATE = 6, 1e-4, 1e-5
 TINY = 1e-300  # stands for a limit of 0
 WAYPOINTS = 10  # parts of the motion between the waypoints of the solution's problem
 LEAST_DRIVE = 1e-9  # of the actuation's largest singular value
@@ -151,7 +152,7 @@ class PathTiming:
         lower, upper = self.limits.x_lower[:nq], self.limits.x_upper[:nq]
         beyond = np.maximum(lower - q, q - upper)
         k, i = np.unravel_index(np.argmax(beyond), beyond.shape)
-        if beyond[k, i] > KEPT * np.ptp(q[:, i]):
+        if beyond[k, i] > KEPT * np.max(np.abs(q[:, i])):
             expected = f"{lower[i]:.6g} to {upper[i]:.6g}"
             raise InputError(SUBJECT, got=f"{self.model.state_names[i]} = {q[k, i]:.6g}", expected=expected)
 
@@ -178,13 +179,13 @@ class PathTiming:
 
     def _knots(self, timing: "_Timing") -> Array:
         """Return knots, as places from 0 to N, between which parabolas follow the inputs of a timing."""
-        knots = np.arange(self.num_steps + 1.0)
+        knots, tolerance = np.arange(self.num_steps + 1.0), SAME_INPUT if self.jerk is None else SAME_RATE
         for _ in range(HALVINGS):
             ends, lengths = knots[:-1], np.diff(knots)
             every = self.motion(timing.at((ends[:, None] + lengths[:, None] * QUARTERS).ravel()))[1]
             first, other, middle, _, last = every.reshape(len(ends), len(QUARTERS), -1).transpose(1, 0, 2)
             off = np.abs(other - (3 * first + 6 * middle - last) / 8)
-            coarse = np.max(off / np.maximum(np.ptp(every, axis=0), TINY), axis=1) > SAME_INPUT * lengths
+            coarse = np.max(off / np.maximum(np.ptp(every, axis=0), TINY), axis=1) > tolerance * lengths
             if not np.any(coarse):
                 break
             knots = np.sort(np.append(knots, (ends + lengths / 2)[coarse]))
@@ -248,10 +249,12 @@ def _along(path: Trajectory, count: int) -> tuple[BSpline, float]:
     """
     rate = path.MakeDerivative()
     cells = np.linspace(path.start_time(), path.end_time(), 4 * count + 1)
-    ranges = np.ptp(trajectory_values(SUBJECT, path, cells), axis=0)
-    if not np.max(ranges) > 0:
+    positions = trajectory_values(SUBJECT, path, cells)
+    ranges = np.ptp(positions, axis=0)
+    moves = ranges > KEPT * np.max(np.abs(positions))
+    if not np.any(moves):
         raise InputError(SUBJECT, got="constant positions", expected="a motion")
-    weights = np.divide(1.0, ranges, out=np.zeros_like(ranges), where=ranges > 0)
+    weights = np.divide(1.0, ranges, out=np.zeros_like(ranges), where=moves)
     nodes, shares = np.polynomial.legendre.leggauss(GAUSS)
 
     def speeds(when: Array) -> Array:
@@ -401,11 +404,11 @@ class _Search:
         jerk = (a[1:] - a[:-1]) / h
         end = _within(s[:-1], v[:-1], a[:-1], jerk, h)
         every = self.limited.map(count)
-        kept = [s[1:] - end[0], v[1:] - end[1]]
+        rows = [s[1:] - end[0], v[1:] - end[1]]
         for fraction in FRACTIONS:
-            place = (*_within(s[:-1], v[:-1], a[:-1], jerk, fraction * h), jerk)
-            kept.append(ca.vec(every(*(z.T for z in place))))
-        kept.append(self.limited(s[-1], v[-1], a[-1], jerk[-1]))
+            point = (*_within(s[:-1], v[:-1], a[:-1], jerk, fraction * h), jerk)
+            rows.append(ca.vec(every(*(z.T for z in point))))
+        rows.append(self.limited(s[-1], v[-1], a[-1], jerk[-1]))
         number, free = len(FRACTIONS) * count + 1, np.full(count + 1, np.inf)
         lower = np.concatenate([np.zeros(2 * count + 2), -free, [guess.duration / WIDEST]])
         upper = np.concatenate([np.ones(count + 1), free, free, [guess.duration * WIDEST]])
@@ -414,7 +417,7 @@ class _Search:
         options = {"print_level": 0, "sb": "yes", "max_iter": limits.max_iterations, "tol": TOLERANCE}
         if np.isfinite(limits.time_limit):
             options["max_wall_time"] = limits.time_limit
-        nlp = {"x": ca.vertcat(s, v, a, duration), "f": duration / guess.duration, "g": ca.vertcat(*kept)}
+        nlp = {"x": ca.vertcat(s, v, a, duration), "f": duration / guess.duration, "g": ca.vertcat(*rows)}
         solver = ca.nlpsol("timing", "ipopt", nlp, {"ipopt": options, "print_time": False})
         result = solver(
             x0=np.append(guess.values.T.ravel(), guess.duration),

@@ -86,8 +86,9 @@ def solve(  # type: ignore[misc]  # only this signature lists the keywords
             (through Drake's own steps, contact included), "ilqr" (the same by Riccati sweeps) or "auto".
         initial_guess: None (a straight line to the goal with inputs near zero, or a `TrackingCost`'s reference), a
             Solution of any method, number of steps and horizon, a pair of Drake trajectories (state, input) as in
-            `Solution.trajectory`, or (xs, us) with shapes (N+1, nx) and (N, nu). Collocation also takes us (N+1, nu),
-            and a third entry, the horizon [s]. For phases: a PhasedSolution, or a list with a guess for each phase.
+            `Solution.trajectory`, one of states or of positions alone, or (xs, us) with shapes (N+1, nx) and (N, nu).
+            Collocation also takes us (N+1, nu), and a third entry, the horizon [s]. For phases: a PhasedSolution, or a
+            list with a guess for each phase.
         max_iterations: the iteration limit of the solver, and of each round of a refinement.
         time_limit: [s] of the whole solve. Numba's compilation, once per machine, is excluded, and a note reports it.
         seed: the seed of the noise in a default guess, and of random initial guesses.

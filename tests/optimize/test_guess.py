@@ -102,6 +102,9 @@ def test_drakes_trajectories_are_a_guess(write_urdf):
     np.testing.assert_allclose(solution.search.guess[1].ravel(), 6 - 12 * (np.arange(20) + 0.5) / 20, atol=1e-12)
     collocated = dd.solve(block(horizon=(0.5, 2.0)), initial_guess=(state, held), max_iterations=100)
     assert collocated.search.guess[2] == 1.0
+    positions = PiecewisePolynomial.CubicHermite(t, [3 * t**2 - 2 * t**3], [6 * t - 6 * t**2])
+    alone = dd.solve(problem, method="ilqr", initial_guess=positions)
+    np.testing.assert_allclose(alone.search.guess[0], solution.search.guess[0], atol=1e-12)
 
 
 @pytest.mark.parametrize(

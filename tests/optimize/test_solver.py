@@ -272,6 +272,13 @@ def test_auto_goes_on_from_what_a_failed_attempt_left(load, monkeypatch):
     assert solution.options["chain"][0]["ended"] == "infeasible"
 
 
+def test_more_equations_than_inputs_print_nothing(load, capfd):
+    waypoints = {k: [0.1 * k, 0.2] for k in range(1, 10)}
+    problem = dd.Problem(load("pendulum.urdf"), x0=[0, 0], x_goal=[1, 0], num_steps=10, waypoints=waypoints)
+    assert dd.solve(problem, method="shooting").status is Status.INFEASIBLE
+    assert capfd.readouterr() == ("", "")
+
+
 def test_the_callback_sees_every_iteration_and_may_end_the_solve(load):
     class Enough(Exception):  # noqa: N818
         pass

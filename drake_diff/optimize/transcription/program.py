@@ -455,7 +455,8 @@ def solve_ipopt(
         by, lower, upper = scales.variables, *(side / scales.rows for side in program.sides)
         bounds = np.abs(np.concatenate([program.lower / by, program.upper / by]))
         least = np.min(bounds[bounds > 0], initial=1.0)  # IPOPT relaxes bounds by 1e-8, much for a motor of 1e-4 N
-        options = {"ipopt.bound_relax_factor": min(1e-8, RELAXED * least)} | options
+        # Without the check of inputs, CasADi does not print that there are more equations than variables.
+        options = {"ipopt.bound_relax_factor": min(1e-8, RELAXED * least), "inputs_check": False} | options
         solver = ca.nlpsol("solver", "ipopt", program.nlp(scales), options)
         known = {}
         if multipliers is not None:
