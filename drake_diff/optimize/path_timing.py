@@ -161,7 +161,7 @@ class PathTiming:
         start = time.monotonic()
         outcome, iterations, timing = _Search(self).run(limits)
         knots = self._knots(timing)
-        rows = timing.at(_halves(knots))
+        rows = timing.rows(_halves(knots))
         rows[[0, -1], :2] = [[0.0, 0.0], [1.0, 0.0]]  # without rounding
         xs, us = self.motion(rows)
         xs = np.clip(xs, self.limits.x_lower, self.limits.x_upper)
@@ -182,7 +182,7 @@ class PathTiming:
         knots, tolerance = np.arange(self.num_steps + 1.0), SAME_INPUT if self.jerk is None else SAME_RATE
         for _ in range(HALVINGS):
             ends, lengths = knots[:-1], np.diff(knots)
-            every = self.motion(timing.at((ends[:, None] + lengths[:, None] * QUARTERS).ravel()))[1]
+            every = self.motion(timing.rows((ends[:, None] + lengths[:, None] * QUARTERS).ravel()))[1]
             first, other, middle, _, last = every.reshape(len(ends), len(QUARTERS), -1).transpose(1, 0, 2)
             off = np.abs(other - (3 * first + 6 * middle - last) / 8)
             coarse = np.max(off / np.maximum(np.ptp(every, axis=0), TINY), axis=1) > tolerance * lengths
@@ -285,7 +285,7 @@ class _Timing:
     values: Array
     duration: float
 
-    def at(self, places: Array) -> Array:
+    def rows(self, places: Array) -> Array:
         """Return s and its three time derivatives (K, 4) at `places` (K,), in intervals from 0 to N."""
         k = np.minimum(places.astype(int), len(self.values) - 2)
         h = self.duration / (len(self.values) - 1)
@@ -447,10 +447,10 @@ class _Search:
     def _factor(self, timing: _Timing) -> float:
         """Return the factor by which a timing is too fast for the limits on the exact path; at most 1 within them."""
         places = np.linspace(0, self.task.num_steps, PLACES * self.task.num_steps + 1)
-        s = timing.at(places)
+        s = timing.rows(places)
         slopes = [self.task.spline(s[:, 0], nu=i) for i in (1, 2, 3)]
         us = self.task.motion(s)[1]
-        before = timing.at(np.maximum(places - ASIDE, 0.0))[:, 3:]  # jerks differ on the sides of a knot
+        before = timing.rows(np.maximum(places - ASIDE, 0.0))[:, 3:]  # jerks differ on the sides of a knot
         every = [self._limited(slopes, s[:, 1:2], s[:, 2:3], jerk, us) for jerk in (s[:, 3:], before)]
         return max(k.ratio(value) ** k.power for values in every for k, value in zip(self.kinds, values, strict=True))
 

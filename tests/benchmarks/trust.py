@@ -30,6 +30,7 @@ PARTS = (
     "rollout",
     "refinement",
     "plans",
+    "given",
     "avoid",
     "reach",
     "verify",
