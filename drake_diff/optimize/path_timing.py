@@ -39,10 +39,10 @@ GRID = 801  # places on the path at which the search knows its slopes and effort
 OFF_PATH = 1e-5  # of the range of a position: allowed distance of the spline from the path
 DEGREE = 5  # of the path's spline, so that its third derivative is continuous
 GAUSS, NEWTON = 5, 5  # places of the quadrature in a cell, and steps to the place with a given length
-FRACTIONS = (0.0, 1 / 3, 2 / 3)  # of an interval: places at which the search satisfies the limits
+PIECES, NEAR = (3, 6), 1.01  # of an interval; the second if a motion by the first is faster than this factor
 PLACES, ASIDE = 40, 1e-9  # places in an interval that are compared with the exact path, and a distance from a knot
-SLOWER, SLOWEST = 1.2, 60  # the factor between two first durations, and their number
 TOLERANCE, WIDEST = 1e-7, 1e3  # of IPOPT, and the factor from the first duration to its bounds
+LARGEST = 1.1  # a factor above this, which slower motions do not reduce, belongs to a load that is too heavy
 KEPT, ROUNDS = 1e-9, 60  # of a limit: an excess that is rounding; and the largest number of slower motions
 QUARTERS = np.arange(5) / 4  # of an interval
 # Of intervals; and the error of an input's parabola over its range in an interval, without and with a jerk limit.
@@ -397,7 +397,33 @@ class _Search:
 
     def run(self, limits: Limits) -> tuple[Outcome, int, _Timing]:
         """Return IPOPT's outcome and iterations, and its timing within the limits, or else the first timing."""
-        count, guess = self.task.num_steps, self._first()
+        timing, iterations = self._first(), 0
+        for pieces in PIECES:
+            outcome, more, faster = self._solved(timing, pieces, limits)
+            iterations += more
+            if outcome is not Outcome.SOLVED:
+                return outcome, iterations, timing
+            timing, factor = self._slowed(faster), self._factor(faster)
+            if factor <= NEAR:
+                break
+        return Outcome.SOLVED, iterations, timing
+
+    def _solved(self, guess: _Timing, pieces: int, limits: Limits) -> tuple[Outcome, int, _Timing]:
+        """Return IPOPT's outcome, iterations and timing with the limits at the ends of `pieces` of each interval."""
+        program, bounds = self._program(guess.duration, pieces)
+        options = {"print_level": 0, "sb": "yes", "max_iter": limits.max_iterations, "tol": TOLERANCE}
+        if np.isfinite(limits.time_limit):
+            options["max_wall_time"] = limits.time_limit
+        solver = ca.nlpsol("timing", "ipopt", program, {"ipopt": options, "print_time": False})
+        by_unit = guess.duration ** np.arange(3)
+        result = solver(x0=np.append((guess.values * by_unit).T.ravel(), 1.0), **bounds)
+        z, stats = np.array(result["x"]).ravel(), solver.stats()
+        timing = _Timing(z[:-1].reshape(3, -1).T / by_unit, float(z[-1] * guess.duration))
+        return OUTCOMES.get(stats["return_status"], Outcome.FAILED), stats["iter_count"], timing
+
+    def _program(self, unit: float, pieces: int) -> tuple[dict[str, Any], dict[str, Array]]:
+        """Return the program in s, ds/dt and d2s/dt2 at the knots and the duration, with `unit` [s] as unit of time."""
+        count = self.task.num_steps
         s, v, a = (ca.MX.sym(name, count + 1) for name in "sva")
         duration = ca.MX.sym("duration")
         h = duration / count
@@ -405,44 +431,28 @@ class _Search:
         end = _within(s[:-1], v[:-1], a[:-1], jerk, h)
         every = self.limited.map(count)
         rows = [s[1:] - end[0], v[1:] - end[1]]
-        for fraction in FRACTIONS:
+        for fraction in np.arange(pieces) / pieces:
             point = (*_within(s[:-1], v[:-1], a[:-1], jerk, fraction * h), jerk)
-            rows.append(ca.vec(every(*(z.T for z in point))))
-        rows.append(self.limited(s[-1], v[-1], a[-1], jerk[-1]))
-        number, free = len(FRACTIONS) * count + 1, np.full(count + 1, np.inf)
-        lower = np.concatenate([np.zeros(2 * count + 2), -free, [guess.duration / WIDEST]])
-        upper = np.concatenate([np.ones(count + 1), free, free, [guess.duration * WIDEST]])
+            rows.append(ca.vec(every(*(z.T / unit**i for i, z in enumerate(point)))))
+        rows.append(self.limited(s[-1], v[-1] / unit, a[-1] / unit**2, jerk[-1] / unit**3))
+        number, free = pieces * count + 1, np.full(count + 1, np.inf)
+        lower = np.concatenate([np.zeros(2 * count + 2), -free, [1 / WIDEST]])
+        upper = np.concatenate([np.ones(count + 1), free, free, [WIDEST]])
         ends = [0, count, count + 1, 2 * count + 1] + [2 * count + 2, 3 * count + 2] * (self.task.jerk is not None)
         lower[ends] = upper[ends] = [0.0, 1.0] + [0.0] * (len(ends) - 2)
-        options = {"print_level": 0, "sb": "yes", "max_iter": limits.max_iterations, "tol": TOLERANCE}
-        if np.isfinite(limits.time_limit):
-            options["max_wall_time"] = limits.time_limit
-        nlp = {"x": ca.vertcat(s, v, a, duration), "f": duration / guess.duration, "g": ca.vertcat(*rows)}
-        solver = ca.nlpsol("timing", "ipopt", nlp, {"ipopt": options, "print_time": False})
-        result = solver(
-            x0=np.append(guess.values.T.ravel(), guess.duration),
-            lbx=lower,
-            ubx=upper,
-            lbg=np.append(np.zeros(2 * count), np.tile(self.lower, number)),
-            ubg=np.append(np.zeros(2 * count), np.tile(self.upper, number)),
-        )
-        z, stats = np.array(result["x"]).ravel(), solver.stats()
-        outcome = OUTCOMES.get(stats["return_status"], Outcome.FAILED)
-        if outcome is not Outcome.SOLVED:
-            return outcome, stats["iter_count"], guess
-        return outcome, stats["iter_count"], self._slowed(_Timing(z[:-1].reshape(3, -1).T, float(z[-1])))
+        bounds = {"lbx": lower, "ubx": upper}
+        for name, side in (("lbg", self.lower), ("ubg", self.upper)):
+            bounds[name] = np.append(np.zeros(2 * count), np.tile(side, number))
+        return {"x": ca.vertcat(s, v, a, duration), "f": duration, "g": ca.vertcat(*rows)}, bounds
 
     def _first(self) -> _Timing:
-        """Return a motion from rest to rest within the limits, or else the slowest that was tried."""
+        """Return a motion from rest to rest, within the limits if slower motions lead there."""
         tau = np.linspace(0, 1, self.task.num_steps + 1)
         left = 1 - tau
         values = [tau**3 * (10 - 15 * tau + 6 * tau**2), 30 * (tau * left) ** 2, 60 * tau * left * (1 - 2 * tau)]
         timing = _Timing(np.array(values).T, 1.0).slower(1 / self._speed)
-        for _ in range(SLOWEST):
-            if self._factor(timing) <= 1:
-                break
-            timing = timing.slower(SLOWER)
-        return timing
+        slower = self._slowed(timing.slower(self._factor(timing)))
+        return timing if self._factor(slower) > LARGEST else slower
 
     def _factor(self, timing: _Timing) -> float:
         """Return the factor by which a timing is too fast for the limits on the exact path; at most 1 within them."""
@@ -455,10 +465,11 @@ class _Search:
         return max(k.ratio(value) ** k.power for values in every for k, value in zip(self.kinds, values, strict=True))
 
     def _slowed(self, timing: _Timing) -> _Timing:
-        """Return the timing, slowed down until it is within the limits."""
+        """Return the timing, slowed down until it is within the limits or does not come nearer to them."""
+        last = np.inf
         for _ in range(ROUNDS):
             factor = self._factor(timing)
-            if factor <= 1 + KEPT:
+            if factor <= 1 + KEPT or factor >= last:
                 break
-            timing = timing.slower(factor)
+            timing, last = timing.slower(factor), factor
         return timing

@@ -94,6 +94,7 @@ def test_an_arm_is_as_fast_as_by_toppra_and_within_its_limits_between_the_sample
     assert max(np.min(np.max(np.abs(points - q), axis=1)) for q in states) < 2e-4
 
 
+@pytest.mark.slow
 def test_the_own_timing_of_a_path_and_its_kind_do_not_matter():
     knots = [0, 0, 0, 0, 0.5, 1, 1, 1, 1]
     basis = BsplineBasis(4, [4.0 * k for k in knots])
@@ -177,3 +178,14 @@ def test_a_corner_is_rejected():
     corner = PiecewisePolynomial.FirstOrderHold([0, 1, 2], np.array([READY, READY + 0.3, READY + np.eye(7)[0]]).T)
     with pytest.raises(InputError, match=r"smooth path.*corner"):
         PathTiming(PANDA, corner)
+
+
+@pytest.mark.slow
+@each_row("unit", [1e-5, 1e-2, 1e3])
+def test_the_time_scales_with_the_limits(unit):
+    """With accelerations of `unit`^2 and jerks of `unit`^3, the motion takes 1 / `unit` of the time."""
+    model = dd.load_model(MODELS / "double_pendulum.urdf", time_step=0.01 / unit, gravity=[0, 0, 0])
+    path = [[0.0, 0.0], [0.5, 1.0], [0.2, 1.5]]
+    wanted = dd.solve(PathTiming(model, path, acceleration=5.0, jerk=100.0)).horizon
+    scaled = dd.solve(PathTiming(model, path, acceleration=5.0 * unit**2, jerk=100.0 * unit**3))
+    assert scaled.horizon == pytest.approx(wanted / unit, rel=1e-6)
