@@ -495,8 +495,10 @@ def add_task(task: Task, program: Any) -> None:
     p, b, prog, x, u = task.problem, task.problem.bounds, program.prog(), program.state(), program.input()
     lower, upper = [*b.x_lower, *b.u_lower], [*b.x_upper, *b.u_upper]
     for value, low, high in zip([*x, *u], lower, upper, strict=True):
-        for row in [value >= low] * np.isfinite(low) + [value <= high] * np.isfinite(high):
-            program.AddConstraintToAllKnotPoints(row)
+        if np.isfinite(low):
+            program.AddConstraintToAllKnotPoints(value >= low)
+        if np.isfinite(high):
+            program.AddConstraintToAllKnotPoints(value <= high)
     for gap in task.above:
         program.AddConstraintToAllKnotPoints(gap(x) >= 0)
     goal = np.full(p.nx, np.nan) if p.x_goal is None else p.x_goal
@@ -511,8 +513,6 @@ def add_task(task: Task, program: Any) -> None:
         program.AddRunningCost(task.cost(x, u))
     if task.final is not None:
         program.AddFinalCost(task.final(x))
-    if task.extra is not None:
-        task.extra(program)
     line = PiecewisePolynomial.FirstOrderHold(
         [0, p.start_horizon], np.column_stack([p.x0, np.where(np.isnan(goal), p.x0, goal)])
     )
@@ -527,6 +527,8 @@ def collocated(task: Task) -> tuple[bool, Plan]:
     if steps[0] < steps[1]:
         program.AddEqualTimeIntervalsConstraints()
     add_task(task, program)
+    if task.extra is not None:
+        task.extra(program)
     result = solve_program(program.prog())
     x, u = program.ReconstructStateTrajectory(result), program.ReconstructInputTrajectory(result)
     return result.is_success(), Plan(x, u if p.nu else None, x.end_time())
