@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from helpers.models import MODELS
-from pydrake.examples import AcrobotPlant, CompassGait, PendulumPlant, VanDerPolOscillator
+from pydrake.examples import AcrobotPlant, CompassGait, PendulumPlant, QuadrotorPlant, VanDerPolOscillator
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder, LeafSystem, LeafSystem_
@@ -173,3 +173,11 @@ def test_a_system_that_cannot_be_converted_is_refused():
 
     with pytest.raises(dd.exceptions.GradientError, match=r"define it as a LeafSystem_\[T\]"):
         dd.Dynamics.from_system(Plain())
+
+
+def test_rates_that_a_system_refuses_are_outside_its_domain():
+    """Roll, pitch and yaw of Drake's quadrotor have no rates at a pitch of 90 degrees, where Drake raises an error."""
+    system, x, u = dd.Dynamics.from_system(QuadrotorPlant()), np.zeros(12), np.ones(4)
+    assert np.isfinite(system(x, u)).all()
+    x[4] = np.pi / 2
+    assert all(np.isnan(values).all() for values in system.derivatives(x, u))

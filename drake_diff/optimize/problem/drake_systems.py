@@ -66,14 +66,21 @@ class DrakeSystem:
         return np.array(vector.CopyToVector())
 
     def evaluate(self, x: Any, u: Any) -> Any:
-        """Return the rates, or the next states of a discrete system, at x (nx,), u (nu,) of floats or AutoDiffXd."""
+        """Return the rates, or the next states of a discrete system, at x (nx,), u (nu,) of floats or AutoDiffXd.
+
+        Rates that the system refuses, as at a gimbal lock, are NaN, and a search shortens its step.
+        """
         x, u = np.asarray(x), np.asarray(u)
         entries = [*x.ravel().tolist(), *u.ravel().tolist()] if x.dtype == object or u.dtype == object else []
-        if not entries:
-            return self._evaluated(self.system, self.context, x, u)
-        if not any(isinstance(entry, AutoDiffXd) for entry in entries):
+        if entries and not any(isinstance(entry, AutoDiffXd) for entry in entries):
             raise TypeError(f"{type(self.system).__name__} is evaluated with floats or AutoDiffXd")
-        return self._evaluated(self.converted, self.carrying, x, u)
+        pair = (self.converted, self.carrying) if entries else (self.system, self.context)
+        try:
+            return self._evaluated(*pair, x, u)
+        except RuntimeError:
+            if self.is_discrete:
+                raise
+            return np.full(len(x), np.nan * (sum(x) + sum(u)))
 
     def _evaluated(self, system: Any, context: Any, x: Any, u: Any) -> Any:
         (context.SetDiscreteState if self.is_discrete else context.SetContinuousState)(x)
