@@ -537,7 +537,7 @@ def _from_other_starts(task: _Task, asked: Attempt, first: Solution) -> Solution
         chain += [{**attempt.told(False), "ended": solution.status.value}, *rows]
         last = _in_steps(task, asked, solution, chain)
         best = min((best, last), key=_preference)
-        if last.status in ENDED:
+        if last.status in ENDED and (best is last or not last.success):  # a finer mesh may lead away from a guess
             break
     note = f"{LOCAL}: {starts}{', not verified' if starts.cheaper and best is first else ''}"
     best = best.told(options=best.options | {"chain": chain})

@@ -1,7 +1,9 @@
 """The random first guesses of "auto": a pendulum with several optima, a convex problem, and their limits."""
 
+import importlib
 import os
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -48,6 +50,19 @@ def test_other_starts_are_never_worse_and_only_without_a_given_guess_or_number(m
     assert same.success
     assert same.cost == plain.cost
     assert "led to no cheaper motion" in same.options["chain"][-1]["ended"]
+
+
+def test_a_start_that_leads_back_to_the_plan_does_not_end_the_search(monkeypatch):
+    """On a finer mesh, the search from a cheaper motion may return to the plan. The next cheaper motion is tried."""
+    module, problem = importlib.import_module("drake_diff.optimize.solve"), weak_pendulum(40)
+    search = module.search_cheaper
+
+    def plan_and_cheaper(plan, *arguments):
+        result = search(plan, *arguments)
+        return replace(result, cheaper=(plan, *result.cheaper))
+
+    monkeypatch.setattr(module, "search_cheaper", plan_and_cheaper)
+    assert dd.solve(problem).cost < 0.9 * dd.solve(problem, restarts=0).cost
 
 
 def test_ctrl_c_during_the_other_starts_returns_the_verified_plan():
