@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from pydrake.trajectories import PiecewisePolynomial, StackedTrajectory, Trajectory
+from scipy.integrate import solve_ivp
 
 from drake_diff._base.arrays import Array, finite_array, positive_float
 from drake_diff.derivatives.step import differentiate_step
@@ -277,7 +278,8 @@ def another_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:
     """Return a random smooth motion near the straight line for collocation: xs (N+1, nx), us (N+1, nu), a horizon.
 
     The states add a few sines and the inputs are a few cosines with normally distributed amplitudes. Guesses near the
-    line and far from it alternate. A free horizon is the first one times a random factor.
+    line and far from it alternate. A free horizon is the first one times a random factor. For dynamics without inputs,
+    number 1 is a simulation from x0 instead.
     """
     random = np.random.default_rng([seed, number])
     far, s = WANDER[number % len(WANDER)], np.linspace(0, 1, problem.num_steps + 1)[:, None]
@@ -293,13 +295,24 @@ def another_guess(problem: Problem, seed: int, number: int) -> tuple[Any, ...]:
     if isinstance(problem.system, Model):
         us = np.where(problem.system.inputs.commanded, problem.system.neutral_input(xs), us)
     us = np.clip(us, b.u_lower, b.u_upper)
+    is_passive = number == 1 and problem.nu == 0 and not problem.has_model and not problem.is_map
+    if is_passive:
+        xs = _passive(problem, way)
     first = int(problem.initial_state_is_given)
     xs[first:] = np.clip(xs[first:], b.x_lower, b.x_upper)
     for start in tangent_space(problem.model).quaternions if problem.has_model else ():
         xs[:, start : start + 4] /= np.linalg.norm(xs[:, start : start + 4], axis=1, keepdims=True)
     if not problem.horizon or problem.horizon[0] == problem.horizon[1]:
         return xs, us
-    return xs, us, float(np.clip(problem.start_horizon * LONGER ** random.uniform(-1, 1), *problem.horizon))
+    longer = 1.0 if is_passive else LONGER ** random.uniform(-1, 1)
+    return xs, us, float(np.clip(problem.start_horizon * longer, *problem.horizon))
+
+
+def _passive(problem: Problem, xs: Array) -> Array:
+    """Return the simulation (N+1, nx) from xs[0] during the first horizon, or xs if the states diverge."""
+    times = np.linspace(0, problem.start_horizon, len(xs))
+    motion = solve_ivp(lambda _, x: problem.dynamics(x, []), (0, times[-1]), xs[0], t_eval=times)
+    return motion.y.T.copy() if motion.success else xs
 
 
 def _holding(problem: Problem, xs: Array) -> Array:

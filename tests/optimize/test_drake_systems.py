@@ -146,6 +146,17 @@ def test_the_limit_cycle_of_a_system_without_inputs():
     assert not dd.check_plan(problem, circle, horizon=solution.horizon).success
 
 
+@pytest.mark.parametrize(("start", "steps"), [(1.446, 25), (2.006, 35)])
+def test_the_limit_cycle_from_a_poor_guess(start, steps):
+    """A straight line and noise lead to the rest at the origin. Simulations from random states lead to the cycle."""
+    problem = dd.Problem(
+        dd.Dynamics.from_system(VanDerPolOscillator()), x0=[start, 0.0], num_steps=steps, horizon=(3, 12),
+        couplings=[dd.optimize.Periodic()], optimize=("initial_state",), initial_state_mask=[True, False],
+        constraints=dd.Constraint(lambda x: x[0], lower=0.5, knots=0), running_cost=1.0,
+    )  # fmt: skip
+    assert dd.solve(problem).horizon == pytest.approx(6.6632868593, rel=1e-3)  # 25 intervals have an error of 1e-4
+
+
 def test_systems_without_such_dynamics_are_refused_by_name():
     discrete = MultibodyPlant(0.01)
     discrete.Finalize()
