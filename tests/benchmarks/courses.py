@@ -244,7 +244,7 @@ def heel_strike(step: float) -> np.ndarray:
 
 
 def compass_gait_cycle(random):
-    """Walk down a slope with a hip torque and a given step. The speeds after the impact are free."""
+    """Walk down a slope with a hip torque and a fixed step length. The speeds after the impact are free."""
     slope, step = random.uniform(0.01, 0.06), random.uniform(0.4, 0.6)
     first, back = np.array([-step / 2 - slope, step / 2 - slope]), np.linalg.inv(heel_strike(step))
     problem = dd.Problem(
@@ -327,7 +327,7 @@ def quadrotor_to_position(random):
 
 
 def glider(x, u, math):
-    """Return x' of a glider of two flat plates. x: place, pitch, elevator, their speeds but u, that of the elevator."""
+    """Return x' of a glider of two flat plates. x: position, pitch, elevator and speeds. u: speed of the elevator."""
     s, c, se, ce = math.sin(x[2]), math.cos(x[2]), math.sin(x[2] + x[3]), math.cos(x[2] + x[3])
     turn, arm, back = x[6] + u[0], 0.27, 0.02
     vx, vz = x[4] + arm * x[6] * s + back * turn * se, x[5] - arm * x[6] * c - back * turn * ce
@@ -457,7 +457,7 @@ def panda_reach(random):
 def panda_past_two_spheres(random):
     """Turn the base past two balls in the path of the hand."""
     turned, clear = np.eye(7)[0], False
-    while not clear:  # in both given postures
+    while not clear:  # in the first and last posture
         angle, radius = random.uniform(0.7, 0.9), random.uniform(0.05, 0.08)
         start, goal = (HOME + side * angle * turned + random.uniform(-0.1, 0.1, 7) for side in (-1, 1))
         centers = [hand_at(HOME + side * angle * turned / 3) + random.uniform(-0.03, 0.03, 3) for side in (-1, 1)]
@@ -671,7 +671,7 @@ def captured() -> Iterator[list[str]]:
             lines += [line for line in file.read().decode(errors="replace").splitlines() if line.strip()]
 
 
-def plan_of_ours(solution: dd.Solution) -> Plan:
+def trajectories_of(solution: dd.Solution) -> Plan:
     if solution.problem.is_map:
         return Plan(solution.xs, solution.us, 0.1 * len(solution.us))
     x, u = solution.trajectory()
@@ -698,7 +698,7 @@ def solve_ours(task: Task, **options: Any) -> dict[str, Any]:
     row |= {"status": status_of(solution), "message": solution.message, "notes": solution.notes}
     row |= {"seconds": time.perf_counter() - start, "printed": printed}
     if solution.success:
-        plan = plan_of_ours(solution)
+        plan = trajectories_of(solution)
         row["simulation"] = simulated(task, plan)
         row["cost"] = np.inf if row["simulation"] else cost_of(task, plan)
     return row
@@ -760,8 +760,8 @@ def line_of(name: str, rows: list[dict[str, Any]]) -> str:
 
 def summary(rows: list[dict[str, Any]]) -> Iterator[str]:
     names = dict.fromkeys(row["task"] for row in rows)
-    every = {name: all(row["solved"] for row in rows if row["task"] == name) for name in names}
-    yield f"{sum(every.values())} of {len(every)} tasks solved or infeasible as stated, from all seeds"
+    solved = [all(row["solved"] for row in rows if row["task"] == name) for name in names]
+    yield f"{sum(solved)} of {len(solved)} tasks solved from all seeds, or reported as infeasible if they are"
     compared = [row for row in rows if row["near_best"] is not None]
     if compared:
         rate = success_rate(sum(row["near_best"] for row in compared), len(compared))
