@@ -197,7 +197,7 @@ def _sampled(problem: Problem, state: Trajectory, held: Trajectory, plant: str) 
     if not 0 < duration < np.inf:
         raise InputError("xs, a trajectory", got=f"{duration:g} s long", expected="a duration in (0, inf)")
     fixed = problem.start_horizon
-    if problem.horizon is None and abs(duration - fixed) > SAME_TIME * fixed:
+    if problem.horizon is None and not problem.is_map and abs(duration - fixed) > SAME_TIME * fixed:
         expected = f"{fixed:.6g} s: {count} steps of {problem.time_step:.6g} s"
         raise InputError("xs, a trajectory", got=f"{duration:.6g} s long", expected=expected)
     fields: dict[str, Any] = {} if problem.horizon is None else {"free_horizon": duration}
@@ -205,6 +205,9 @@ def _sampled(problem: Problem, state: Trajectory, held: Trajectory, plant: str) 
         knots = start + duration * np.linspace(0, 1, count + 1)
         fields["xs"] = trajectory_values("xs", state, knots)
         fields["us"] = trajectory_values("us", held, (knots[:-1] + knots[1:]) / 2)
+        if problem.is_map and _is_held(state):  # Drake's trajectories of held states lack the last one
+            last = problem.dynamics(fields["xs"][-2], fields["us"][-1])
+            fields["xs"] = frozen(np.vstack([fields["xs"][:-1], last]))
         return fields
     mesh = _mesh(count, [(_breaks(s) - start) / duration for s in (state, held)])
     knots = start + duration * mesh

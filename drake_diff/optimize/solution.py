@@ -21,7 +21,7 @@ from drake_diff.model.parameters import ParameterVector, applied, select
 from drake_diff.motion.intervals import intervals_of
 from drake_diff.motion.rollout import STEPS, Rollout
 from drake_diff.optimize.checks import Check, Checks
-from drake_diff.optimize.measure import following_checks, plan_checks
+from drake_diff.optimize.measure import GIVEN, following_checks, plan_checks
 from drake_diff.optimize.optimality import Optimality, final_state_norms, optimality
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iteration, Multipliers
@@ -393,7 +393,8 @@ class Solution(PicklesItsFields, ShowsItsRepr):
     def bound_excess(self) -> dict[str, tuple[float, int]]:
         """The largest excess over a bound and its knot, by the state's, input's or parameter's name, where above 0.
 
-        Given states have no excess. Midpoints of collocation are assigned to the knot before them.
+        Given states have no excess. Midpoints of collocation are assigned to the knot before them, and those of a given
+        plan, which has no scheme, are left to the checks between the knots.
         """
         b, states, names = self.problem.bounds, self.problem.state_names, self.problem.input_names
         free = self.problem.initial_state_mask
@@ -401,8 +402,9 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         given[0] = ~free
         inside = np.clip(0.0, b.x_lower, b.x_upper)
         sides = [(states, np.where(given, inside, self.xs), b.x_lower, b.x_upper)]
-        if self.transcribed is not None and not self.transcribed.task.scheme.input_is_linear:  # Drake only bounds knots
-            sides += [(states, xs, b.x_lower, b.x_upper) for xs in [self.transcribed.xs_mid] if xs is not None]
+        motion = None if self.method == GIVEN else self.transcribed
+        if motion is not None and not motion.task.scheme.input_is_linear:  # Drake only bounds knots
+            sides += [(states, xs, b.x_lower, b.x_upper) for xs in [motion.xs_mid] if xs is not None]
         sides += [(names, us, b.u_lower, b.u_upper) for us in (self.inputs_at_knots, self.us_mid) if us is not None]
         sides.append((self.vector.names, self.vector.values[None], *self.problem.bounds_of_parameters()))
         if self.problem.horizon is not None:

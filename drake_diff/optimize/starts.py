@@ -12,7 +12,7 @@ from drake_diff.optimize.run import arrays_of
 from drake_diff.optimize.solution import Solution, Status
 from drake_diff.optimize.transcription.collocation import FOUND, Transcribed, Transcription
 
-MOST_STARTS, FEWEST_STARTS = 12, 3  # if the first few all lead to the plan's cost, the others are not tried
+MOST_STARTS, FEWEST_STARTS = 12, 5  # if the first few all lead to the plan's cost, the others are not tried
 # Of all starts together, times the knots' states and inputs, so that they take about as long for robots as for small
 # systems, and of one start. A search that needs more iterations rarely ends at a cheaper motion.
 MOST_ITERATIONS, MOST_OF_A_START, SIZED_ITERATIONS = 600, 100, 200_000

@@ -8,8 +8,9 @@ import pytest
 from helpers.models import MODELS
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.planning import DirectCollocation
+from pydrake.planning import DirectCollocation, DirectTranscription
 from pydrake.solvers import Solve
+from pydrake.systems.primitives import LinearSystem
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 import drake_diff as dd
@@ -201,3 +202,23 @@ def test_what_is_no_plan_is_refused_by_name(in_drake):
         dd.check_plan(slide(), xs, us, tolerance=0.1)
     with pytest.raises(dd.exceptions.InputError, match="without phases"):
         dd.check_plan(dd.optimize.PhasedProblem([slide(), replace(slide(), x0=[1, 0])]), xs, us)
+
+
+def test_a_plan_of_direct_transcription_is_judged_in_the_steps_of_its_system():
+    """Drake's trajectories of a discrete system are in seconds, a `DiscreteMap` counts its steps."""
+    period, count = 0.1, 20
+    A, B = np.array([[1.0, period], [0.0, 1.0]]), np.array([[0.0], [period]])
+    system = LinearSystem(A, B, np.eye(2), np.zeros((2, 1)), period)
+    program = DirectTranscription(system, system.CreateDefaultContext(), count + 1)
+    program.prog().AddBoundingBoxConstraint([0, 0], [0, 0], program.initial_state())
+    program.prog().AddBoundingBoxConstraint([1, 0], [1, 0], program.final_state())
+    program.AddRunningCost(program.input() @ program.input())
+    result = Solve(program.prog())
+    states, inputs = program.ReconstructStateTrajectory(result), program.ReconstructInputTrajectory(result)
+    assert states.end_time() == pytest.approx(period * count)
+    problem = dd.Problem(dd.Dynamics.from_system(system), x0=[0, 0], x_goal=[1, 0], num_steps=count)
+    assert dd.check_plan(problem, states, inputs).success
+    other = PiecewisePolynomial.ZeroOrderHold(
+        inputs.get_segment_times(), 1.02 * inputs.vector_values(inputs.get_segment_times())
+    )
+    assert not dd.check_plan(problem, states, other).success
