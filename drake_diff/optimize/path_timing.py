@@ -6,7 +6,6 @@ All limits are then compared with the exact path between the knots, and the moti
 left. The result is a plan of the model, with the verification of `check_plan`.
 """
 
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
@@ -18,6 +17,7 @@ from pydrake.trajectories import PiecewisePolynomial, Trajectory
 from scipy.interpolate import BSpline, make_interp_spline
 
 from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
+from drake_diff._base.clock import now
 from drake_diff.exceptions import InputError, ShapeError
 from drake_diff.model.model import Model
 from drake_diff.optimize.check_plan import checked
@@ -29,6 +29,7 @@ from drake_diff.optimize.problem.dynamics import bounds_of
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Limits, Outcome
 from drake_diff.optimize.solution import Solution, Status
+from drake_diff.optimize.transcription.collocation import FOUND
 from drake_diff.optimize.transcription.program import OUTCOMES
 from drake_diff.optimize.transcription.task import DEFAULT_SCHEME
 from drake_diff.optimize.verification import ended, status_of
@@ -158,8 +159,8 @@ class PathTiming:
 
     def solved(self, limits: Limits) -> Solution:
         """Return the verified plan of least time; see `solve`."""
-        start = time.monotonic()
-        outcome, iterations, timing = _Search(self).run(limits)
+        start = now()
+        outcome, iterations, timing = _Search(self).run(limits, start)
         knots = self._knots(timing)
         rows = timing.rows(_halves(knots))
         rows[[0, -1], :2] = [[0.0, 0.0], [1.0, 0.0]]  # without rounding
@@ -172,10 +173,10 @@ class PathTiming:
         plan = Solution(problem, GIVEN, "IPOPT", Status.FAILED, "", **fields)
         words = f"IPOPT: {outcome.value} after {iterations} iterations"
         solution: Solution = ended(plan, status_of(outcome) or Status.FAILED, words)
-        if outcome is Outcome.SOLVED:
+        if outcome in FOUND:
             arguments = {"method": GIVEN, "plant": "continuous", "tolerance": 1e-4, "search": type(self).__name__}
             solution = checked(plan, arguments)
-        return solution.told(wall_time=time.monotonic() - start)
+        return solution.told(wall_time=now() - start)
 
     def _knots(self, timing: "_Timing") -> Array:
         """Return knots, as places from 0 to N, between which parabolas follow the inputs of a timing."""
@@ -395,25 +396,25 @@ class _Search:
             fastest = np.min(self.kinds[0].upper / np.abs(self.task.spline(self.grid, nu=1)), axis=1)
         return float(np.median(fastest)) if np.isfinite(fastest).all() else 1.0
 
-    def run(self, limits: Limits) -> tuple[Outcome, int, _Timing]:
+    def run(self, limits: Limits, start: float) -> tuple[Outcome, int, _Timing]:
         """Return IPOPT's outcome and iterations, and its timing within the limits, or else the first timing."""
         timing, iterations = self._first(), 0
         for pieces in PIECES:
-            outcome, more, faster = self._solved(timing, pieces, limits)
+            outcome, more, faster = self._solved(timing, pieces, limits.after(start))
             iterations += more
-            if outcome is not Outcome.SOLVED:
+            if outcome not in FOUND:
                 return outcome, iterations, timing
             timing, factor = self._slowed(faster), self._factor(faster)
             if factor <= NEAR:
                 break
-        return Outcome.SOLVED, iterations, timing
+        return outcome, iterations, timing
 
     def _solved(self, guess: _Timing, pieces: int, limits: Limits) -> tuple[Outcome, int, _Timing]:
         """Return IPOPT's outcome, iterations and timing with the limits at the ends of `pieces` of each interval."""
         program, bounds = self._program(guess.duration, pieces)
         options = {"print_level": 0, "sb": "yes", "max_iter": limits.max_iterations, "tol": TOLERANCE}
         if np.isfinite(limits.time_limit):
-            options["max_wall_time"] = limits.time_limit
+            options["max_wall_time"] = max(limits.time_limit, TINY)
         solver = ca.nlpsol("timing", "ipopt", program, {"ipopt": options, "print_time": False})
         by_unit = guess.duration ** np.arange(3)
         result = solver(x0=np.append((guess.values * by_unit).T.ravel(), 1.0), **bounds)

@@ -205,6 +205,10 @@ class Limits:
     time_limit: float
     tolerance: float
 
+    def after(self, start: float) -> "Limits":
+        """Return what is left of the limits in a solve that began at `start` on the monotonic clock."""
+        return replace(self, time_limit=max(0.0, self.time_limit - (now() - start)))
+
 
 @dataclass(frozen=True, eq=False)
 class Multipliers:

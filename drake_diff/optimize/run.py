@@ -135,11 +135,6 @@ class Run:
         fields = {"iterations": table, "solver_message": result.message}
         return ended(reached.draft, status, result.message, cut, **fields)
 
-    def _left(self) -> Limits:
-        """Return the limits of a search that begins now."""
-        left = self.limits.time_limit - (now() - self.start)
-        return dataclasses.replace(self.limits, time_limit=max(left, 0.0))
-
     def collocate(self, guesses: Sequence[Guess]) -> Solution:
         """Solve by collocation in CasADi, or with SNOPT, which CasADi does not include, by Drake's DirectCollocation.
 
@@ -158,7 +153,9 @@ class Run:
             self._reach(1)
             starts = [self._begin(transcription, i, guess) for i, guess in enumerate(guesses)]
             refinement = self.asked if refine else None
-            motion = transcription.solve(starts, limits=self._left(), report=self.report, refinement=refinement)
+            motion = transcription.solve(
+                starts, limits=self.limits.after(self.start), report=self.report, refinement=refinement
+            )
             motion = dataclasses.replace(motion, result=heard(motion.result, interrupted))
         if refine:
             self.options["refinements"] = [list(row) for row in motion.refinements]
@@ -227,7 +224,9 @@ class Run:
         if all(beyond is None for beyond in exceeded):
             return None
         self.reached.append(SoFar(1, solution, judged=solution))
-        return transcription.finer(motion, exceeded, self.asked.max_num_steps, self._left(), self.report)
+        return transcription.finer(
+            motion, exceeded, self.asked.max_num_steps, self.limits.after(self.start), self.report
+        )
 
     def _collocate_in_drake(self, guesses: Sequence[Guess]) -> Solution:
         """Solve by Drake's own DirectCollocation."""
@@ -242,7 +241,7 @@ class Run:
                 return refused(self._of_guess(guesses), error)
             self._reach(1)
             result, xs, us, u_final = solve_collocation(
-                self.problem, guess.xs, guess.us, limits=self._left(), report=self.report
+                self.problem, guess.xs, guess.us, limits=self.limits.after(self.start), report=self.report
             )
         self._offer(self._draft(xs, us, u_final=u_final), result)
         self._reach(2, self._draft(xs, us, u_final=u_final, certificates=certificates), result)
@@ -296,7 +295,7 @@ class Run:
         report, first = self.report, iter([xs] if given else [])
 
         def search(problem: Problem, rolled: Array, us: Array, values: Array) -> tuple[NlpResult, Array, Array]:
-            limits = self._left()
+            limits = self.limits.after(self.start)
             if stages:
                 result, xs_found, us, logs = solve_continuation(problem, xs, us, stages, limits=limits, report=report)
                 self.options["continuation"] = [asdict(log) for log in logs]
@@ -335,7 +334,7 @@ class Run:
                 self.options["initial_guess"] = f"default, then {result.message}"
                 values = values if result.parameters is None else result.parameters
             options: dict[str, Any] = {"values": values, "multipliers": multipliers}
-            return solve_shooting(problem, xs, us, limits=self._left(), report=self.report, **options)
+            return solve_shooting(problem, xs, us, limits=self.limits.after(self.start), report=self.report, **options)
 
         return self._through_steps(guess.xs, guess.us, search, guess, around=not rolled)
 
@@ -346,7 +345,9 @@ class Run:
         problem = dataclasses.replace(problem, couplings=())
         if not takes(problem):
             return None
-        few = dataclasses.replace(self._left(), max_iterations=min(self.asked.sweeps, self.limits.max_iterations))
+        few = dataclasses.replace(
+            self.limits.after(self.start), max_iterations=min(self.asked.sweeps, self.limits.max_iterations)
+        )
         try:
             with problem.intervals(problem.design.vector.at(values)) as intervals:
                 rolled = roll(intervals, x0, us)

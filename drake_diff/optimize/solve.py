@@ -351,9 +351,8 @@ class _Task:
 
     def limits_of(self, attempt: Attempt) -> Limits:
         """Return the limits that remain for an attempt."""
-        left = self.limits.time_limit - (now() - self.start)
         most = min(attempt.max_iterations or self.limits.max_iterations, self.limits.max_iterations)
-        return replace(self.limits, time_limit=max(left, 0.0), max_iterations=most)
+        return replace(self.limits.after(self.start), max_iterations=most)
 
 
 def _solve_in_chain(task: _Task, asked: Attempt, given: Any) -> Any:

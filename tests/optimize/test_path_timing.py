@@ -121,6 +121,12 @@ def test_a_motor_that_cannot_hold_the_robot_on_its_path_gives_no_plan():
     assert dd.solve(PathTiming(PENDULUM, [[1.2], [1.8]], acceleration=2.0)).success
 
 
+@each_row("limit, status", [({"time_limit": 1e-3}, "time_limit"), ({"max_iterations": 3}, "iteration_limit")])
+def test_a_limit_ends_the_search_by_name(limit, status):
+    solution = dd.solve(PathTiming(PANDA, CURVE, acceleration=5.0), **limit)
+    assert solution.status.value == status
+
+
 @each_row("factor", [0.99, 0.9])
 def test_a_faster_motion_is_rejected(factor):
     timing = PathTiming(PENDULUM, [[0.0], [1.0]], acceleration=4.0)

@@ -566,9 +566,9 @@ class Transcription:
             # A motion through an obstacle is no guess for the next round, and a motion near an obstacle may be none.
             first = [b.on(m, t.scheme) for b, m, t in zip(starts, meshes, self.tasks, strict=True)]
             last, near_one = motion, any(np.any(short > 0) for short in lacking) and not entered
-            motion = self._solve_on(first if entered else _from(last, meshes), _left(limits, start), report)
+            motion = self._solve_on(first if entered else _from(last, meshes), limits.after(start), report)
             if near_one and motion.result.outcome is Outcome.INFEASIBLE:
-                motion = self._solve_on(first, _left(limits, start), report)
+                motion = self._solve_on(first, limits.after(start), report)
             if motion.result.outcome not in FOUND and not entered:
                 motion = kept(last, motion)
                 break
@@ -646,7 +646,7 @@ def solve_program(
     options: dict[str, Any] = {"more": more, "motions": program.iterates}
     result = solve_ipopt(program, guess, limits, report, exact=not why, multipliers=usable, **options)
     if usable and result.outcome not in (*FOUND, Outcome.INTERRUPTED, Outcome.TIME_LIMIT):
-        result = solve_ipopt(program, guess, _left(limits, start), report, exact=not why, **options)
+        result = solve_ipopt(program, guess, limits.after(start), report, exact=not why, **options)
     elif usable:
         result = replace(result, message=f"{result.message}, from the guess's multipliers")
     if not why and result.message == NOT_FINITE:
@@ -669,11 +669,6 @@ def finer_mesh(motion: Collocated, exceeded: Sequence[int], most: int) -> Array 
         tolerance = np.inf
     mesh = _split(motion, max(tolerance, SMALLEST_ERROR), lacking)
     return None if len(mesh) - 1 > most or len(mesh) == len(motion.mesh) else mesh
-
-
-def _left(limits: Limits, start: float) -> Limits:
-    """Return what is left of `limits` in a solve that began at `start` on the monotonic clock."""
-    return replace(limits, time_limit=max(0.0, limits.time_limit - (now() - start)))
 
 
 def kept(last: Transcribed, failed: Transcribed) -> Transcribed:

@@ -42,6 +42,7 @@ OUTCOMES = {
     "Maximum_Iterations_Exceeded": Outcome.ITERATION_LIMIT,
     "Infeasible_Problem_Detected": Outcome.INFEASIBLE,
     "Diverging_Iterates": Outcome.UNBOUNDED,
+    "Maximum_WallTime_Exceeded": Outcome.TIME_LIMIT,
 }
 OPTIONS = {
     "ipopt.mu_strategy": "adaptive",  # the monotone strategy reports minimum-time problems of a pendulum as infeasible
