@@ -16,7 +16,7 @@ import numpy as np
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 from scipy.interpolate import BSpline, make_interp_spline
 
-from drake_diff._base.arrays import Array, finite_array, frozen, positive_int
+from drake_diff._base.arrays import Array, count, finite_array, frozen
 from drake_diff._base.clock import now
 from drake_diff.exceptions import InputError, ShapeError
 from drake_diff.model.model import Model
@@ -36,7 +36,7 @@ from drake_diff.optimize.verification import ended, status_of
 
 SUBJECT = "PathTiming.path"
 SAMPLES = (100, 400, 1600)  # numbers of places on the path that its spline interpolates; more if it is not accurate
-GRID = 801  # places on the path at which the search knows its slopes and efforts
+GRID = 801  # the least number of places on the path at which a search knows its slopes and efforts
 OFF_PATH = 1e-5  # of the range of a position: allowed distance of the spline from the path
 DEGREE = 5  # of the path's spline, so that its third derivative is continuous
 GAUSS, NEWTON = 5, 5  # places of the quadrature in a cell, and steps to the place with a given length
@@ -44,11 +44,13 @@ PIECES, NEAR = (3, 6), 1.01  # of an interval; the second if a motion by the fir
 PLACES, ASIDE = 40, 1e-9  # places in an interval that are compared with the exact path, and a distance from a knot
 TOLERANCE, WIDEST = 1e-7, 1e3  # of IPOPT, and the factor from the first duration to its bounds
 LARGEST = 1.1  # a factor above this, which slower motions do not reduce, belongs to a load that is too heavy
+RESTS = 1e-6  # of the largest position: a smaller range of a joint is noise
 KEPT, ROUNDS = 1e-9, 60  # of a limit: an excess that is rounding; and the largest number of slower motions
 QUARTERS = np.arange(5) / 4  # of an interval
-# Of intervals; and the error of an input's parabola over its range in an interval, without and with a jerk limit.
-HALVINGS, SAME_INPUT, SAME_RATE = 6, 1e-4, 1e-5
+# Of intervals; and the error of an input's parabola over its range in an interval.
+HALVINGS, SAME_INPUT = 6, 1e-5
 TINY = 1e-300  # stands for a limit of 0
+FEWEST_STEPS = 3
 WAYPOINTS = 10  # parts of the motion between the waypoints of the solution's problem
 LEAST_DRIVE = 1e-9  # of the actuation's largest singular value
 
@@ -67,8 +69,8 @@ class PathTiming:
             `KinematicTrajectoryOptimization` or `GcsTrajectoryOptimization`, whose own timing is ignored; or waypoints
             (K, nq), joined by a cubic spline. It has no corners.
         num_steps: number N of intervals.
-        acceleration: [velocity's unit per s] a limit for all velocities, or a mapping from names to limits. If it is
-            not given, the acceleration limits of the model apply.
+        acceleration: [velocity's unit per s] a limit for all velocities, or a mapping from names to limits. The model's
+            own limits apply to the rest.
         jerk: [velocity's unit per s^2] the same for the rate of the accelerations, which then are 0 at both ends.
         bounds: other limits of the states and inputs, as in `Problem`.
 
@@ -99,7 +101,7 @@ class PathTiming:
         model, subject = self.model, "PathTiming.model"
         if not isinstance(model, Model):
             raise InputError(subject, got=type(model).__name__, expected="a Model")
-        positive_int("num_steps", self.num_steps)
+        count("num_steps", self.num_steps, FEWEST_STEPS)
         if not (model.contract.is_unconstrained and model.plant.IsVelocityEqualToQDot()):
             expected = "an open chain of joints whose inputs are efforts"
             raise InputError(subject, got="closed loops, PD control or a floating body", expected=expected)
@@ -119,11 +121,14 @@ class PathTiming:
     @cached_property
     def couplings(self) -> tuple[Acceleration | Jerk, ...]:
         """The limits of accelerations and jerks."""
-        acceleration = self.acceleration
-        if acceleration is None:
-            most = zip(self.model.velocity_names, self.model.plant.GetAccelerationUpperLimits(), strict=True)
-            acceleration = {name: float(limit) for name, limit in most if np.isfinite(limit)} or None
-        couplings = [] if acceleration is None else [Acceleration(acceleration)]
+        names, most = self.model.velocity_names, self.model.plant.GetAccelerationUpperLimits()
+        asked: Any = {name: float(limit) for name, limit in zip(names, most, strict=True) if np.isfinite(limit)}
+        if isinstance(self.acceleration, Mapping):
+            entries, limits = Acceleration(self.acceleration).entries(self.model)
+            asked |= {names[i - self.model.nq]: limit for i, limit in zip(entries, limits.tolist(), strict=True)}
+        elif self.acceleration is not None:
+            asked = self.acceleration
+        couplings = [Acceleration(asked)] if asked != {} else []
         every: tuple[Acceleration | Jerk, ...] = (*couplings, *([] if self.jerk is None else [Jerk(self.jerk)]))
         for coupling in every:
             coupling.entries(self.model)
@@ -140,22 +145,33 @@ class PathTiming:
     def spline(self) -> BSpline:
         """The path q(s) as a spline of degree 5, where s from 0 to 1 is proportional to its length."""
         path = _trajectory(self.path, self.model.nq)
-        for count in SAMPLES:
-            spline, off = _along(path, count)
+        for samples in SAMPLES:
+            spline, off = _along(path, samples)
             if off <= OFF_PATH:
                 return spline
-        got = f"a corner: a spline through {count} of its places leaves it by {off:.2g} of the motion"
+        got = f"a corner: a spline through {samples} of its places leaves it by {off:.2g} of the motion"
         raise InputError(SUBJECT, got=got, expected="a smooth path")
+
+    @cached_property
+    def grid(self) -> Array:
+        """The places on the path at which a search knows its slopes and efforts."""
+        return np.linspace(0, 1, max(GRID, 4 * len(self.spline.c)))
 
     def _check_path(self) -> None:
         """Raise InputError if the path leaves the limits of the positions."""
-        nq, q = self.model.nq, self.spline(np.linspace(0, 1, GRID))
+        nq, q = self.model.nq, self.spline(self.grid)
         lower, upper = self.limits.x_lower[:nq], self.limits.x_upper[:nq]
         beyond = np.maximum(lower - q, q - upper)
         k, i = np.unravel_index(np.argmax(beyond), beyond.shape)
         if beyond[k, i] > KEPT * np.max(np.abs(q[:, i])):
             expected = f"{lower[i]:.6g} to {upper[i]:.6g}"
             raise InputError(SUBJECT, got=f"{self.model.state_names[i]} = {q[k, i]:.6g}", expected=expected)
+        slopes, lower, upper = self.spline(self.grid, nu=1), self.limits.x_lower[nq:], self.limits.x_upper[nq:]
+        noise = RESTS * np.max(np.abs(slopes))
+        ahead, back = np.max(slopes, axis=0) > noise, np.min(slopes, axis=0) < -noise
+        for i in np.flatnonzero((lower > 0) | (upper < 0) | (ahead & (upper <= 0)) | (back & (lower >= 0)))[:1]:
+            expected = f"{self.model.velocity_names[i]} that {lower[i]:.6g} to {upper[i]:.6g} allows, from rest to rest"
+            raise InputError(SUBJECT, got="a motion against its bounds of speed", expected=expected)
 
     def solved(self, limits: Limits) -> Solution:
         """Return the verified plan of least time; see `solve`."""
@@ -180,13 +196,13 @@ class PathTiming:
 
     def _knots(self, timing: "_Timing") -> Array:
         """Return knots, as places from 0 to N, between which parabolas follow the inputs of a timing."""
-        knots, tolerance = np.arange(self.num_steps + 1.0), SAME_INPUT if self.jerk is None else SAME_RATE
+        knots = np.arange(self.num_steps + 1.0)
         for _ in range(HALVINGS):
             ends, lengths = knots[:-1], np.diff(knots)
             every = self.motion(timing.rows((ends[:, None] + lengths[:, None] * QUARTERS).ravel()))[1]
             first, other, middle, _, last = every.reshape(len(ends), len(QUARTERS), -1).transpose(1, 0, 2)
             off = np.abs(other - (3 * first + 6 * middle - last) / 8)
-            coarse = np.max(off / np.maximum(np.ptp(every, axis=0), TINY), axis=1) > tolerance * lengths
+            coarse = np.max(off / np.maximum(np.ptp(every, axis=0), TINY), axis=1) > SAME_INPUT * lengths
             if not np.any(coarse):
                 break
             knots = np.sort(np.append(knots, (ends + lengths / 2)[coarse]))
@@ -252,7 +268,7 @@ def _along(path: Trajectory, count: int) -> tuple[BSpline, float]:
     cells = np.linspace(path.start_time(), path.end_time(), 4 * count + 1)
     positions = trajectory_values(SUBJECT, path, cells)
     ranges = np.ptp(positions, axis=0)
-    moves = ranges > KEPT * np.max(np.abs(positions))
+    moves = ranges > RESTS * np.max(np.abs(positions))  # other joints have only the noise of inverse kinematics
     if not np.any(moves):
         raise InputError(SUBJECT, got="constant positions", expected="a motion")
     weights = np.divide(1.0, ranges, out=np.zeros_like(ranges), where=moves)
@@ -314,9 +330,10 @@ class _Limit:
 
     @cached_property
     def centre(self) -> Array:
-        """The middle (n,) of the limits, or 0 if one of them is infinite."""
+        """The middle (n,) of limits that do not enclose 0, and 0 for others."""
         with np.errstate(invalid="ignore"):
-            return np.nan_to_num((self.lower + self.upper) / 2, posinf=0.0, neginf=0.0)
+            middle = np.nan_to_num((self.lower + self.upper) / 2, posinf=0.0, neginf=0.0)
+        return np.where((self.lower < 0) & (self.upper > 0), 0.0, middle)
 
     @cached_property
     def reach(self) -> Array:
@@ -342,7 +359,7 @@ class _Search:
 
     def __init__(self, task: PathTiming):
         self.task, nq, b = task, task.model.nq, task.limits
-        self.grid = np.linspace(0, 1, GRID)
+        self.grid = task.grid
         self.kinds = [_Limit(b.x_lower[nq:], b.x_upper[nq:], 1.0), _Limit(b.u_lower, b.u_upper, 0.5)]
         for coupling in task.couplings:
             entries, limits = coupling.entries(task.model)
@@ -392,8 +409,10 @@ class _Search:
     @cached_property
     def _speed(self) -> float:
         """A typical speed along the path [1/s]."""
+        slopes, nq = self.task.spline(self.grid, nu=1), self.task.model.nq
+        limits = np.where(slopes > 0, self.task.limits.x_upper[nq:], -self.task.limits.x_lower[nq:])
         with np.errstate(divide="ignore"):
-            fastest = np.min(self.kinds[0].upper / np.abs(self.task.spline(self.grid, nu=1)), axis=1)
+            fastest = np.min(limits / np.abs(slopes), axis=1)
         return float(np.median(fastest)) if np.isfinite(fastest).all() else 1.0
 
     def run(self, limits: Limits, start: float) -> tuple[Outcome, int, _Timing]:

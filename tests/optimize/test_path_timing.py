@@ -1,5 +1,6 @@
 """Tests of `PathTiming`: least times in closed form and beside Drake's Toppra, and limits that hold between samples."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -121,6 +122,30 @@ def test_a_motor_that_cannot_hold_the_robot_on_its_path_gives_no_plan():
     assert dd.solve(PathTiming(PENDULUM, [[1.2], [1.8]], acceleration=2.0)).success
 
 
+def test_noise_in_a_joint_at_rest_and_a_bound_that_is_far_change_nothing():
+    """Inverse kinematics leave noise of 1e-9 rad. One speed has bounds on one side only, which are far on the other."""
+    model, noise = dd.load_model(MODELS / "double_pendulum.urdf", time_step=0.01), np.random.default_rng(0)
+    path = np.column_stack([np.linspace(0, 1, 15), 0.3 + 1e-9 * noise.standard_normal(15)])
+    far = dd.Bounds(x_lower=[np.nan, np.nan, 0.0, -1e9], x_upper=[np.nan, np.nan, 1e9, 9.0])
+    for bounds in (None, far):
+        solution = dd.solve(PathTiming(model, path, acceleration=20.0, bounds=bounds))
+        assert solution.success, solution.message
+        assert solution.horizon == pytest.approx(2 * np.sqrt(1 / 20), rel=1e-3)
+
+
+def test_the_own_limits_of_the_model_apply_to_the_other_joints(tmp_path):
+    text = (MODELS / "double_pendulum.urdf").read_text()
+    text = text.replace("<robot ", '<robot xmlns:drake="http://drake.mit.edu" ', 1)
+    limits = '<limit effort="50" velocity="20" drake:acceleration="2.0"/>'
+    (tmp_path / "limited.urdf").write_text(re.sub(r"(<axis[^>]*/>)", rf"\1{limits}", text))
+    model = dd.load_model(tmp_path / "limited.urdf", time_step=0.01)
+    assert model.plant.GetAccelerationUpperLimits().tolist() == [2.0, 2.0]
+    first, second = model.velocity_names
+    timing = PathTiming(model, [[0, 0], [0.2, 1.0]], acceleration={first: 20.0})
+    assert timing.couplings[0].limit == {first: 20.0, second: 2.0}
+    assert dd.solve(timing).horizon == pytest.approx(2 * np.sqrt(1 / 2), rel=2e-3)  # the second joint moves by 1
+
+
 @each_row("limit, status", [({"time_limit": 1e-3}, "time_limit"), ({"max_iterations": 3}, "iteration_limit")])
 def test_a_limit_ends_the_search_by_name(limit, status):
     solution = dd.solve(PathTiming(PANDA, CURVE, acceleration=5.0), **limit)
@@ -164,6 +189,8 @@ def test_a_run_of_it_is_verified_and_a_changed_one_is_not(tmp_path):
     [
         (lambda: PathTiming(PENDULUM, [[0.0], [1.0]]), InputError, "acceleration=, jerk="),
         (lambda: PathTiming(PENDULUM, [[0.0]], jerk=1.0), InputError, "two or more"),
+        (lambda: PathTiming(PENDULUM, [[0.0], [1.0]], jerk=1.0, num_steps=1), InputError, "at least 3"),
+        (lambda: PathTiming(PENDULUM, [[0.0], [1.0]], bounds=speed_limit(0.0)), InputError, "bounds of speed"),
         (lambda: PathTiming(PENDULUM, [[0.0], [0.0]], jerk=1.0), InputError, "two or more"),
         (lambda: PathTiming(PENDULUM, [[0.0, 1.0]], jerk=1.0), ShapeError, "PathTiming.path"),
         (lambda: PathTiming(PANDA, PiecewisePolynomial([1.0])), ShapeError, "PathTiming.path"),
