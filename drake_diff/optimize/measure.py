@@ -309,9 +309,12 @@ def certify_equations(
         point, scale = np.concatenate([knot, tail]), np.concatenate([np.maximum(1.0, np.abs(knot)), sizes])
         f = system.at_step(k).values if isinstance(system, DiscreteMap) else values
         derivative = partial(jacobian, k=k) if is_map else jacobian
-        plan = LookAt(np.asarray(derivative(point), dtype=float) * scale)
-        look = plan.taken(np.asarray(f(point + scale * plan.displacements), dtype=float))
-        if look.doubt():
+        matrix = np.asarray(derivative(point), dtype=float)
+        look = None
+        if np.all(np.isfinite(matrix)):
+            plan = LookAt(matrix * scale)
+            look = plan.taken(np.asarray(f(point + scale * plan.displacements), dtype=float))
+        if look is None or look.doubt():
             certificates.append(certify_jacobian(f, point, derivative, batched=True, scale=scale, **named))
         else:
             certificates.append(look.certificate(scale, **named))

@@ -44,7 +44,7 @@ PIECES, NEAR = (3, 6), 1.01  # of an interval; the second if a motion by the fir
 PLACES, ASIDE = 40, 1e-9  # places in an interval that are compared with the exact path, and a distance from a knot
 TOLERANCE, WIDEST = 1e-7, 1e3  # of IPOPT, and the factor from the first duration to its bounds
 LARGEST = 1.1  # a factor above this, which slower motions do not reduce, belongs to a load that is too heavy
-RESTS = 1e-6  # of the largest position: a smaller range of a joint is noise
+RESTS = 1e-6  # of the largest range of a joint: a smaller range is noise
 KEPT, ROUNDS = 1e-9, 60  # of a limit: an excess that is rounding; and the largest number of slower motions
 QUARTERS = np.arange(5) / 4  # of an interval
 # Of intervals; and the error of an input's parabola over its range in an interval.
@@ -137,8 +137,7 @@ class PathTiming:
     @cached_property
     def limits(self) -> Bounds:
         """The limits of all states and inputs."""
-        model = self.model
-        given = bounds_of(model, self.bounds)
+        model, given = self.model, bounds_of(self.model, self.bounds)
         return resolve_bounds(given, plant_limits(model), model.state_names, model.input_names)
 
     @cached_property
@@ -183,9 +182,9 @@ class PathTiming:
         xs, us = self.motion(rows)
         xs = np.clip(xs, self.limits.x_lower, self.limits.x_upper)
         fields: dict[str, Any] = {"xs": frozen(xs[::2]), "us": frozen(us[:-1:2]), "u_final": frozen(us[-1])}
-        fields |= {"us_mid": frozen(us[1::2]), "mesh": frozen(knots / self.num_steps)}
+        fields |= {"us_mid": frozen(us[1::2]), "mesh": frozen(knots / self.num_steps), "scheme": DEFAULT_SCHEME}
+        fields["free_horizon"] = timing.duration
         problem = self._problem(xs[::2][knots == knots.round()], timing.duration)
-        fields |= {"scheme": DEFAULT_SCHEME, "free_horizon": timing.duration}
         plan = Solution(problem, GIVEN, "IPOPT", Status.FAILED, "", **fields)
         words = f"IPOPT: {outcome.value} after {iterations} iterations"
         solution: Solution = ended(plan, status_of(outcome) or Status.FAILED, words)
@@ -268,7 +267,8 @@ def _along(path: Trajectory, count: int) -> tuple[BSpline, float]:
     cells = np.linspace(path.start_time(), path.end_time(), 4 * count + 1)
     positions = trajectory_values(SUBJECT, path, cells)
     ranges = np.ptp(positions, axis=0)
-    moves = ranges > RESTS * np.max(np.abs(positions))  # other joints have only the noise of inverse kinematics
+    # Other joints have only the noise of inverse kinematics, or rounding far from 0.
+    moves = ranges > max(RESTS * np.max(ranges), KEPT * np.max(np.abs(positions)))
     if not np.any(moves):
         raise InputError(SUBJECT, got="constant positions", expected="a motion")
     weights = np.divide(1.0, ranges, out=np.zeros_like(ranges), where=moves)
@@ -358,8 +358,7 @@ class _Search:
     """The program of a `PathTiming` in s, ds/dt and d2s/dt2 at the knots, and the duration."""
 
     def __init__(self, task: PathTiming):
-        self.task, nq, b = task, task.model.nq, task.limits
-        self.grid = task.grid
+        self.task, self.grid, nq, b = task, task.grid, task.model.nq, task.limits
         self.kinds = [_Limit(b.x_lower[nq:], b.x_upper[nq:], 1.0), _Limit(b.u_lower, b.u_upper, 0.5)]
         for coupling in task.couplings:
             entries, limits = coupling.entries(task.model)
@@ -392,9 +391,7 @@ class _Search:
         speed = self._speed
 
         def inputs(v: float, a: float) -> Array:
-            rows = np.tile([0.0, v, a], (len(self.grid), 1))
-            rows[:, 0] = self.grid
-            return self.task.motion(rows)[1]
+            return self.task.motion(np.column_stack(np.broadcast_arrays(self.grid, v, a)))[1]
 
         rest = inputs(0.0, 0.0)
         (ahead, back), twice = (inputs(v, 0.0) for v in (speed, -speed)), [inputs(2 * v, 0.0) for v in (speed, -speed)]

@@ -192,3 +192,10 @@ def test_rates_that_a_system_refuses_are_outside_its_domain():
     assert np.isfinite(system(x, u)).all()
     x[4] = np.pi / 2
     assert all(np.isnan(values).all() for values in system.derivatives(x, u))
+
+
+def test_a_guess_that_a_system_refuses_ends_by_name():
+    """A line from the gimbal lock of Drake's quadrotor has no derivatives at its first knot."""
+    quadrotor, x0 = dd.Dynamics.from_system(QuadrotorPlant()), np.pi / 2 * np.eye(12)[4]
+    problem = dd.Problem(quadrotor, x0=x0, x_goal=np.zeros(12), num_steps=10, horizon=1.0)
+    assert "not finite" in dd.solve(problem, method="collocation", restarts=0).message
