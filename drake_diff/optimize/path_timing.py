@@ -1,9 +1,9 @@
 """The least time along a given path of a robot's positions, within limits of speed, acceleration, effort and jerk.
 
-The path is q(s), where s from 0 to 1 is its length. The motion is s(t), a piecewise cubic of N intervals of the same
-duration, so that its acceleration is continuous. IPOPT minimizes the duration over s, ds/dt and d2s/dt2 at the knots.
-All limits are then compared with the exact path between the knots, and the motion is slowed down by the excess that is
-left. The result is a plan of the model, with the verification of `check_plan`.
+The path is q(s), where s from 0 to 1 is its length. The motion is s(t), a piecewise cubic whose acceleration is
+continuous, with N intervals between given places s, which are close together in bends. IPOPT minimizes the sum of their
+durations over ds/dt and d2s/dt2 at the knots. All limits are then compared with the exact path between the knots, and
+the motion is slowed down by the excess that is left. The result is a plan, with the verification of `check_plan`.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -35,18 +35,18 @@ from drake_diff.optimize.transcription.task import DEFAULT_SCHEME
 from drake_diff.optimize.verification import ended, status_of
 
 SUBJECT = "PathTiming.path"
-SAMPLES = (100, 400, 1600)  # numbers of places on the path that its spline interpolates; more if it is not accurate
-GRID = 801  # the least number of places on the path at which a search knows its slopes and efforts
+SAMPLES, BISECTIONS, MOST = 100, 8, 3200  # cells of the path's spline at first, bisections of a cell, and most cells
+GRID = (4, 800)  # the least numbers of parts of a cell, and of a path, at whose ends a search knows slopes and efforts
 OFF_PATH = 1e-5  # of the range of a position: allowed distance of the spline from the path
 DEGREE = 5  # of the path's spline, so that its third derivative is continuous
-GAUSS, NEWTON = 5, 5  # places of the quadrature in a cell, and steps to the place with a given length
+CELLS = 6400  # intervals of the path's own time in which its length is integrated
+GAUSS, NEWTON = 5, 5  # places of the quadrature in an interval, and steps to the place with a given length
 PIECES, NEAR = (3, 6), 1.01  # of an interval; the second if a motion by the first is faster than this factor
 PLACES, ASIDE = 40, 1e-9  # places in an interval that are compared with the exact path, and a distance from a knot
 TOLERANCE, WIDEST = 1e-7, 1e3  # of IPOPT, and the factor from the first duration to its bounds
 LARGEST = 1.1  # a factor above this, which slower motions do not reduce, belongs to a load that is too heavy
 RESTS = 1e-6  # of the largest range of a joint: a smaller range is noise
 KEPT, ROUNDS = 1e-9, 60  # of a limit: an excess that is rounding; and the largest number of slower motions
-QUARTERS = np.arange(5) / 4  # of an interval
 # Of intervals; and the error of an input's parabola over its range in an interval.
 HALVINGS, SAME_INPUT = 6, 1e-5
 TINY = 1e-300  # stands for a limit of 0
@@ -68,7 +68,7 @@ class PathTiming:
         path: the positions as a Drake trajectory (nq), such as a `BsplineTrajectory` or the result of
             `KinematicTrajectoryOptimization` or `GcsTrajectoryOptimization`, whose own timing is ignored; or waypoints
             (K, nq), joined by a cubic spline. It has no corners.
-        num_steps: number N of intervals.
+        num_steps: number N of intervals; sharp bends get more.
         acceleration: [velocity's unit per s] a limit for all velocities, or a mapping from names to limits. The model's
             own limits apply to the rest.
         jerk: [velocity's unit per s^2] the same for the rate of the accelerations, which then are 0 at both ends.
@@ -143,18 +143,17 @@ class PathTiming:
     @cached_property
     def spline(self) -> BSpline:
         """The path q(s) as a spline of degree 5, where s from 0 to 1 is proportional to its length."""
-        path = _trajectory(self.path, self.model.nq)
-        for samples in SAMPLES:
-            spline, off = _along(path, samples)
-            if off <= OFF_PATH:
-                return spline
-        got = f"a corner: a spline through {samples} of its places leaves it by {off:.2g} of the motion"
-        raise InputError(SUBJECT, got=got, expected="a smooth path")
+        return _along(_trajectory(self.path, self.model.nq))
+
+    @cached_property
+    def cells(self) -> Array:
+        """The ends of the spline's cells, which are small in bends."""
+        return np.unique(self.spline.t)
 
     @cached_property
     def grid(self) -> Array:
         """The places on the path at which a search knows its slopes and efforts."""
-        return np.linspace(0, 1, max(GRID, 4 * len(self.spline.c)))
+        return _divided(self.cells, max(GRID[0], -(-GRID[1] // (len(self.cells) - 1))))
 
     def _check_path(self) -> None:
         """Raise InputError if the path leaves the limits of the positions."""
@@ -177,14 +176,18 @@ class PathTiming:
         start = now()
         outcome, iterations, timing = _Search(self).run(limits, start)
         knots = self._knots(timing)
-        rows = timing.rows(_halves(knots))
+        rows = timing.rows(_divided(knots, 2))
         rows[[0, -1], :2] = [[0.0, 0.0], [1.0, 0.0]]  # without rounding
         xs, us = self.motion(rows)
         xs = np.clip(xs, self.limits.x_lower, self.limits.x_upper)
         fields: dict[str, Any] = {"xs": frozen(xs[::2]), "us": frozen(us[:-1:2]), "u_final": frozen(us[-1])}
-        fields |= {"us_mid": frozen(us[1::2]), "mesh": frozen(knots / self.num_steps), "scheme": DEFAULT_SCHEME}
+        fields |= {
+            "us_mid": frozen(us[1::2]),
+            "mesh": frozen(timing.times(knots) / timing.duration),
+            "scheme": DEFAULT_SCHEME,
+        }
         fields["free_horizon"] = timing.duration
-        problem = self._problem(xs[::2][knots == knots.round()], timing.duration)
+        problem = self._problem(xs[::2], timing.times(knots), timing.duration)
         plan = Solution(problem, GIVEN, "IPOPT", Status.FAILED, "", **fields)
         words = f"IPOPT: {outcome.value} after {iterations} iterations"
         solution: Solution = ended(plan, status_of(outcome) or Status.FAILED, words)
@@ -195,22 +198,31 @@ class PathTiming:
 
     def _knots(self, timing: "_Timing") -> Array:
         """Return knots, as places from 0 to N, between which parabolas follow the inputs of a timing."""
-        knots = np.arange(self.num_steps + 1.0)
+        whole = np.arange(float(len(timing.values)))
+        knots = np.union1d(
+            whole, np.interp(self._waypoints / self.num_steps * timing.duration, timing.times(whole), whole)
+        )
         for _ in range(HALVINGS):
-            ends, lengths = knots[:-1], np.diff(knots)
-            every = self.motion(timing.rows((ends[:, None] + lengths[:, None] * QUARTERS).ravel()))[1]
-            first, other, middle, _, last = every.reshape(len(ends), len(QUARTERS), -1).transpose(1, 0, 2)
+            every = self.motion(timing.rows(_divided(knots, 4)))[1]
+            first, other, middle, last = every[:-1:4], every[1::4], every[2::4], every[4::4]
             off = np.abs(other - (3 * first + 6 * middle - last) / 8)
+            lengths = np.diff(timing.times(knots)) / timing.duration * self.num_steps
             coarse = np.max(off / np.maximum(np.ptp(every, axis=0), TINY), axis=1) > SAME_INPUT * lengths
             if not np.any(coarse):
                 break
-            knots = np.sort(np.append(knots, (ends + lengths / 2)[coarse]))
+            knots = np.sort(np.append(knots, ((knots[:-1] + knots[1:]) / 2)[coarse]))
         return knots
 
-    def _problem(self, xs: Array, duration: float) -> Problem:
-        """Return the problem of a motion xs (N+1, nx)."""
-        chosen = np.unique(np.linspace(0, self.num_steps, WAYPOINTS + 1).round().astype(int))[1:-1]
-        waypoints = {int(k): np.append(xs[k, : self.model.nq], np.full(self.model.nv, np.nan)) for k in chosen}
+    @cached_property
+    def _waypoints(self) -> Array:
+        """The steps of the waypoints of the solution's problem."""
+        return np.unique(np.linspace(0, self.num_steps, WAYPOINTS + 1).round().astype(int))[1:-1]
+
+    def _problem(self, xs: Array, times: Array, duration: float) -> Problem:
+        """Return the problem of a motion xs (K, nx) at `times` (K,)."""
+        free, nq = np.full(self.model.nv, np.nan), self.model.nq
+        rows = np.argmin(np.abs(times - self._waypoints[:, None] / self.num_steps * duration), axis=1)
+        waypoints = {int(k): np.append(xs[row, :nq], free) for k, row in zip(self._waypoints, rows, strict=True)}
         return Problem(
             self.model,
             x0=xs[0],
@@ -235,9 +247,9 @@ class PathTiming:
         return xs, np.asarray(needed @ np.linalg.pinv(self.model.actuation).T)
 
 
-def _halves(knots: Array) -> Array:
-    """Return knots (N+1,) with the places in the middle between them (2N+1,)."""
-    return np.interp(np.arange(2 * len(knots) - 1) / 2, np.arange(len(knots)), knots)
+def _divided(ends: Array, parts: int) -> Array:
+    """Return the ends (N+1,) of intervals with those of their equal parts (parts N + 1,)."""
+    return np.interp(np.arange(parts * (len(ends) - 1) + 1) / parts, np.arange(len(ends)), ends)
 
 
 def _trajectory(path: Any, nq: int) -> Trajectory:
@@ -258,13 +270,13 @@ def _trajectory(path: Any, nq: int) -> Trajectory:
     return PiecewisePolynomial.CubicWithContinuousSecondDerivatives(breaks, points.T)
 
 
-def _along(path: Trajectory, count: int) -> tuple[BSpline, float]:
-    """Return the path as a spline of its length from 0 to 1, and the largest distance of the spline from the path.
+def _along(path: Trajectory) -> BSpline:
+    """Return the path as a spline of its length from 0 to 1, where each position is relative to its range.
 
-    Lengths and distances are relative to the range of each position. The spline interpolates `count` + 1 places.
+    Raises InputError if the spline does not follow the path.
     """
     rate = path.MakeDerivative()
-    cells = np.linspace(path.start_time(), path.end_time(), 4 * count + 1)
+    cells = np.linspace(path.start_time(), path.end_time(), CELLS + 1)
     positions = trajectory_values(SUBJECT, path, cells)
     ranges = np.ptp(positions, axis=0)
     # Other joints have only the noise of inverse kinematics, or rounding far from 0.
@@ -282,37 +294,67 @@ def _along(path: Trajectory, count: int) -> tuple[BSpline, float]:
         return np.asarray((speeds((start + end)[:, None] / 2 + half * nodes) * half) @ shares)
 
     lengths = np.append(0.0, np.cumsum(lengths_of(cells[:-1], cells[1:])))
-    targets = np.linspace(0, lengths[-1], 2 * count + 1)
-    when = np.interp(targets, lengths, cells)
-    k = np.clip(np.searchsorted(lengths, targets, side="right") - 1, 0, len(cells) - 2)
-    for _ in range(NEWTON):
-        speed = speeds(when)
-        left = targets - lengths[k] - lengths_of(cells[k], when)
-        when = when + np.divide(left, speed, out=np.zeros_like(speed), where=speed > 0)
-        when = np.clip(when, cells[k], cells[k + 1])
-    values, s = trajectory_values(SUBJECT, path, when), targets / lengths[-1]
-    spline = make_interp_spline(s[::2], values[::2], DEGREE)
-    return spline, float(np.max(np.abs(spline(s[1::2]) - values[1::2]) * weights))
+
+    def positions_at(s: Array) -> Array:
+        targets = s * lengths[-1]
+        when = np.interp(targets, lengths, cells)
+        k = np.clip(np.searchsorted(lengths, targets, side="right") - 1, 0, len(cells) - 2)
+        for _ in range(NEWTON):
+            speed = speeds(when)
+            left = targets - lengths[k] - lengths_of(cells[k], when)
+            when = when + np.divide(left, speed, out=np.zeros_like(speed), where=speed > 0)
+            when = np.clip(when, cells[k], cells[k + 1])
+        return trajectory_values(SUBJECT, path, when)
+
+    ends = np.linspace(0, 1, SAMPLES + 1)
+    for _ in range(BISECTIONS + 1):
+        spline, middle = make_interp_spline(ends, positions_at(ends), DEGREE), (ends[:-1] + ends[1:]) / 2
+        off = np.max(np.abs(spline(middle) - positions_at(middle)) * weights, axis=1)
+        if np.all(off <= OFF_PATH):
+            return spline
+        coarse = np.convolve(off > OFF_PATH, np.ones(3), "same") > 0  # with its neighbours
+        if len(middle) + np.sum(coarse) > MOST:
+            break
+        ends = np.sort(np.append(ends, middle[coarse]))
+    got = f"a corner: a spline through {len(spline.c)} of its places leaves it by {np.max(off):.2g} of the motion"
+    raise InputError(SUBJECT, got=got, expected="a smooth path")
 
 
 @dataclass(frozen=True)
 class _Timing:
-    """The values (N+1, 3) of s, ds/dt [1/s] and d2s/dt2 [1/s^2] at the knots of a motion of `duration` [s]."""
+    """The values (N+1, 3) of s, ds/dt [1/s] and d2s/dt2 [1/s^2] at knots, and the intervals (N,) between them [s]."""
 
     values: Array
-    duration: float
+    intervals: Array
+
+    @property
+    def duration(self) -> float:
+        """The time of the whole motion [s]."""
+        return float(np.sum(self.intervals))
+
+    def times(self, places: Array) -> Array:
+        """Return the times (K,) [s] at `places` (K,), in intervals from 0 to N."""
+        knots = np.append(0.0, np.cumsum(self.intervals))
+        return np.interp(places, np.arange(len(knots)), knots)
 
     def rows(self, places: Array) -> Array:
         """Return s and its three time derivatives (K, 4) at `places` (K,), in intervals from 0 to N."""
-        k = np.minimum(places.astype(int), len(self.values) - 2)
-        h = self.duration / (len(self.values) - 1)
-        jerks = (self.values[k + 1, 2] - self.values[k, 2]) / h
+        k = np.minimum(places.astype(int), len(self.intervals) - 1)
+        jerks = (self.values[k + 1, 2] - self.values[k, 2]) / self.intervals[k]
         s, v, a = self.values[k].T
-        return np.array([*_within(s, v, a, jerks, h * (places - k)), jerks]).T
+        return np.array([*_within(s, v, a, jerks, self.intervals[k] * (places - k)), jerks]).T
 
     def slower(self, factor: float) -> "_Timing":
         """Return the same motion in `factor` times the duration."""
-        return _Timing(self.values / factor ** np.arange(3), self.duration * factor)
+        return _Timing(self.values / factor ** np.arange(3), self.intervals * factor)
+
+    def divided(self, cells: Array, count: int) -> "_Timing":
+        """Return nearly the same motion in `count` intervals with equal shares of its time and of the `cells` of s."""
+        places = _divided(np.arange(float(len(self.values))), PLACES)
+        s = np.maximum.accumulate(self.rows(places)[:, 0])
+        shares = self.times(places) / self.duration + np.interp(s, cells, np.linspace(0, 1, len(cells)))
+        chosen = np.interp(np.linspace(0, shares[-1], count + 1), shares, places)
+        return _Timing(self.rows(chosen)[:, :3], np.diff(self.times(chosen)))
 
 
 def _within(s: Any, v: Any, a: Any, jerk: Any, t: Any) -> tuple[Any, Any, Any]:
@@ -359,6 +401,7 @@ class _Search:
 
     def __init__(self, task: PathTiming):
         self.task, self.grid, nq, b = task, task.grid, task.model.nq, task.limits
+        self.mesh = task.cells, task.num_steps + max(0, len(task.cells) - 1 - SAMPLES)
         self.kinds = [_Limit(b.x_lower[nq:], b.x_upper[nq:], 1.0), _Limit(b.u_lower, b.u_upper, 0.5)]
         for coupling in task.couplings:
             entries, limits = coupling.entries(task.model)
@@ -427,53 +470,57 @@ class _Search:
 
     def _solved(self, guess: _Timing, pieces: int, limits: Limits) -> tuple[Outcome, int, _Timing]:
         """Return IPOPT's outcome, iterations and timing with the limits at the ends of `pieces` of each interval."""
-        program, bounds = self._program(guess.duration, pieces)
+        program, bounds = self._program(guess, pieces)
         options = {"print_level": 0, "sb": "yes", "max_iter": limits.max_iterations, "tol": TOLERANCE}
         if np.isfinite(limits.time_limit):
             options["max_wall_time"] = max(limits.time_limit, TINY)
         solver = ca.nlpsol("timing", "ipopt", program, {"ipopt": options, "print_time": False})
-        by_unit = guess.duration ** np.arange(3)
-        result = solver(x0=np.append((guess.values * by_unit).T.ravel(), 1.0), **bounds)
+        by_unit, count = guess.duration ** np.arange(1, 3), len(guess.intervals)
+        result = solver(x0=np.append((guess.values[:, 1:] * by_unit).T, np.ones(count)), **bounds)
         z, stats = np.array(result["x"]).ravel(), solver.stats()
-        timing = _Timing(z[:-1].reshape(3, -1).T / by_unit, float(z[-1] * guess.duration))
+        values = np.column_stack([guess.values[:, 0], z[:-count].reshape(2, -1).T / by_unit])
+        timing = _Timing(values, z[-count:] * guess.intervals)
         return OUTCOMES.get(stats["return_status"], Outcome.FAILED), stats["iter_count"], timing
 
-    def _program(self, unit: float, pieces: int) -> tuple[dict[str, Any], dict[str, Array]]:
-        """Return the program in s, ds/dt and d2s/dt2 at the knots and the duration, with `unit` [s] as unit of time."""
-        count = self.task.num_steps
-        s, v, a = (ca.MX.sym(name, count + 1) for name in "sva")
-        duration = ca.MX.sym("duration")
-        h = duration / count
+    def _program(self, guess: _Timing, pieces: int) -> tuple[dict[str, Any], dict[str, Array]]:
+        """Return the program in ds/dt and d2s/dt2 at the knots of a guess, and the ratios of intervals to the guess's.
+
+        The unit of time is the guess's duration.
+        """
+        count, unit = len(guess.intervals), guess.duration
+        v, a, ratios = ca.MX.sym("v", count + 1), ca.MX.sym("a", count + 1), ca.MX.sym("ratios", count)
+        s, h = ca.DM(guess.values[:, 0]), ratios * (guess.intervals / unit)
         jerk = (a[1:] - a[:-1]) / h
         end = _within(s[:-1], v[:-1], a[:-1], jerk, h)
         every = self.limited.map(count)
-        rows = [s[1:] - end[0], v[1:] - end[1]]
+        rows = [(s[1:] - end[0]) / np.diff(guess.values[:, 0]), v[1:] - end[1]]
         for fraction in np.arange(pieces) / pieces:
             point = (*_within(s[:-1], v[:-1], a[:-1], jerk, fraction * h), jerk)
             rows.append(ca.vec(every(*(z.T / unit**i for i, z in enumerate(point)))))
         rows.append(self.limited(s[-1], v[-1] / unit, a[-1] / unit**2, jerk[-1] / unit**3))
         number, free = pieces * count + 1, np.full(count + 1, np.inf)
-        lower = np.concatenate([np.zeros(2 * count + 2), -free, [1 / WIDEST]])
-        upper = np.concatenate([np.ones(count + 1), free, free, [WIDEST]])
-        ends = [0, count, count + 1, 2 * count + 1] + [2 * count + 2, 3 * count + 2] * (self.task.jerk is not None)
-        lower[ends] = upper[ends] = [0.0, 1.0] + [0.0] * (len(ends) - 2)
+        lower = np.concatenate([np.zeros(count + 1), -free, np.full(count, 1 / WIDEST)])
+        upper = np.concatenate([free, free, np.full(count, WIDEST)])
+        ends = [0, count] + [count + 1, 2 * count + 1] * (self.task.jerk is not None)
+        lower[ends] = upper[ends] = 0.0
         bounds = {"lbx": lower, "ubx": upper}
         for name, side in (("lbg", self.lower), ("ubg", self.upper)):
             bounds[name] = np.append(np.zeros(2 * count), np.tile(side, number))
-        return {"x": ca.vertcat(s, v, a, duration), "f": duration, "g": ca.vertcat(*rows)}, bounds
+        return {"x": ca.vertcat(v, a, ratios), "f": ca.sum1(h), "g": ca.vertcat(*rows)}, bounds
 
     def _first(self) -> _Timing:
         """Return a motion from rest to rest, within the limits if slower motions lead there."""
         tau = np.linspace(0, 1, self.task.num_steps + 1)
         left = 1 - tau
         values = [tau**3 * (10 - 15 * tau + 6 * tau**2), 30 * (tau * left) ** 2, 60 * tau * left * (1 - 2 * tau)]
-        timing = _Timing(np.array(values).T, 1.0).slower(1 / self._speed)
+        equal = np.full(self.task.num_steps, 1 / self.task.num_steps)
+        timing = _Timing(np.array(values).T, equal).slower(1 / self._speed).divided(*self.mesh)
         slower = self._slowed(timing.slower(self._factor(timing)))
         return timing if self._factor(slower) > LARGEST else slower
 
     def _factor(self, timing: _Timing) -> float:
         """Return the factor by which a timing is too fast for the limits on the exact path; at most 1 within them."""
-        places = np.linspace(0, self.task.num_steps, PLACES * self.task.num_steps + 1)
+        places = _divided(np.arange(float(len(timing.values))), PLACES)
         s = timing.rows(places)
         slopes = [self.task.spline(s[:, 0], nu=i) for i in (1, 2, 3)]
         us = self.task.motion(s)[1]

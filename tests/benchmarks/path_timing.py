@@ -1,9 +1,10 @@
 """Time random paths of arms by `PathTiming` and by Drake's Toppra, and measure both between the samples with pydrake.
 
     pip install -e '.[test]'
-    python tests/benchmarks/path_timing.py [--count 34] [--seed 0] [--jerk 300] [--robot FILE.urdf ...]
+    python tests/benchmarks/path_timing.py [--count 34] [--seed 0] [--jerk 300] [--bends 0.01] [--robot FILE.urdf ...]
 
-Each path is the cubic spline through five random postures without overlap of the arm's shapes. The limits are those of
+Each path is the cubic spline through five random postures without overlap of the arm's shapes; or with --bends straight
+legs of a B-spline between them, with bends of that fraction of a leg, as in the results of GCS. The limits are those of
 the file, and an acceleration of 10 rad/s^2. The robots are the Panda, the UR5 and those in --robot, such as the iiwa of
 Drake's models. The referee evaluates both motions at 20 places of each interval by the equations of a continuous plant
 of pydrake. Durations are ratios to Toppra's, which satisfies the limits at its grid points only.
@@ -16,15 +17,17 @@ import tempfile
 import time
 import warnings
 from importlib.resources import files
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from panda_arm import robot
+from pydrake.math import BsplineBasis
 from pydrake.multibody.optimization import CalcGridPointsOptions, Toppra
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.trajectories import PiecewisePolynomial
+from pydrake.trajectories import BsplineTrajectory, PiecewisePolynomial, Trajectory
 
 import drake_diff as dd
 
@@ -62,7 +65,7 @@ class Referee:
         joints = [self.plant.get_joint(j) for j in self.plant.GetJointIndices()]
         self.damping = np.array([j.default_damping_vector()[0] for j in joints if j.num_velocities()])
 
-    def path(self, random: np.random.Generator) -> PiecewisePolynomial:
+    def path(self, random: np.random.Generator, bends: float | None) -> Trajectory:
         """Return the next random path within the joint limits and without overlap."""
         lower, upper = self.plant.GetPositionLowerLimits() + 0.1, self.plant.GetPositionUpperLimits() - 0.1
         lower, upper = np.maximum(lower, -2.8), np.minimum(upper, 2.8)
@@ -70,8 +73,16 @@ class Referee:
             points = [random.uniform(lower, upper)]
             for _ in range(POSTURES - 1):
                 points.append(np.clip(points[-1] + random.uniform(-STEP, STEP, len(lower)), lower, upper))
+            if bends is not None:
+                shares = (0.0, bends, 2 * bends, 1 / 3, 2 / 3, 1 - 2 * bends, 1 - bends)
+                points = [a + f * (b - a) for a, b in pairwise(points) for f in shares] + [points[-1]]
             breaks = np.append(0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
-            path = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(breaks, np.array(points).T)
+            if bends is None:
+                path = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(breaks, np.array(points).T)
+            else:
+                inner = [np.mean(breaks[k + 1 : k + 4]) for k in range(len(points) - 4)]
+                basis = BsplineBasis(4, [0.0] * 4 + inner + [breaks[-1]] * 4)
+                path = BsplineTrajectory(basis, [p[:, None] for p in points])
             q = path.vector_values(np.linspace(0, breaks[-1], 100)).T
             if np.all((q >= lower) & (q <= upper)) and not any(self.overlaps(row) for row in q):
                 return path
@@ -108,10 +119,10 @@ def ours(timing: dd.optimize.PathTiming, referee: Referee) -> tuple[dd.Solution,
     return solution, seconds, referee.excess(xs, np.array(rates), us)
 
 
-def drakes(path: PiecewisePolynomial, referee: Referee) -> tuple[float, float, float]:
+def drakes(path: Trajectory, referee: Referee) -> tuple[float, float, float]:
     """Return the duration by Toppra, the seconds it took, and the excess of its motion."""
     start = time.perf_counter()
-    grid = Toppra.CalcGridPoints(path, CalcGridPointsOptions(max_err=1e-5))
+    grid = Toppra.CalcGridPoints(path, CalcGridPointsOptions(max_err=1e-5, min_points=1000))
     search = Toppra(path, referee.plant, grid)
     search.AddJointVelocityLimit(-referee.speed, referee.speed)
     search.AddJointAccelerationLimit(*(sign * np.full(len(referee.speed), ACCELERATION) for sign in (-1, 1)))
@@ -137,6 +148,7 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=34, help="paths of each robot")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jerk", type=float, default=300.0, help="[rad/s^3] of a second timing of each path")
+    parser.add_argument("--bends", type=float, help="of a leg: sharp bends between straight legs")
     parser.add_argument("--robot", type=Path, nargs="*", default=[], help="more robot files")
     asked = parser.parse_args()
     warnings.simplefilter("ignore", dd.exceptions.ModelWarning)
@@ -149,7 +161,7 @@ def main() -> int:
             model = dd.load_model(path_of, time_step=0.001, weld_base=referee.welded)
             limits, rows = {"acceleration": ACCELERATION}, []
             for k in range(asked.count):
-                path = referee.path(random)
+                path = referee.path(random, asked.bends)
                 solution, seconds, excess = ours(dd.optimize.PathTiming(model, path, **limits), referee)
                 duration, drake_seconds, drake_excess = drakes(path, referee)
                 smooth = dd.solve(dd.optimize.PathTiming(model, path, jerk=asked.jerk, **limits))

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -45,9 +46,9 @@ def test_the_time_of_a_straight_line_is_in_closed_form(limits, wanted):
     assert solution.xs[-1] == pytest.approx([1.0, 0.0], abs=1e-12)  # a spline ends within rounding
 
 
-def drakes_time(model, path, most):
+def drakes_time(model, path, most, points=300):
     """Return the duration by Toppra, which satisfies the limits at its grid points."""
-    grid = Toppra.CalcGridPoints(path, CalcGridPointsOptions(max_err=1e-5, min_points=300))
+    grid = Toppra.CalcGridPoints(path, CalcGridPointsOptions(max_err=1e-5, min_points=points))
     timing = Toppra(path, model.plant, grid)
     speed, effort = model.plant.GetVelocityUpperLimits(), model.plant.GetEffortUpperLimits()
     timing.AddJointVelocityLimit(-speed, speed)
@@ -113,6 +114,27 @@ def test_the_own_timing_of_a_path_and_its_kind_do_not_matter():
         again = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(times + times**2, path.vector_values(times))
         with_samples = dd.solve(PathTiming(PANDA, again, acceleration=8.0, num_steps=60))
         assert with_samples.horizon == pytest.approx(solution.horizon, rel=5e-3)  # splines round a jump of curvature
+
+
+@pytest.mark.slow
+@each_row("size", [0.03, 0.005])
+def test_bends_much_shorter_than_an_interval_are_passed_at_speed(size):
+    """Straight legs of a cubic B-spline, with a bend of `size` times their length, as in the results of GCS."""
+    random, corners = np.random.default_rng(0), [READY]
+    for _ in range(3):
+        corners.append(corners[-1] + random.uniform(-0.5, 0.5, 7))
+    shares = (0.0, size, 2 * size, 1 / 3, 2 / 3, 1 - 2 * size, 1 - size)
+    points = [a + f * (b - a) for a, b in pairwise(corners) for f in shares] + [corners[-1]]
+    places = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    inner = [np.mean(places[k + 1 : k + 4]) for k in range(len(points) - 4)]
+    path = BsplineTrajectory(BsplineBasis(4, [0.0] * 4 + inner + [places[-1]] * 4), [p[:, None] for p in points])
+    solution, wanted = dd.solve(PathTiming(PANDA, path, acceleration=10.0)), drakes_time(PANDA, path, 10.0, 3000)
+    assert solution.success, solution.message
+    assert 0.98 * wanted <= solution.horizon <= 1.02 * wanted
+    _, speeds, accelerations, efforts = measured(PANDA, solution, 20001)
+    assert np.max(np.abs(speeds) / PANDA.plant.GetVelocityUpperLimits()) <= 1 + 1e-4
+    assert np.max(np.abs(efforts) / PANDA.plant.GetEffortUpperLimits()) <= 1 + 1e-4
+    assert np.max(np.abs(accelerations)) <= 10.0 * (1 + 1e-2)  # the input is a parabola between its knots
 
 
 def test_a_motor_that_cannot_hold_the_robot_on_its_path_gives_no_plan():
