@@ -105,13 +105,15 @@ def _asked(script: Path, cross_check: bool) -> tuple[Any, dict[str, Any]]:
     module = _loaded(script)
     problem, options = module.problem(), getattr(module, "solve_options", {})
     from drake_diff.optimize.options import Options
+    from drake_diff.optimize.path_timing import PathTiming
     from drake_diff.optimize.problem.phases import PhasedProblem
     from drake_diff.optimize.problem.problem import Problem
     from drake_diff.optimize.solve import solve
 
-    if not isinstance(problem, (Problem, PhasedProblem)):
-        raise InputError("problem()", got=type(problem).__name__, expected="a Problem or a PhasedProblem")
-    if cross_check and not (isinstance(problem, Problem) and problem.has_model):
+    if not isinstance(problem, (Problem, PhasedProblem, PathTiming)):
+        expected = "a Problem, a PhasedProblem or a PathTiming"
+        raise InputError("problem()", got=type(problem).__name__, expected=expected)
+    if cross_check and not (isinstance(problem, PathTiming) or (isinstance(problem, Problem) and problem.has_model)):
         raise InputError(
             "--cross-check", got="a problem without a model, or in phases", expected="a Problem with a model"
         )
@@ -123,8 +125,9 @@ def _asked(script: Path, cross_check: bool) -> tuple[Any, dict[str, Any]]:
     if not isinstance(options.get("options", Options()), Options):
         got = type(options["options"]).__name__
         raise InputError("solve_options, options", got=got, expected="a drake_diff.optimize.Options")
-    parts = problem.phases if isinstance(problem, PhasedProblem) else (problem,)
-    show(plain(script.name, "bold"), "; ".join(f"{phase.system}, {phase.num_steps} steps" for phase in parts))
+    parts = () if isinstance(problem, PathTiming) else problem.phases
+    words = "; ".join(f"{phase.system}, {phase.num_steps} steps" for phase in parts) or repr(problem)
+    show(plain(script.name, "bold"), words)
     return problem, options
 
 
@@ -143,16 +146,19 @@ def _solved_into(
 ) -> Any:
     """Solve, measure and write `folder`, later `directory`; an interrupted run does not replace another run."""
     from drake_diff.optimize.options import Options
+    from drake_diff.optimize.path_timing import PathTiming
     from drake_diff.optimize.solve import solve
     from drake_diff.runs.cross_check import cross_check
     from drake_diff.runs.directory import is_taken
     from drake_diff.runs.save import begin, begin_failure, begin_interrupted, keep_plan, plan_kept, write_run
 
     begun: list[Any] = []
+    of_path = isinstance(problem, PathTiming)  # its solution's problem is known at the end
+    stated = None if of_path else problem
 
     def on_start() -> None:
         begun.append(problem)
-        begin(folder, problem)
+        begin(folder, stated)
 
     def on_plan(plan: Any) -> None:
         with plan_kept(plan, directory.name, folder):
@@ -160,8 +166,11 @@ def _solved_into(
 
     try:
         with progress_line("solving") as report:
-            hooked = replace(options.pop("options", Options()), on_start=on_start, on_plan=on_plan)
-            solution: Any = solve(problem, progress=report, options=hooked, **options)
+            if of_path:
+                on_start()
+            else:
+                options["options"] = replace(options.get("options", Options()), on_start=on_start, on_plan=on_plan)
+            solution: Any = solve(problem, progress=report, **options)
         if checked:
             with progress_line("replaying the plan in other simulators"):
                 solution = cross_check(solution)
@@ -169,14 +178,14 @@ def _solved_into(
             record: Any = write_run(solution, folder, meshes=meshes)
     except KeyboardInterrupt:
         with held_interrupts():
-            begin_interrupted(folder, problem)
+            begin_interrupted(folder, stated)
         show(f"interrupted: the partial run is in {folder}")
         if begun:
             show(plain(f"drake-diff recover {shlex.quote(str(folder))} measures its plan, if it has one"))
         raise typer.Exit(INTERRUPTED) from None
     except Exception as error:
         if begun and not isinstance(error, WriteError):
-            begin_failure(error, folder, problem)
+            begin_failure(error, folder, stated)
         raise
     if record.solver.status == "interrupted" and is_taken(directory):
         show(judged(record.verdict), f" interrupted: {record.sentence}")

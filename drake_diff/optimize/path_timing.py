@@ -6,7 +6,7 @@ durations over ds/dt and d2s/dt2 at the knots. All limits are then compared with
 the motion is slowed down by the excess that is left. The result is a plan, with the verification of `check_plan`.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from typing import Any
@@ -171,10 +171,11 @@ class PathTiming:
             expected = f"{self.model.velocity_names[i]} that {lower[i]:.6g} to {upper[i]:.6g} allows, from rest to rest"
             raise InputError(SUBJECT, got="a motion against its bounds of speed", expected=expected)
 
-    def solved(self, limits: Limits) -> Solution:
+    def solved(self, limits: Limits, say: Callable[[str], None]) -> Solution:
         """Return the verified plan of least time; see `solve`."""
         start = now()
         outcome, iterations, timing = _Search(self).run(limits, start)
+        say(f"IPOPT {outcome.value} after {iterations} iterations: {timing.duration:.4g} s")
         knots = self._knots(timing)
         rows = timing.rows(_divided(knots, 2))
         rows[[0, -1], :2] = [[0.0, 0.0], [1.0, 0.0]]  # without rounding

@@ -81,7 +81,7 @@ def solve(  # type: ignore[misc]  # only this signature lists the keywords
     Args:
         problem: the problem of a model or of plain `Dynamics`, or an `optimize.PhasedProblem`, which requires
             collocation and whose solution is an `optimize.PhasedSolution`; or an `optimize.PathTiming`, for which only
-            `max_iterations` and `time_limit` apply.
+            `max_iterations`, `time_limit` and `progress` apply.
         method: "collocation" (in continuous time, for models without contact and for plain dynamics), "shooting"
             (through Drake's own steps, contact included), "ilqr" (the same by Riccati sweeps) or "auto".
         initial_guess: None (a straight line to the goal with inputs near zero, or a `TrackingCost`'s reference), a
@@ -137,17 +137,17 @@ def solve(  # type: ignore[misc]  # only this signature lists the keywords
         np.inf if time_limit is None else positive_float("time_limit [s]", time_limit),
         chosen.tolerance,
     )
-    if isinstance(problem, PathTiming):
-        unused = {"method": method != "auto", "initial_guess": initial_guess is not None, "restarts": bool(restarts)}
-        unused |= {"options": options is not None, "callback": callback is not None, "view": view is not False}
-        for name in (name for name, is_given in unused.items() if is_given):
-            raise InputError(name, got="a value", expected="no value for a PathTiming")
-        return problem.solved(limits)
     report = Report(
         print if progress is True else (progress or None),
         callback and partial(noted, "callback", callback),
         chosen.on_plan,
     )
+    if isinstance(problem, PathTiming):
+        unused = {"method": method != "auto", "initial_guess": initial_guess is not None, "restarts": bool(restarts)}
+        unused |= {"options": options is not None, "callback": callback is not None, "view": view is not False}
+        for name in (name for name, is_given in unused.items() if is_given):
+            raise InputError(name, got="a value", expected="no value for a PathTiming")
+        return problem.solved(limits, report.say)
     arguments: dict[str, Any] = {
         "method": method,
         "max_iterations": limits.max_iterations,

@@ -294,17 +294,15 @@ def write_files(folder: Path, measurement: Measurement, fields: dict[str, Any]) 
 
 def begin_interrupted(folder: Path, problem: Problem | PhasedProblem | None) -> None:
     """Mark the run in `folder` as interrupted, before the search if it has no record yet."""
-    if problem is None:
-        begin(folder, None, IN_THE_SETUP, events=[Event(t_s=None, kind="failure", message=IN_THE_SETUP)])
-        return
     if record_path(folder) is None:
-        begin(folder, problem, BEFORE_THE_SEARCH)
+        sentence = IN_THE_SETUP if problem is None else BEFORE_THE_SEARCH
+        begin(folder, problem, sentence, events=[Event(t_s=None, kind="failure", message=sentence)])
         return
     record = load_record(folder)
     record.model_copy(update={"sentence": f"the run was interrupted; {record.sentence}"}).begin(folder)
 
 
-def begin_failure(error: BaseException, folder: Path, problem: Problem | PhasedProblem) -> None:
+def begin_failure(error: BaseException, folder: Path, problem: Problem | PhasedProblem | None) -> None:
     """Mark the run in progress in `folder` as ended by `error` before there was a solution."""
     failure = failure_of(error)
     event = Event(t_s=None, kind="failure", message=failure.message)

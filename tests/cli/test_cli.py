@@ -83,6 +83,38 @@ def problem():
     assert re.search(r"cost +12 ", shown)
 
 
+PATH_TIMING = """import drake_diff as dd
+def problem():
+    path = [[0.0], [1.0]]
+    return dd.optimize.PathTiming(dd.example_model("pendulum"), path, acceleration=4.0)
+"""
+
+
+def test_a_script_may_define_the_timing_of_a_path(tmp_path, monkeypatch, capsys):
+    (tmp_path / "timing.py").write_text(PATH_TIMING)
+    monkeypatch.chdir(tmp_path)
+    assert exit_of(monkeypatch, "run", tmp_path / "timing.py", "--out", tmp_path / "run") == 0
+    assert "PathTiming of pendulum" in capsys.readouterr().out
+    (duration,) = (m.value for m in dd.load_record(tmp_path / "run").metrics if m.name == "horizon")
+    assert duration == pytest.approx(1.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("error", [RuntimeError("broken"), KeyboardInterrupt()])
+def test_the_timing_of_a_path_that_ends_early_leaves_a_record_that_says_so(tmp_path, monkeypatch, error):
+    def ended(*arguments):
+        raise error
+
+    monkeypatch.setattr(dd.optimize.PathTiming, "solved", ended)
+    (tmp_path / "timing.py").write_text(PATH_TIMING)
+    monkeypatch.chdir(tmp_path)
+    assert exit_of(monkeypatch, "run", tmp_path / "timing.py", "--out", tmp_path / "run") in (cli.INTERNAL, 130)
+    (folder,) = tmp_path.glob("run.partial-*")
+    record = dd.load_record(folder)
+    assert record.verdict == "incomplete"
+    assert "interrupted" in record.sentence or "broken" in record.sentence
+    assert exit_of(monkeypatch, "recover", folder) == cli.USAGE
+
+
 @pytest.mark.slow
 def test_a_problem_that_cannot_be_solved_exits_with_1_and_a_complete_artifact(tmp_path):
     """0.1 N m cannot lift 1 kg at 0.5 m, which needs 4.9 N m, to the top within 0.8 s."""
@@ -119,7 +151,7 @@ def test_a_problem_that_cannot_be_solved_exits_with_1_and_a_complete_artifact(tm
         (("def problem", "def another"), "problem()"),
         (
             ("return dd.Problem", "return lambda *_, **__: dd.Problem"),
-            "problem(): expected a Problem or a PhasedProblem, got function",
+            "problem(): expected a Problem, a PhasedProblem or a PathTiming, got function",
         ),
         (("{'method'", "{'metod'"), "solve_options: expected one of"),
     ],
