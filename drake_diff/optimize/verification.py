@@ -61,7 +61,8 @@ def trials(s: Solution) -> list[list[PlantTrial]]:
     an integration of its equations and, for a model, in the two finest steps of Drake that were tried.
     """
     feedbacks = dict.fromkeys(c.feedback for c in s.following)
-    following = [PlantTrial("in continuous time", f, [c for c in s.following if c.feedback == f]) for f in feedbacks]
+    plant = "in its own steps" if s.problem.is_map else "in continuous time"
+    following = [PlantTrial(plant, f, [c for c in s.following if c.feedback == f]) for f in feedbacks]
     plants = [following] if following else []
     if s.problem.has_model:
         variants = deciding(s.plan, s.replays)

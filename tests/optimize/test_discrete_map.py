@@ -43,6 +43,7 @@ def test_a_linear_map_costs_what_riccati_says():
     solution = dd.solve(dd.Problem(system, x0=x, num_steps=STEPS, **costs))
     assert solution.success
     assert solution.scheme == "map"
+    assert "open loop in its own steps" in solution.message
     assert solution.cost == pytest.approx(x @ P @ x, rel=1e-7)  # the solver's tolerance is 1e-8
     assert solution.us.shape == (STEPS, 1)
     assert solution.u_final is None
