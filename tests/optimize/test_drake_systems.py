@@ -11,6 +11,7 @@ from pydrake.systems.primitives import LinearSystem, Multiplexer
 from pydrake.systems.scalar_conversion import TemplateSystem
 
 import drake_diff as dd
+from drake_diff.optimize.transcription import program
 
 EFFORT = dd.QuadraticCost(R=[[1.0]])
 
@@ -199,3 +200,21 @@ def test_a_guess_that_a_system_refuses_ends_by_name():
     quadrotor, x0 = dd.Dynamics.from_system(QuadrotorPlant()), np.pi / 2 * np.eye(12)[4]
     problem = dd.Problem(quadrotor, x0=x0, x_goal=np.zeros(12), num_steps=10, horizon=1.0)
     assert "not finite" in dd.solve(problem, method="collocation", restarts=0).message
+
+
+def test_a_search_that_ends_at_an_acceptable_level_is_finished_by_differences(monkeypatch):
+    monkeypatch.setattr(program, "OPTIONS", program.OPTIONS | {"ipopt.acceptable_tol": 1.0})  # after 15 iterations
+    lift = 0.775 * 9.81 / 4  # the input of a rotor at hover
+    problem = dd.Problem(
+        dd.Dynamics.from_system(QuadrotorPlant()),
+        x0=np.zeros(12),
+        x_goal=[-1.2, -0.3, 1.8, *np.zeros(9)],
+        num_steps=23,
+        horizon=2.1,
+        bounds=dd.Bounds(u_lower=np.zeros(4), u_upper=np.full(4, 4.0)),
+        running_cost=lambda x, u: sum((v - lift) ** 2 for v in u),
+    )
+    solution = dd.solve(problem, restarts=0)
+    assert solution.success, solution.message
+    assert "Hessian by differences" in solution.options["derivatives"]
+    assert [i.dual_infeasibility for i in solution.iterations][-1] <= 1e-6  # 1e-8 in scaled variables

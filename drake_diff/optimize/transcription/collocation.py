@@ -649,6 +649,12 @@ def solve_program(
         result = solve_ipopt(program, guess, limits.after(start), report, exact=not why, **options)
     elif usable:
         result = replace(result, message=f"{result.message}, from the guess's multipliers")
+    if why and result.outcome is Outcome.INACCURATE:  # the limited-memory Hessian converges slowly near the end
+        options |= {"multipliers": result.multipliers, "more": None}
+        finer = solve_ipopt(program, result.z, limits.after(start), report, exact=True, **options)
+        if finer.outcome is Outcome.SOLVED:
+            finer = replace(finer, iterations=(*result.iterations, *finer.iterations))
+            return finer, f"{derivatives}; at the end a Hessian by differences"
     if not why and result.message == NOT_FINITE:
         again = solve_ipopt(program, guess, limits, report, exact=False, **options)
         if again.message != NOT_FINITE:  # the Hessian was not finite
