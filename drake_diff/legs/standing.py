@@ -47,7 +47,7 @@ AT_REST = 1e-7  # [rad/s or m/s] largest velocity after a step
 SINK, RELAXES, DISSIPATION, NEAR_RIGID = 0.0625, 2.5, 0.5, 0.1  # DISSIPATION is in s/m
 FIRST_SINK = 1e-4  # [m] least initial depth, because a sole in the air has no derivative
 # A motion from rest to rest.
-DURATIONS, HOLDING = (0.6, 1.0), 0.2  # [s] of the motion, and of holding its end
+DURATIONS, HOLDING = (0.6, 1.0, 2.0), 0.5  # [s] of the motion, and of holding its end
 SIZES = ((1.0, 1.0), (1.0, 0.2), (0.5, 0.2), (0.25, 0.1), (0.12, 0.0))  # factors on a random shift of base and arms
 TURNED, SHIFTED, LOWERED = 0.1, 0.06, 0.12  # of the base: [rad], and fractions of the centre of mass's height
 MOVED = 0.1  # fraction of a joint's range, for joints outside the legs
@@ -371,14 +371,20 @@ def _shift_to(
 ) -> Shift | Refusal:
     """Return a motion from rest to the posture nearest to a wish, with fixed feet and the targets `others`."""
     q0 = start.x[: legs.model.nq]
-    feet = legs.points_in(q0)
-    targets = [*legs.at(feet, ON_GROUND, rolls=range(len(feet))), *others]
-    q = inverse_kinematics(legs.model, q0, targets, wish, lower, upper)
-    off = max(miss(legs.model, targets), -float(np.min(legs.on_lowest(q).points_in(q)[:, 2])))
-    if off > FEET_STAY:
+    feet, q, soles = legs.points_in(q0), q0, legs
+    for _ in range(ROUNDS):  # a foot of several spheres rolls from one to the next
+        targets = [*soles.at(feet, ON_GROUND, rolls=range(len(feet))), *others]
+        q = inverse_kinematics(legs.model, q, targets, wish, lower, upper)
+        off, soles = miss(legs.model, targets), soles.on_lowest(q)
+        low = soles.points_in(q)
+        off = max(off, -float(np.min(low[:, 2])))
+        if off <= FEET_STAY:
+            break
+        feet = np.column_stack([low[:, :2], feet[:, 2]])
+    else:
         return Refusal(f"the feet would have to move by {off:.2g} m")
-    stance = hold(legs, q)
-    end = stance if isinstance(stance, Refusal) else settled(legs, stance)
+    stance = hold(soles, q)
+    end = stance if isinstance(stance, Refusal) else settled(soles, stance)
     if isinstance(end, Refusal):
         return end
     why, nq = Refusal(""), legs.model.nq
@@ -406,11 +412,18 @@ def _between(legs: Legs, start: Rest, end: Rest, duration: float) -> Shift | Ref
     q0, q1 = start.x[: model.nq], end.x[: model.nq]
     s = smooth(np.linspace(0, 1, moving + 1))
     feet = [legs.points_in(q) for q in (q0, q1)]  # round ones roll as the legs turn
+    ground = [legs.on_lowest(q).points_in(q)[:, 2] for q in (q0, q1)]
     way, unit, qs = legs.apart(q1, q0), np.full(model.nv, ALONG), [q0]
     for fraction in s[1:-1]:
-        targets = legs.at(feet[0] + fraction * (feet[1] - feet[0]), STILL)
-        wish = Wish(legs.moved(q0, fraction * way), unit)
-        qs.append(inverse_kinematics(model, qs[-1], targets, wish, legs.lower, legs.upper))
+        places, height = ((1 - fraction) * first + fraction * last for first, last in (feet, ground))
+        wish, q = Wish(legs.moved(q0, fraction * way), unit), qs[-1]
+        for _ in range(ROUNDS):
+            q = inverse_kinematics(model, q, legs.at(places, STILL), wish, legs.lower, legs.upper)
+            gap = legs.on_lowest(q).points_in(q)[:, 2] - height
+            if np.max(np.abs(gap)) <= ON_GROUND:
+                break
+            places[:, 2] -= gap
+        qs.append(q)
     qs += [q1] * (holding + 1)
     v = [np.zeros(model.nv)] + [legs.apart(b, a) / h for a, b in pairwise(qs)]
     xs = np.array([np.concatenate([q, speed]) for q, speed in zip(qs, v, strict=True)])
@@ -418,7 +431,9 @@ def _between(legs: Legs, start: Rest, end: Rest, duration: float) -> Shift | Ref
     for k in range(moving + 1):
         change = v[k + 1] - v[k]
         set_state(model.double, xs[k])
-        stance = hold(legs, qs[k], model.double.inverse_dynamics(change / h) + model.double.damping() * change)
+        stance = hold(
+            legs.on_lowest(qs[k]), qs[k], model.double.inverse_dynamics(change / h) + model.double.damping() * change
+        )
         if isinstance(stance, Refusal):
             return Refusal(f"along the motion, {stance.reason}")
         us.append(stance.u)

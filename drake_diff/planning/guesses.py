@@ -104,6 +104,15 @@ def read_goals(model: Model, goals: Mapping[str, Any], avoid: Sequence[Obstacle]
     return Goals(places, angles, tuple(avoid))
 
 
+def check_frames_move(robot: Robot, frames: Mapping[str, Array]) -> None:
+    """Raise InputError if a frame with a goal belongs to a floating base that a repair fixed, with the reason."""
+    plant, why = robot.model.plant, "; ".join(repair for repair in robot.repairs if "base='weld'" in repair)
+    fixed = {int(body.index()) for body in plant.GetBodiesWeldedTo(plant.world_body())}
+    for name in frames:
+        if why and int(frame_named(plant, "goal", name).body().index()) in fixed:
+            raise InputError(f"goal {name}", got=why, expected="a frame that moves")
+
+
 def recorded_plan(
     path: Path, model: Model, goals: Mapping[str, Any], avoid: Sequence[Obstacle]
 ) -> tuple[Problem, Array, Array]:

@@ -36,6 +36,7 @@ from drake_diff.planning.guesses import (
     Space,
     along,
     by_controller,
+    check_frames_move,
     flight,
     flown,
     lines,
@@ -195,34 +196,26 @@ def plan(
         check_place(Path(out).resolve())  # before the planning, which takes minutes
     with warnings.catch_warnings(), ExitStack() as stack:
         warnings.simplefilter("ignore", ModelWarning)
-        folders: list[Path] = []
-        weld = "the search for the least time excludes contact" if time else ""
-        for _ in range(2):
-            note("load", path.name)
-            ready = load_robot(path, seed, weld, packages)
-            if not folders:
-                directory = Path(out) if out is not None else Path("artifacts") / f"plan_{ready.model.name}"
-                folders.append(stack.enter_context(written_whole(directory)))
-            note("audit", str(ready.model))
-            findings = tuple(audit(ready.model))
-            note("guess", f"{len(findings)} finding{'s' * (len(findings) != 1)}")
-            task = read_goals(ready.model, goals or {}, avoid)
-            try:
-                attempts = (attempt.restarted(restarts) for attempt in _attempts(ready, task, time, seed))
-                tried, solutions, apart = _first_that_holds(attempts, note, partial(_keep, folder=folders[0]))
-            except ModelError as error:
-                if ready.standing is None:
-                    raise
-                tried, solutions, apart = [str(error)], [], False
-            if apart or ready.standing is None or (solutions and solutions[-1].status is Status.INTERRUPTED):
-                break
-            weld = f"no plan with its feet on the ground was verified: {'; '.join(tried)}"
+        note("load", path.name)
+        ready = load_robot(path, seed, packages)
+        if time and ready.standing is not None:
+            got = f"{time!r} for a robot that stands on its feet"
+            raise InputError("time", got=got, expected="None: the search for the least time excludes contact")
+        directory = Path(out) if out is not None else Path("artifacts") / f"plan_{ready.model.name}"
+        folder = stack.enter_context(written_whole(directory))
+        note("audit", str(ready.model))
+        findings = tuple(audit(ready.model))
+        note("guess", f"{len(findings)} finding{'s' * (len(findings) != 1)}")
+        task = read_goals(ready.model, goals or {}, avoid)
+        check_frames_move(ready, task.frames)
+        attempts = (attempt.restarted(restarts) for attempt in _attempts(ready, task, time, seed))
+        tried, solutions, apart = _first_that_holds(attempts, note, partial(_keep, folder=folder))
         if not solutions:
             raise ModelError(f"{path}: no plan could be tried: {'; '.join(tried) or NOTHING}")
         best = solutions[-1] if apart else min(solutions, key=lambda s: s.defect + s.goal_error)
         note("save", best.status.value)
-        with plan_kept(best, directory.name, folders[0]):
-            record = write_run(best, folders[0], meshes=meshes)
+        with plan_kept(best, directory.name, folder):
+            record = write_run(best, folder, meshes=meshes)
         if best.status is Status.INTERRUPTED and is_taken(directory):
             raise KeyboardInterrupt  # the new run stays next to the earlier run
         stack.close()  # moves the run to its directory

@@ -110,17 +110,16 @@ class _Draft:
         self.mend(f"{why}: fixed (fix_joints)", fix_joints=fixed)
 
 
-def load_robot(path: Path, seed: int, weld: str = "", packages: Mapping[str, str | Path] | None = None) -> Robot:
+def load_robot(path: Path, seed: int, packages: Mapping[str, str | Path] | None = None) -> Robot:
     """Load a robot file and repair it if necessary; raise ModelError if nothing in it can be driven.
 
-    A floating robot that can stand on its feet does so, unless `weld` is a reason to weld it to the world. `packages`
-    are the folders of packages by name.
+    A floating robot that can stand on its feet does so. `packages` are the folders of packages by name.
     """
     draft = _Draft(path, {"time_step": TIME_STEP, "packages": packages})
     _reduce_followers(draft)
     _add_motors(draft)
     if draft.model.plant.GetFloatingBaseBodies() and joints(draft.model.plant):
-        standing = Refusal(weld) if weld else _standing(draft, seed)
+        standing = _standing(draft, seed)
         if isinstance(standing, Robot):
             return standing
         _weld_base(draft, standing)
@@ -249,7 +248,7 @@ def _standing(read: _Draft, seed: int) -> Robot | Refusal:
         if model.nv > MANY and isinstance(derivatives, Refusal):
             return Refusal(f"the derivatives of {model.nv} velocities in contact would take minutes: {derivatives}")
         lower, upper = ranges(model)
-        stance = stand(model, lower, upper)
+        stance = stand(model, *ranges(model, np.pi))  # legs may bend further than random postures
         if isinstance(stance, Refusal):
             return Refusal(f"it cannot stand: {stance}")
         shapes = draft.read(ground=None, contact=True)
@@ -430,11 +429,14 @@ def shares(model: Model, efforts: Array) -> Array:
     return np.asarray(np.abs(efforts) / np.where((limits > 0) & np.isfinite(limits), limits, np.inf))
 
 
-def ranges(model: Model) -> tuple[Array, Array]:
-    """Return (lower, upper) (nq,): each coordinate's limits, or a range around 0 if it is unlimited or very wide."""
+def ranges(model: Model, turn: float = TURN) -> tuple[Array, Array]:
+    """Return (lower, upper) (nq,): each coordinate's limits, or a range around 0 if it is unlimited or very wide.
+
+    That range is `turn` [rad] to each side for an angle.
+    """
     lower = np.array([p.lower for p in model.contract.positions], dtype=float)
     upper = np.array([p.upper for p in model.contract.positions], dtype=float)
-    reach = np.array([SHIFT if p.unit == "m" else TURN for p in model.contract.positions])
+    reach = np.array([SHIFT if p.unit == "m" else turn for p in model.contract.positions])
     wide = upper - lower > WIDEST  # true also without limits
     low = np.where(wide, np.maximum(lower, -reach), lower)
     high = np.where(wide, np.minimum(upper, reach), upper)

@@ -9,7 +9,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 import drake_diff as dd
 from drake_diff._base.values import Refusal
-from drake_diff.exceptions import InputError
+from drake_diff.exceptions import InputError, ModelError
 from drake_diff.legs.feet import Legs, find_feet
 from drake_diff.legs.standing import Shift, hold, shift_to, stand, standing_posture
 from drake_diff.model.contact import contacts_of_the_step
@@ -230,3 +230,37 @@ def test_solo12_lowers_its_trunk_with_its_feet_on_the_ground(tmp_path):
     assert trunk[0] - trunk[1] > 0.003  # the trunk is lowered
     assert trunk[2] == pytest.approx(trunk[1], abs=1e-3)
     assert np.max(np.abs(motion.xs[-1][model.nq :])) < 0.05  # [rad/s, m/s] at rest
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["go2.urdf", "solo12.urdf"])
+def test_a_trunk_goes_where_it_is_asked_to(name, tmp_path):
+    """The feet of go2 are meshes of many spheres, from one of which to the next they roll. Solo12 has no joint limits.
+
+    The trunk is lowered by 15 % and moved by 5 % of its height.
+    """
+    file = robot_file(name)
+    start = load_robot(file, 0)
+    plant, q = start.model.plant, start.standing[1].x[: start.model.nq]
+    (base,) = plant.GetFloatingBaseBodies()
+    context, trunk = plant.CreateDefaultContext(), plant.get_body(base)
+    plant.SetPositions(context, q)
+    goal = trunk.EvalPoseInWorld(context).translation() * [1, 1, 0.85]
+    goal[:2] += 0.05 * goal[2]
+    done = plan(file, goals={trunk.name(): goal.tolist()}, out=tmp_path / "out")
+    assert done.success, done.lines
+    assert len(done.model.plant.GetFloatingBaseBodies()) == 1
+    plant.SetPositions(context, done.solution.xs[-1][: start.model.nq])
+    assert trunk.EvalPoseInWorld(context).translation() == pytest.approx(goal, abs=1e-3)
+
+
+def test_a_base_that_was_fixed_and_a_least_time_on_feet_are_refused_with_the_reason(tmp_path):
+    """The planner does not fix a trunk to reach its goal."""
+    file = robot_file("simple_humanoid.urdf")
+    with pytest.raises(InputError, match=r"goal base_link.*it cannot stand"):
+        plan(file, goals={"base_link": [0, 0, 0.5]}, out=tmp_path / "out")
+    with pytest.raises(InputError, match=r"time.*on its feet"):
+        plan(robot_file("solo12.urdf"), time="least", out=tmp_path / "out")
+    with pytest.raises(ModelError, match=r"no other posture.*the feet would have to move"):
+        plan(robot_file("solo12.urdf"), goals={"base_link": [0, 0, 3.0]}, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
