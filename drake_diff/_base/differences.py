@@ -9,7 +9,7 @@ from drake_diff._base.arrays import Array
 
 Function = Callable[[Array], Array]
 Many = Callable[[Array], Array]  # displacements (K, n) -> values (K, m)
-Difference = Callable[[Array, Array], Array]
+Difference = Callable[[Array, Array], Array]  # (..., m) and (m,) or (..., m) -> (..., n)
 
 RATIO_SQUARED = 10.0  # squared ratio of neighbouring steps, which are half a decade apart
 SWEEP = tuple(10.0 ** (-k / 2) for k in range(4, 12))  # 1e-2 ... 3e-6
@@ -44,7 +44,7 @@ def sweep_of(f: Many, size: int, steps: Sequence[float], *, minus: Difference = 
     sides = np.stack([h * np.eye(size), -h * np.eye(size)])  # (2, s, n, n)
     values = np.asarray(f(np.vstack([np.zeros((1, size)), sides.reshape(-1, size)])), dtype=float)
     centre = values[0]
-    apart = values[1:] - centre if minus is np.subtract else np.array([minus(v, centre) for v in values[1:]])
+    apart = minus(values[1:], centre)
     rows = len(minus(centre, centre))
     ahead, behind = apart.reshape(2, len(steps), size, rows).swapaxes(2, 3) / h
     return Sweep(centre, ahead, -behind)
