@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff.certificates.truth import overlaps_along
 from drake_diff.comparison.recordings import CLOCK_TOLERANCE
 from drake_diff.exceptions import DrakeDiffError, SimulationError
 from drake_diff.identification.candidates import Ranking, Tried
@@ -55,12 +56,9 @@ def may_touch(model: Model, pieces: Sequence[Excerpt]) -> bool:
     lower = [model.position_names.index(name) for name in _heights(model)]
     radii = {p.name: p.value for p in list_parameters(model) if p.name.endswith(".radius") and "/" not in p.name}
     with applied(select(model, {name: LARGER * value for name, value in radii.items()})) as larger:
-        for x in (x for p in pieces for x in guess_states(model, p, np.arange(len(p.times)))):
-            x[lower] -= HEIGHT
-            set_state(larger.double, x)
-            if larger.double.overlaps():
-                return True
-    return False
+        states = np.concatenate([guess_states(model, piece, np.arange(len(piece.times))) for piece in pieces])
+        states[:, lower] -= HEIGHT
+        return any(overlaps_along(larger, states))
 
 
 class FitStage(NamedTuple):

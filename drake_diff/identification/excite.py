@@ -16,6 +16,7 @@ from scipy.optimize import linprog
 
 from drake_diff._base.arrays import Array, frozen, positive_float, positive_int
 from drake_diff._base.values import Refusal, ShowsItsRepr
+from drake_diff.certificates.truth import overlaps_along
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.identification.fit import Fit, growth_cuts
@@ -27,7 +28,6 @@ from drake_diff.identification.tree import ORDER_4, Tree, TreeDynamics, numbers_
 from drake_diff.identification.unknowns import FAR, Unknowns, choose_unknowns
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
-from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
 
 NOISE = 1e-3  # [rad] or [m] default standard deviation of positions
@@ -397,13 +397,7 @@ class _Design:
         return None
 
     def touches(self, xs: Array) -> bool:
-        if not self.model.contract.contact.collision_pairs:
-            return False
-        for x in xs:
-            set_state(self.model.double, x)
-            if self.model.double.overlaps():
-                return True
-        return False
+        return any(overlaps_along(self.model, xs))
 
     def feasible(self, c: Array) -> tuple[Array, Array] | None:
         """Return the motion, scaled down a little if needed, if it is within all limits at every sample."""

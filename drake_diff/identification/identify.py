@@ -10,6 +10,7 @@ from scipy import stats
 
 from drake_diff._base.arrays import Array, frozen, positive_int
 from drake_diff._base.values import Refusal
+from drake_diff.certificates.truth import overlaps_along
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.identification.fit import Fit, Solved, growth_cuts
@@ -19,6 +20,7 @@ from drake_diff.identification.judge import (
     FALSE_ALARM,
     Known,
     colour_of,
+    covariance_of,
     freedom_of,
     intervals_of,
     known_of,
@@ -42,7 +44,6 @@ from drake_diff.identification.sensors import Sensors, choose_sensors
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import Unknowns, choose_unknowns
 from drake_diff.model.model import Model
-from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
 
 MOTIONS = ("auto", "continuous", "steps", "impacts")
@@ -167,11 +168,8 @@ def what_acts(model: Model, pieces: Sequence[Excerpt]) -> str:
             beyond = np.any((q < lower) | (q > upper), axis=0)
         if np.any(beyond):
             return f"{model.position_names[int(np.argmax(beyond))]} is beyond its limit"
-        if model.contract.contact.collision_pairs:
-            for x in guess_states(model, piece, np.arange(len(piece.times))):
-                set_state(model.double, x)
-                if model.double.overlaps():
-                    return TOUCH
+        if any(overlaps_along(model, guess_states(model, piece, np.arange(len(piece.times))))):
+            return TOUCH
     return ""
 
 
@@ -294,16 +292,11 @@ class Problem:
         freedom = freedom_of(fit, solved)
         known = known_of(unknowns, z, solved.reduced.R)
         intervals = intervals_of(unknowns, z, known.covariance, freedom.left)
-        values, by_z = unknowns.values(z), unknowns.by_z(z)
         before, after, why_not, motions = self._predicted(fit, solved, known, freedom.left)
         reason = self.doubt(fit, solved, why_not)
-        lost = ~np.isfinite(np.diag(known.covariance))
-        covariance = by_z @ np.where(np.isfinite(known.covariance), known.covariance, 0.0) @ by_z.T
-        hidden = np.any(by_z[:, lost] != 0, axis=1)
-        covariance[hidden, hidden] = np.inf
         return identification(
             unknowns,
-            values,
+            unknowns.values(z),
             intervals,
             open_=unidentifiable(unknowns, z, known.open),
             errors=(before, after),
@@ -311,7 +304,7 @@ class Problem:
             noise={n: float(s) for n, s in zip(self.entries, fit.noise, strict=True) if np.isfinite(s)},
             residuals=tuple(frozen(r) for r in solved.reduced.residuals),
             entries=self.entries,
-            covariance=frozen(covariance),
+            covariance=frozen(covariance_of(unknowns, z, known.covariance)),
             score=score_of(fit, solved),
             count=freedom.numbers,
             converged=solved.converged,

@@ -23,6 +23,7 @@ import numpy as np
 from scipy import stats
 
 from drake_diff._base.arrays import Array, frozen, positive_float
+from drake_diff.certificates.truth import overlaps_along
 from drake_diff.comparison.recordings import CLOCK_TOLERANCE, Recording
 from drake_diff.derivatives.step import derivatives_along
 from drake_diff.exceptions import InputError, SimulationError
@@ -34,7 +35,7 @@ from drake_diff.identification.unknowns import BIAS, CENTER, INERTIA, STRENGTH, 
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
-from drake_diff.model.step import advance, set_state
+from drake_diff.model.step import advance
 from drake_diff.model.tangent import TangentSpace, tangent_space
 
 LEAST = 6  # minimum number of samples of a flight, which must determine a velocity
@@ -46,11 +47,7 @@ def flights_of(model: Model, xs: Array) -> list[tuple[int, int]]:
     """Return the first and last sample of each part of xs (n, nx) without contact."""
     if not model.contract.contact.collision_pairs:
         return [(0, len(xs) - 1)]
-    touching = np.zeros(len(xs), dtype=bool)
-    for k, x in enumerate(xs):
-        set_state(model.double, x)
-        touching[k] = model.double.overlaps()
-    edges = np.flatnonzero(np.diff(np.concatenate([[1], touching.astype(int), [1]])))
+    edges = np.flatnonzero(np.diff(np.array([True, *overlaps_along(model, xs), True], dtype=int)))
     flights = []
     for first, end in edges.reshape(-1, 2):
         a, b = first + CLEAR * (first > 0), end - 1 - CLEAR * (end < len(xs))
