@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_diff._base.arrays import MOST_STEPS, Array, array_with_gaps, finite_array
-from drake_diff.comparison.recordings import Recording, check_sizes, read_recording
+from drake_diff._base.arrays import MOST_STEPS, Array, array_with_gaps
+from drake_diff.comparison.recordings import Recording, check_sizes, checked_motion, read_recording
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
@@ -133,19 +133,8 @@ def columns_of(recordings: Sequence[Recording]) -> tuple[str, ...]:
 
 def _checked(recording: Recording, model: Model, columns: Sequence[str]) -> Excerpt:
     subject = f"recording {recording.name}"
-    times = finite_array(f"{subject}: times", recording.times, ("n",))
-    if len(times) < LEAST:
-        raise InputError(f"{subject}: samples", got=len(times), expected=f"{LEAST} or more")
-    if np.any(np.diff(times) <= 0):
-        k = int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1
-        raise InputError(
-            f"{subject}: time of sample {k}", got=f"{times[k]} s", expected="a time after the previous sample"
-        )
-    ys = np.array(array_with_gaps(f"{subject}: xs", recording.xs, (len(times), model.nx)))
-    us = finite_array(f"{subject}: us", recording.us, (len(times) - 1, model.nu))
-    check_sizes(f"{subject}: times", times[:, None], ["s"])
-    check_sizes(f"{subject}: xs", ys, model.state_names)
-    check_sizes(f"{subject}: us", us, model.input_names)
+    times, xs, us = checked_motion(recording, model, least=LEAST, gaps=True)
+    ys = np.array(xs)
     if times[-1] - times[0] > MOST_STEPS * model.time_step:
         k = int(np.argmax(np.diff(times)))
         got = f"{times[-1] - times[0]:.6g} s, with {times[k + 1] - times[k]:.6g} s between samples {k} and {k + 1}"
