@@ -13,6 +13,7 @@ Difference = Callable[[Array, Array], Array]  # (..., m) and (m,) or (..., m) ->
 
 RATIO_SQUARED = 10.0  # squared ratio of neighbouring steps, which are half a decade apart
 SWEEP = tuple(10.0 ** (-k / 2) for k in range(4, 12))  # 1e-2 ... 3e-6
+TINY = 1e-30  # size of a complex step
 ROUNDING = 1e-15  # relative rounding error in double precision: a few units in the last place
 
 
@@ -27,6 +28,12 @@ def central_differences(
     centre = f(np.zeros(size)) if at_zero is None else at_zero
     columns = [(minus(f(step * e), centre) - minus(f(-step * e), centre)) / (2 * step) for e in np.eye(size)]
     return np.array(columns).reshape(size, len(minus(centre, centre))).T
+
+
+def complex_steps(f: Function, z: Array) -> Array:
+    """Return the derivative (m, n) of an analytic function of z (n,), exact to rounding."""
+    columns = [np.imag(f(z + 1j * TINY * e)) / TINY for e in np.eye(len(z))]
+    return np.array(columns, dtype=float).T if columns else np.zeros((len(f(z)), 0))
 
 
 @dataclass(frozen=True)
