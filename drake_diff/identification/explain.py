@@ -38,9 +38,6 @@ from drake_diff.identification.unknowns import DELAY, LIMIT
 from drake_diff.model.model import Model
 
 BESIDE, LOOKED_AT_BESIDE = 3, 4  # number of first changes of pairs, and number of second changes for each
-DELAYS_SEEN, NEAR = 4, 0.02  # maximum number of linearizations at delays; relative change of the delay that ends them
-BEHIND = 4.0  # times the best prediction: worse candidates are tried only among the first LOOKED_AT_BESIDE
-SHORTEST_DELAY = 1e-4  # [s] least delay of a pair
 TIME_STEP = "model.time_step"
 MOTIONS = ("auto", "continuous")
 Search = Callable[[], list[Tried]]
