@@ -35,8 +35,8 @@ from drake_diff.identification.unknowns import BIAS, CENTER, INERTIA, STRENGTH, 
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
-from drake_diff.model.step import advance
 from drake_diff.model.tangent import TangentSpace, tangent_space
+from drake_diff.motion.rollout import roll_states
 
 LEAST = 6  # minimum number of samples of a flight, which must determine a velocity
 CLEAR = 1  # samples between a flight and a sample at which shapes overlap
@@ -367,15 +367,12 @@ class ImpactSearch:
         with applied(self.vector(w)) as model:
             for segment in segments:
                 piece = self.pieces[segment.piece].part(segment.first, segment.last)
-                x, xs = segment.x0 - shift, np.full((len(piece.us), self.model.nx), np.nan)
+                stride = steps_between(model, piece)
                 try:
-                    for k, u in enumerate(piece.us):
-                        for _ in range(steps_between(model, piece)):
-                            x = advance(model.double, x, u)
-                        xs[k] = x + shift
+                    xs = roll_states(model, segment.x0 - shift, np.repeat(piece.us, stride, axis=0))[stride::stride]
                 except SimulationError:
-                    xs[:] = np.nan
-                motions.append(xs)
+                    xs = np.full((len(piece.us), self.model.nx), np.nan)
+                motions.append(xs + shift)
         return motions
 
     def residual(self, w: Array, segments: Sequence[Segment]) -> Array:
