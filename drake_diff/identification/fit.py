@@ -259,11 +259,7 @@ class Fit:
     def _bias_columns(self) -> list[tuple[int, int]]:
         """Return (column of z, entry of a tangent vector) for each bias."""
         names = (*self.space.names, *self.sensors.columns)
-        return [
-            (s.start, names.index(unknown.label))
-            for unknown, s in zip(self.unknowns.each, self.unknowns.slices, strict=True)
-            if unknown.quantity == BIAS
-        ]
+        return [(s.start, names.index(u.label)) for u, s in self.unknowns.items() if u.quantity == BIAS]
 
     def _pull(self, z: Array) -> float:
         weak = np.sum(((z - self.unknowns.z_start) / self.unknowns.pulls) ** 2)

@@ -88,7 +88,7 @@ def intervals_of(unknowns: Unknowns, z: Array, covariance: Array, freedom: float
     t = float(stats.t.ppf((1 + CONFIDENCE) / 2, max(freedom, 1.0)))
     values, spread = unknowns.values(z), deviations_of(unknowns, z, covariance)
     intervals = np.empty((len(z), 2))
-    for unknown, s in zip(unknowns.each, unknowns.slices, strict=True):
+    for unknown, s in unknowns.items():
         if unknown.quantity == MASS:
             wide = t * spread[s] / values[s]
             with np.errstate(over="ignore"):

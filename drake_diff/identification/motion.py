@@ -413,7 +413,6 @@ def discrete_motion(model: Model, unknowns: Unknowns, pieces: Sequence[Excerpt])
     h = period / max(1, round(period / model.time_step))
     if abs(h - model.time_step) > CLOCK_TOLERANCE * model.time_step:
         model = model.at_time_step(h)
-    parameters = [unknown for unknown in unknowns.each if unknown.quantity != BIAS]
-    places = [s for unknown, s in zip(unknowns.each, unknowns.slices, strict=True) if unknown.quantity != BIAS]
-    entries = np.concatenate([np.arange(s.start, s.stop) for s in places]) if places else np.zeros(0, dtype=int)
-    return DiscreteMotion(model, unknowns, select(model, [unknown.name for unknown in parameters]), entries)
+    parameters = {unknown.name: s for unknown, s in unknowns.items() if unknown.quantity != BIAS}
+    entries = [i for s in parameters.values() for i in range(s.start, s.stop)]
+    return DiscreteMotion(model, unknowns, select(model, list(parameters)), np.array(entries, dtype=int))
