@@ -99,7 +99,7 @@ class ContactExplanation(Ranking):
         end = None  # unchanged model from the first states of the best change, which may give smaller residuals
         if explaining:
             starts = min(explaining, key=self.bic).starts
-            end = self.to_end(NOTHING, len(self.stages) - 1, np.zeros(0), starts)
+            end = self.to_end(len(self.stages) - 1, starts)
         again = [] if end is None else [self.judged((), NOTHING, end)]
         none = [candidate for candidate in explaining if self.is_nothing(candidate)]
         base = min([base, *again], key=lambda fitted: fitted.score)
@@ -186,9 +186,9 @@ class ContactExplanation(Ranking):
         best = sorted((point for point in points if point is not None), key=lambda point: point.value)
         return [point.starts for point in best[:BEST]]
 
-    def to_end(self, unknowns: Unknowns, first: int, z: Array, starts: Array | None) -> FitStage | None:
-        """Return the fit of the last stage, or None if the change does not reach the end of the recordings."""
-        stages = list(self.stages_of(unknowns, first, z, starts))
+    def to_end(self, first: int, starts: Array | None) -> FitStage | None:
+        """Return the last stage of the unchanged model, or None if it does not reach the end of the recordings."""
+        stages = list(self.stages_of(NOTHING, first, np.zeros(0), starts))
         return stages[-1] if stages and stages[-1].stage == len(self.stages) - 1 else None
 
     def first_points(self, begin: FitStage) -> Iterator[tuple[Unknown, list[FittedMotion]]]:
@@ -234,7 +234,7 @@ class ContactExplanation(Ranking):
     def unchanged(self, pieces: Sequence[Excerpt]) -> tuple[float, bool]:
         """Return (score, whether it explains) of the unchanged model on other pieces."""
         other = ContactExplanation(self.model, list(pieces), self.stated)
-        end = other.to_end(NOTHING, 0, np.zeros(0), None)
+        end = other.to_end(0, None)
         base = None if end is None else other.judged((), NOTHING, end)
         return (np.inf, False) if base is None else (base.score, base.explains)
 

@@ -62,9 +62,9 @@ class Start(NamedTuple):
     x: Array  # (nx,)
     spread: Array  # (2 nv, k): tangent vectors at x, of one standard deviation each
 
-    def others(self, space: TangentSpace, count: int, random: np.random.Generator) -> list[Array]:
+    def others(self, space: TangentSpace, random: np.random.Generator) -> list[Array]:
         """Draw first states (nx,) that agree with the same positions."""
-        return [space.plus(self.x, self.spread @ random.standard_normal(self.spread.shape[1])) for _ in range(count)]
+        return [space.plus(self.x, self.spread @ random.standard_normal(self.spread.shape[1])) for _ in range(OTHERS)]
 
 
 def start_of(model: Model, piece: Excerpt, scale: Array) -> Start:
@@ -550,7 +550,7 @@ def _predicted(search: ImpactSearch, w: Array, noise: Array) -> tuple[list[Array
     """Return the motion (n, nx) of each recording, and residuals (n, 2 nv) in units of their noise; NaN for v."""
     starts, random, nv = search.starts(w, noise), np.random.default_rng(SEED), search.model.nv
     xs = search.recordings(w, [start.x for start in starts])
-    others = [start.others(search.space, OTHERS, random) for start in starts]
+    others = [start.others(search.space, random) for start in starts]
     squares = [np.zeros((len(x), 2 * nv)) for x in xs]
     for k in range(OTHERS):
         for square, other, x in zip(squares, search.recordings(w, [draws[k] for draws in others]), xs, strict=True):
