@@ -254,7 +254,7 @@ def checked_motion(recording: Recording, model: Model, *, least: int = 2, gaps: 
     subject = f"recording {recording.name}"
     times = finite_array(f"{subject}: times", recording.times, ("n",))
     if len(times) < least:
-        raise InputError(f"{subject}: times", got=f"{len(times)}", expected=f"{least} or more")
+        raise InputError(f"{subject}: samples", got=len(times), expected=f"{least} or more")
     for k in np.flatnonzero(np.diff(times) <= 0)[:1] + 1:
         before = f"more than {times[k - 1]} s, the time of the sample before"
         raise InputError(f"{subject}: time of sample {k}", got=f"{times[k]} s", expected=before)
