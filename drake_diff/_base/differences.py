@@ -9,10 +9,11 @@ from drake_diff._base.arrays import Array
 
 Function = Callable[[Array], Array]
 Many = Callable[[Array], Array]  # displacements (K, n) -> values (K, m)
-Difference = Callable[[Array, Array], Array]
+Difference = Callable[[Array, Array], Array]  # (..., m) and (m,) or (..., m) -> (..., n)
 
 RATIO_SQUARED = 10.0  # squared ratio of neighbouring steps, which are half a decade apart
 SWEEP = tuple(10.0 ** (-k / 2) for k in range(4, 12))  # 1e-2 ... 3e-6
+TINY = 1e-30  # size of a complex step
 ROUNDING = 1e-15  # relative rounding error in double precision: a few units in the last place
 
 
@@ -27,6 +28,12 @@ def central_differences(
     centre = f(np.zeros(size)) if at_zero is None else at_zero
     columns = [(minus(f(step * e), centre) - minus(f(-step * e), centre)) / (2 * step) for e in np.eye(size)]
     return np.array(columns).reshape(size, len(minus(centre, centre))).T
+
+
+def complex_steps(f: Function, z: Array) -> Array:
+    """Return the derivative (m, n) of an analytic function of z (n,), exact to rounding."""
+    columns = [np.imag(f(z + 1j * TINY * e)) / TINY for e in np.eye(len(z))]
+    return np.array(columns, dtype=float).T if columns else np.zeros((len(f(z)), 0))
 
 
 @dataclass(frozen=True)
@@ -44,7 +51,7 @@ def sweep_of(f: Many, size: int, steps: Sequence[float], *, minus: Difference = 
     sides = np.stack([h * np.eye(size), -h * np.eye(size)])  # (2, s, n, n)
     values = np.asarray(f(np.vstack([np.zeros((1, size)), sides.reshape(-1, size)])), dtype=float)
     centre = values[0]
-    apart = values[1:] - centre if minus is np.subtract else np.array([minus(v, centre) for v in values[1:]])
+    apart = minus(values[1:], centre)
     rows = len(minus(centre, centre))
     ahead, behind = apart.reshape(2, len(steps), size, rows).swapaxes(2, 3) / h
     return Sweep(centre, ahead, -behind)

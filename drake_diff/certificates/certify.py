@@ -333,7 +333,7 @@ class StepAround:
 
     def _changes(self, ends: Ends, displacements: Array) -> Array:
         x_next, _ = ends(np.vstack([np.zeros((1, len(self.scale))), displacements]))
-        return np.array([self.space.minus(end, x_next[0]) for end in x_next[1:]])
+        return self.space.minus(x_next[1:], x_next[0])
 
 
 Ends = Callable[[Array], tuple[Array, float]]

@@ -99,21 +99,17 @@ def look_around(
     sweep = sweep_of(f, n, DIFFERENCES.steps, minus=minus)
     centre, ahead = sweep.centre, sweep.forward
     rows, direction = ahead.shape[1], line(n)
-
-    def apart(some: Array) -> Array:
-        return some - centre if minus is np.subtract else np.array([minus(value, centre) for value in some])
-
     size = np.abs(centre) if minus is np.subtract else np.ones(rows)
-    along, rounding, by_spacing = _scattered(apart(np.asarray(f(_along(n)), dtype=float)), size)
+    along, rounding, by_spacing = _scattered(minus(np.asarray(f(_along(n)), dtype=float), centre), size)
     unknown = np.array(np.broadcast_to(unsolved, rows), dtype=float)
     if point is not None:
         unknown = np.maximum(unknown, DIFFERENCES.rounded_point * np.nan_to_num(np.abs(ahead[0])) @ np.abs(point))
     scatter = np.maximum(by_spacing[:, : DIFFERENCES.near].max(axis=(0, 1)), unknown / DIFFERENCES.safety)
     finest = np.maximum(by_spacing[:, 0].max(axis=0), unknown / DIFFERENCES.safety)
     lines = DIFFERENCES.steps[0] * np.array([line(n, seed) for seed in DIFFERENCES.seeds])
-    ends = apart(np.asarray(f(np.vstack([lines, -lines])), dtype=float)).reshape(2, len(lines), rows)
+    ends = minus(np.asarray(f(np.vstack([lines, -lines])), dtype=float), centre).reshape(2, len(lines), rows)
     products = np.abs(ends.sum(axis=0)).max(axis=0) / DIFFERENCES.steps[0] ** 2
-    stairs = _stairs(lambda t: apart(f(np.multiply.outer(t, direction))), along, by_spacing, rounding, unknown)
+    stairs = _stairs(lambda t: minus(f(np.multiply.outer(t, direction)), centre), along, by_spacing, rounding, unknown)
     return Neighbourhood(centre, size, ahead, sweep.backward, scatter, finest, products, stairs)
 
 

@@ -66,7 +66,7 @@ class LookAt:
     def taken(self, values: Array, minus: Difference = np.subtract) -> "FirstLook":
         """Evaluate the values (p, m) at the `displacements` (p, n). `minus` subtracts two values."""
         centre = values[0]
-        changes = values[1:] - centre if minus is np.subtract else np.array([minus(v, centre) for v in values[1:]])
+        changes = minus(values[1:], centre)
         small, wide, unmoved = np.split(changes, [2 * len(self.widths) * SCREEN.directions, -2])
         ahead, behind = small.reshape(2, len(self.widths), SCREEN.directions, -1) / self.widths[:, None, None]
         size = np.abs(centre) if minus is np.subtract else np.ones(changes.shape[1])

@@ -17,7 +17,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from io import BytesIO
-from itertools import pairwise
 from types import CellType, FunctionType, MethodType
 from typing import Any
 
@@ -187,8 +186,7 @@ class Displaced:
         """
         with applied(self.vector) as model:
             refined = solved(refine_steps(model, self.vector, g.xs[:-1], g.us))
-        left = [self.space.minus(*pair) for pair in zip(refined.drake, refined.x_next, strict=True)]
-        return np.array(left), float(np.max(refined.left))
+        return self.space.minus(refined.drake, refined.x_next), float(np.max(refined.left))
 
     def solved_losses(self, left: Array, displacements: Array) -> Array:
         """Return losses (K, 1) as `losses`, with every step solved to rounding and then displaced by `left` (N, size).
@@ -211,7 +209,7 @@ class Displaced:
             for k in range(count):
                 inputs[:, k] = [ask(x, k, h) for ask, x, h in zip(asks, xs[:, k], times, strict=True)]
                 refined = solved(refine_steps(model, self.vector, xs[:, k], inputs[:, k], values))
-                xs[:, k + 1] = [self.space.plus(x_next, left[k]) for x_next in refined.x_next]
+                xs[:, k + 1] = self.space.plus(refined.x_next, left[k])
         return np.array([[evaluate_loss(self.loss, *motion)] for motion in zip(xs, inputs, strict=True)])
 
     def solver_tolerance(self, g: RolloutGradient) -> float:
@@ -351,7 +349,7 @@ Jump = tuple[float, float]  # places before and after the jump
 def stairs_of_loss(loss: Loss, g: RolloutGradient, space: TangentSpace) -> str:
     """Describe the jumps of the loss near the trajectory of `g`, or return "" if the loss is not a staircase."""
     by_x = line((len(g.xs), space.size), LINE)
-    states = np.array([space.derivative_of_plus(x) @ d for x, d in zip(g.xs, by_x, strict=True)])
+    states = (space.derivative_of_plus(g.xs) @ by_x[..., None])[..., 0]
     inputs = line(g.us.shape, LINE)
 
     def along(s: float) -> float:
@@ -402,7 +400,7 @@ class _PolicyProbe:
     def switches(self) -> Iterator[str]:
         """Search switches between consecutive states, and beyond the extremes of each state."""
         xs, none = self.g.xs, np.zeros(len(policy_parameters(self.policy)))
-        steps = np.array([self.space.minus(after, x) for x, after in pairwise(xs)])
+        steps = self.space.minus(xs[1:], xs[:-1])
         moves = np.max(np.abs(steps), axis=1) > ASK.moves * np.max(np.abs(xs))
         for k in np.flatnonzero(moves).tolist():
             yield self._switch(k, np.append(steps[k], none), "to the next state")

@@ -14,7 +14,7 @@ the time limit is reached or the error of the integration hides it.
 """
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -423,16 +423,16 @@ def refine_by_time_step(moved: Displaced, gradient: RolloutGradient, truth: Trut
     values = np.array([moved.flat(gradient), *_at_finer_steps(moved)])
     levels = tuple(moved.model.time_step / m for m in REFINEMENTS)
     refinement = judge_levels(levels, moved.columns, values, moved.units)
-    return beside_truth(refinement, moved.lines, truth, touches=_overlaps(moved.model, gradient.xs))
+    return beside_truth(refinement, moved.lines, truth, touches=any(overlaps_along(moved.model, gradient.xs)))
 
 
-def _overlaps(model: Model, xs: Array) -> bool:
-    """Return whether geometries that may collide overlap in one of the states `xs` (N + 1, nx)."""
-    for x in xs if model.contract.contact.collision_pairs else ():
-        set_state(model.double, x)
-        if model.double.overlaps():
-            return True
-    return False
+def overlaps_along(model: Model, xs: Iterable[Array]) -> Iterator[bool]:
+    """Yield for each state in `xs`, each (nx,), whether geometries that may collide overlap."""
+    can_touch = bool(model.contract.contact.collision_pairs)
+    for x in xs:
+        if can_touch:
+            set_state(model.double, x)
+        yield can_touch and model.double.overlaps()
 
 
 def beside_truth(

@@ -25,7 +25,7 @@ from drake_diff.pages.html import Line, Plot, page_again, page_data, write_page
 from drake_diff.runs import other_records as records
 from drake_diff.runs.differences import Reproduced
 from drake_diff.runs.directory import name_of, written_whole
-from drake_diff.runs.fields import DataBoundary, DataUse
+from drake_diff.runs.fields import DataBoundary, DataUse, evidence
 from drake_diff.runs.other_records import ComparisonRecord
 from drake_diff.runs.provenance import (
     contract_of,
@@ -115,16 +115,14 @@ def record_of(
     fields = {
         "verdict": "pass" if comparison.holds else "fail",
         "sentence": str(comparison),
-        "states": [records.StateEvidence(name=s.name, x=s.x.tolist(), u=s.u.tolist()) for s in comparison.states],
+        "states": [evidence(records.StateEvidence, state) for state in comparison.states],
         "engines": [row_of(e, causes.get(e.engine) if e.is_recorded else None) for e in comparison.engines],
         "data": _data(comparison, causes),
         "recordings": [
-            records.RecordedEvidence(
-                name=r.name, version=r.version, facts=dict(r.facts), path=place_of(i), samples=len(r.times)
-            )
+            evidence(records.RecordedEvidence, r, facts=dict(r.facts), path=place_of(i), samples=len(r.times))
             for i, r in enumerate(_saved_recordings(comparison))
         ],
-        "refused": [records.RefusedEvidence(**vars(refused)) for refused in comparison.refused],
+        "refused": list(comparison.refused),
     }
     clocks = {
         kind: {e.engine: getattr(e, kind) for e in comparison.engines}
@@ -172,39 +170,32 @@ def hash_of_arrays(*arrays: Array) -> str:
 
 def row_of(e: Compared, cause: records.CauseEvidence | None) -> records.EngineEvidence:
     """Return the record's entry for an engine or a recording."""
-    same = ("engine", "version", "precision", "verdict", "sentence", "final_gap", "rollout_gap", "gradient")
-    return records.EngineEvidence(
-        **{name: getattr(e, name) for name in same}, contract=[records.LineEvidence(**vars(line)) for line in e.lines],
+    return evidence(
+        records.EngineEvidence, e, contract=[records.LineEvidence(**vars(line)) for line in e.lines],
         status=e.motion.status, steps=len(e.motion.us), largest_step_gap=float(max(e.step_gaps, default=0.0)),
         first_apart_s=None if e.first_apart is None else float(e.motion.times[e.first_apart]),
         first=_attribution(e.first), largest=_attribution(e.largest), energy_change_J=e.motion.energy_change,
         largest_penetration_m=None if e.motion.depth is None else float(np.max(e.motion.depth)),
         jacobians=[
-            records.JacobianEvidence(
-                **{name: getattr(j, name) for name in ("state", "method", "own")},
+            evidence(
+                records.JacobianEvidence,
+                j,
                 gap=float(gap),
-                jacobian=_rows(j.jacobian),
                 law=law,
                 certificate=None if j.certificate is None else gradient_evidence(j.certificate),
             )
             for j, gap, law in zip(e.jacobians, e.jacobian_gaps, e.laws, strict=True)
         ],
-        function=None if e.function is None else records.FunctionEvidence(
-            name=e.function.name, sha256=e.function.sha256, parameters=dict(e.function.parameters)
+        function=None if e.function is None else evidence(
+            records.FunctionEvidence, e.function, parameters=dict(e.function.parameters)
         ),
-        rollout_jacobian=None if e.rollout_jacobian is None else _rows(e.rollout_jacobian), cause=cause,
+        cause=cause,
     )  # fmt: skip
 
 
 def _attribution(a: Attribution) -> records.AttributionEvidence:
-    return records.AttributionEvidence(
-        gap=a.gap, responsible=a.responsible, effects=dict(a.effects), schemes=[str(s) for s in a.schemes],
-        assumed=list(a.assumed),
-    )  # fmt: skip
-
-
-def _rows(matrix: Array) -> list[records.Numbers]:
-    return [[float(v) if np.isfinite(v) else None for v in row] for row in matrix]
+    schemes = [str(scheme) for scheme in a.schemes]
+    return evidence(records.AttributionEvidence, a, effects=dict(a.effects), schemes=schemes)
 
 
 def write_comparison_trace(path: Path, comparison: Comparison) -> None:

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, finite_array, frozen
+from drake_diff._base.arrays import Array, array_with_gaps, finite_array, frozen
 from drake_diff._base.files import MOST_TEXT, arrays_of, json_of, make_folder, plain_file, read_plain, write_whole
 from drake_diff._base.sandbox import reading
 from drake_diff._base.values import ShowsItsRepr
@@ -39,10 +39,11 @@ POSE, TWIST = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TwistStamped"
 ROS2 = "cdr"  # encoding of ROS 2 messages
 USED = (JOINTS, ODOMETRY, POSE, TWIST)
 Stamped = dict[int, Any]  # messages by time [ns]
+Motion = tuple[Array, Array, Array]  # times (n,) [s], xs (n, nx), us (n - 1, nu)
 Source = tuple[str, str]  # a topic, and the body frame in its messages, or "" if they have none
 
 
-def read_ros2(path: Path, model: Model) -> tuple[tuple[Array, Array, Array], Mapping[str, str]]:
+def read_ros2(path: Path, model: Model) -> tuple[Motion, Mapping[str, str]]:
     """Return (times (n,) from 0, xs (n, nx), us (n - 1, nu)), and the metadata record "contract" of an MCAP file.
 
     Raises InputError that names message and time if a joint, a twist or an effort is missing.
@@ -99,7 +100,7 @@ class _Found:
         self.singles = [x for x in moving if x.kind != "quaternion_floating"]
         self.free = [x for x in moving if x.kind == "quaternion_floating"]
 
-    def motion(self) -> tuple[Array, Array, Array]:
+    def motion(self) -> Motion:
         model = self.model
         messages = self._only(JOINTS, "/joint_states") if self.singles else {}
         bases = {link.body: self._base_of(link) for link in self.free}
@@ -245,20 +246,29 @@ class Recording(ShowsItsRepr):
         return f"{self.name} {self.version}: {len(self.times)} samples over {self.times[-1] - self.times[0]:.6g} s"
 
 
-def check_recording(recording: Recording, model: Model) -> None:
-    """Raise ShapeError, NonFiniteError or InputError, with recording and row, if this is not a motion of `model`."""
+def checked_motion(recording: Recording, model: Model, *, least: int = 2, gaps: bool = False) -> Motion:
+    """Return times, states and inputs of at least `least` samples; with `gaps`, states may be NaN.
+
+    Raises ShapeError, NonFiniteError or InputError that names recording and row.
+    """
     subject = f"recording {recording.name}"
     times = finite_array(f"{subject}: times", recording.times, ("n",))
-    if len(times) < 2:
-        raise InputError(f"{subject}: times", got=f"{len(times)}", expected="two or more")
+    if len(times) < least:
+        raise InputError(f"{subject}: samples", got=len(times), expected=f"{least} or more")
     for k in np.flatnonzero(np.diff(times) <= 0)[:1] + 1:
         before = f"more than {times[k - 1]} s, the time of the sample before"
         raise InputError(f"{subject}: time of sample {k}", got=f"{times[k]} s", expected=before)
-    xs = finite_array(f"{subject}: xs", recording.xs, (len(times), model.nx))
+    xs = (array_with_gaps if gaps else finite_array)(f"{subject}: xs", recording.xs, (len(times), model.nx))
     us = finite_array(f"{subject}: us", recording.us, (len(times) - 1, model.nu))
     check_sizes(f"{subject}: times", times[:, None], ["s"])
     check_sizes(f"{subject}: xs", xs, model.state_names)
     check_sizes(f"{subject}: us", us, model.input_names)
+    return times, xs, us
+
+
+def check_recording(recording: Recording, model: Model) -> None:
+    """Raise ShapeError, NonFiniteError or InputError, with recording and row, if this is not a motion of `model`."""
+    subject, (_, xs, _) = f"recording {recording.name}", checked_motion(recording, model)
     for start in tangent_space(model).quaternions:
         norms = np.linalg.norm(xs[:, start : start + 4], axis=1)
         k = int(np.argmax(np.abs(norms - 1)))
@@ -291,7 +301,6 @@ def steps_between(recording: Recording, time_step: float) -> int:
     return count
 
 
-Motion = tuple[Array, Array, Array]  # times (n,) [s], xs (n, nx), us (n - 1, nu)
 LARGEST_NUMBER = 1e12  # of a recording, in any unit: above, squares and products may overflow
 LONGEST_LINE = 2**20  # characters of a line of a CSV file
 MOST_NUMBERS = 2**25  # of a recording: 256 MiB

@@ -16,7 +16,7 @@ from drake_diff.engines.contract import UNKNOWN, ContractLine, is_another_model
 from drake_diff.engines.equations import UserFunction
 from drake_diff.engines.interface import Precision
 from drake_diff.model.model import Model
-from drake_diff.runs.other_records import EngineEvidence
+from drake_diff.runs.other_records import EngineEvidence, RefusedEvidence
 
 Verdict = Literal["same", "other law", "other model", "unexplained"]
 Gradient = Literal["its own step's", "not its own step's", "undecided", "none"]
@@ -62,15 +62,6 @@ class StateProbe(NamedTuple):
     name: str
     x: Array
     u: Array
-
-
-@dataclass(frozen=True)
-class Refused:
-    """An engine that is not compared: it is not installed, or does not support the model."""
-
-    engine: str
-    reason: str
-    installed: bool
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -228,7 +219,7 @@ class Comparison:
     us: Array
     states: tuple[StateProbe, ...]
     engines: tuple[Compared, ...]
-    refused: tuple[Refused, ...]
+    refused: tuple[RefusedEvidence, ...]
     recordings: tuple[Recording, ...] = ()
 
     @property

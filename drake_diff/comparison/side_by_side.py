@@ -17,7 +17,7 @@ from drake_diff._base.values import Refusal
 from drake_diff.comparison import attribution
 from drake_diff.comparison.attribution import EngineMotion, JacobianAt, measured, move, rollout_jacobian, seconds
 from drake_diff.comparison.recordings import Recording, check_recording, steps_between
-from drake_diff.comparison.result import STEP_TOLERANCE, Compared, Comparison, Refused, StateProbe, first_above
+from drake_diff.comparison.result import STEP_TOLERANCE, Compared, Comparison, StateProbe, first_above
 from drake_diff.engines.contract import MUST_HAVE, Match, contact_lines, match_contracts
 from drake_diff.engines.drake import DrakeEngine
 from drake_diff.engines.equations import ClosedForm
@@ -28,6 +28,7 @@ from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 from drake_diff.model.tangent import sample_states, tangent_space
 from drake_diff.motion.rollout import check_inputs
+from drake_diff.runs.other_records import RefusedEvidence
 
 DURATION, MOST_STEPS = 1.0, 500  # [s] and number of steps of a default motion
 
@@ -87,7 +88,7 @@ def compare(
     inputs = check_inputs(model, us, num_steps)
     reference = DrakeEngine(model)
     loaded: list[Engine] = []
-    refused: list[Refused] = []
+    refused: list[RefusedEvidence] = []
     for wanted in default_engines(model) if engines is None else engines:
         try:
             engine = load_spec(wanted, model) if isinstance(wanted, str) else _checked_engine(wanted, reference)
@@ -95,7 +96,8 @@ def compare(
                 _check_contact(reference, engine)
             loaded.append(engine)
         except (MissingDependencyError, ModelError) as error:
-            refused.append(Refused(str(wanted), str(error), isinstance(error, ModelError)))
+            installed = isinstance(error, ModelError)
+            refused.append(RefusedEvidence(engine=str(wanted), reason=str(error), installed=installed))
     panel = _Panel(model, reference, start, inputs)
     panel.look(seed)
     results, stuck = panel.all([reference, *loaded, *recordings])
@@ -170,16 +172,16 @@ class _Panel:
         self.jacobians = self._jacobians(self.reference)
         self.product = rollout_jacobian(self.reference, self.space, motion)
 
-    def all(self, sources: Sequence[Engine | Recording]) -> tuple[list[tuple[Any, Compared]], list[Refused]]:
+    def all(self, sources: Sequence[Engine | Recording]) -> tuple[list[tuple[Any, Compared]], list[RefusedEvidence]]:
         """Return each source with its comparison, and the refusals of those that cannot take a step."""
-        results, stuck = list[tuple[Any, Compared]](), list[Refused]()
+        results, stuck = list[tuple[Any, Compared]](), list[RefusedEvidence]()
         for source in sources:
             try:
                 result = self.recorded(source) if isinstance(source, Recording) else self.compared(source)
                 results.append((source, result))
             except SimulationError as error:
                 reason = f"it cannot take a step from one of the states: {error}"
-                stuck.append(Refused(source.name, reason, True))
+                stuck.append(RefusedEvidence(engine=source.name, reason=reason, installed=True))
         return results, stuck
 
     def compared(self, engine: Engine) -> Compared:

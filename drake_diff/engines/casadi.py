@@ -15,6 +15,7 @@ from drake_diff._base.arrays import Array
 from drake_diff.engines.formats import carried_by, inertial_urdf
 from drake_diff.engines.interface import EngineContract, EulerEngine, PlantEngine, floats, limit
 from drake_diff.exceptions import MissingDependencyError, ModelError
+from drake_diff.mechanics.casadi_tree import quaternion_rotation
 from drake_diff.mechanics.description import Description, JointContract, Link, joint_contract
 from drake_diff.model.model import Model
 
@@ -145,7 +146,7 @@ class _Tree:
         if self.base is None:
             return ca.SX.eye(4)
         i, X = self.base.q_start, self.base.on_parent
-        R = ca.mtimes([_turn(self.base), rotation(q[i : i + 4]), _turn(self.base).T])
+        R = ca.mtimes([_turn(self.base), quaternion_rotation(q[i : i + 4]), _turn(self.base).T])
         p = X.translation() + ca.mtimes(_turn(self.base), q[i + 4 : i + 7])
         return ca.blockcat([[R, p], [ca.SX(1, 3), ca.SX(1)]])
 
@@ -202,13 +203,6 @@ class _Joint(StdJoint):  # type: ignore[misc]  # adam has no types
 class _Factory(URDFModelFactory):  # type: ignore[misc]
     def build_joint(self, joint: Any) -> _Joint:
         return _Joint(joint, self.math)
-
-
-def rotation(quaternion: Any) -> Any:
-    """Return the rotation matrix (3, 3) of a quaternion (w, x, y, z) of any norm, as an expression."""
-    s, v = quaternion[0], quaternion[1:4]
-    product = s**2 * ca.SX.eye(3) + 2 * s * ca.skew(v) + ca.mtimes(v, v.T) + ca.mtimes(ca.skew(v), ca.skew(v))
-    return product / ca.sumsqr(quaternion)
 
 
 def _turn(base: Link) -> Any:

@@ -4,7 +4,7 @@ Their derivatives are complex-step derivatives of M(q) a + bias(q, v) at fixed a
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy import cos, sin
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, positive_float
+from drake_diff._base.differences import complex_steps
 from drake_diff.engines.interface import EngineContract, EulerEngine, float_rows, floats
 from drake_diff.exceptions import ModelError
 from drake_diff.mechanics.coordinates import Coordinates
@@ -20,7 +21,6 @@ from drake_diff.model.model import Model
 
 (X, Y, Z), ORIGIN, NO_INERTIA = np.eye(3), np.zeros(3), np.zeros((3, 3))
 Limits = tuple[float, float]
-TINY = 1e-30  # size of a complex step
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,8 @@ class HandForm(ABC):
 
     def needed_derivative(self, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
         """Return the derivatives (nv, nv) of M a + bias with respect to small motion and to v."""
-        by_q = _complex_steps(lambda z: self.mass_matrix(z) @ a + self.bias(z, v), q)
-        return by_q @ self.coordinates.rate(q), _complex_steps(lambda z: self.bias(q, z), v)
+        by_q = complex_steps(lambda z: self.mass_matrix(z) @ a + self.bias(z, v), q)
+        return by_q @ self.coordinates.rate(q), complex_steps(lambda z: self.bias(q, z), v)
 
     def _joint(
         self, index: int, kind: str, axis: Array, anchor: Array, mass: float, com: Array, inertia: Array = NO_INERTIA,
@@ -84,12 +84,6 @@ class HandForm(ABC):
             name=self.joint_names[index], kind=kind, axis=axis, anchor=anchor, carried=[(mass, com, inertia)],
             damping=damping, lower=lower, upper=upper, **spring,
         )  # fmt: skip
-
-
-def _complex_steps(function: Callable[[Array], Array], z: Array) -> Array:
-    """Return the derivative (m, n) of an analytic function of z (n,)."""
-    columns = [np.imag(function(z + 1j * TINY * e)) / TINY for e in np.eye(len(z))]
-    return np.array(columns).T.astype(float)
 
 
 @dataclass(frozen=True)

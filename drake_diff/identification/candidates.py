@@ -30,7 +30,7 @@ from drake_diff.identification.judge import (
 )
 from drake_diff.identification.messages import changed_to
 from drake_diff.identification.motion import LONGEST, EulerMotion, Law, TreeMotion
-from drake_diff.identification.recordings import Chart, Excerpt, noise_by_differences
+from drake_diff.identification.recordings import Excerpt, noise_by_differences
 from drake_diff.identification.results import Explanation
 from drake_diff.identification.tree import ORDER_4, Tree
 from drake_diff.identification.unknowns import (
@@ -73,7 +73,6 @@ class Ranking:
     """The judgement of fitted changes of a model and of their evidence; the search ends after LONGEST_SEARCH."""
 
     model: Model
-    chart: Chart
     pieces: list[Excerpt]
     stated: Array  # (2 nv,) the given noise; NaN if unknown
     evidence: dict[str, float] = field(default_factory=dict)
@@ -98,10 +97,10 @@ class Ranking:
 
     @cached_property
     def scatter(self) -> Array:
-        return noise_by_differences(self.chart, self.pieces, jumps=self.jumps)
+        return noise_by_differences(self.model, self.pieces, jumps=self.jumps)
 
     def problem(self, unknowns: Unknowns, pieces: Sequence[Excerpt]) -> Problem:
-        return Problem(self.model, self.chart, unknowns, list(pieces), self.stated, self.scatter, jumps=self.jumps)
+        return Problem(self.model, unknowns, list(pieces), self.stated, self.scatter, jumps=self.jumps)
 
     def judge(self, names: tuple[str, ...], problem: Problem, fit: Fit, solved: Solved) -> Tried:
         unknowns, freedom = problem.unknowns, freedom_of(fit, solved)
@@ -316,7 +315,7 @@ class Candidates(Ranking):
     def unknowns(self) -> Unknowns:
         """All quantities that are tried."""
         measured = np.any([np.isfinite(p.ys).any(axis=0) for p in self.pieces], axis=0)
-        singles = {i for i, _ in self.chart.coordinates.single} | set(range(self.model.nq, self.model.nx))
+        singles = {i for i, _ in self.tree.coordinates.single} | set(range(self.model.nq, self.model.nx))
         biases = {f"{name}.{BIAS}" for i, name in enumerate(self.model.state_names) if measured[i] and i in singles}
         names = [n for n in possible_changes(self.model, self.tree) if not n.endswith(f".{BIAS}") or n in biases]
         unknowns = choose_unknowns(self.model, self.tree, names).each
@@ -355,7 +354,7 @@ class Candidates(Ranking):
     def euler_steps(self) -> list[float]:
         """The lengths [s] of the Euler steps that are tried; a whole number of steps fits between samples."""
         periods = np.concatenate([np.diff(piece.times) for piece in self.cut])
-        if self.chart.coordinates.free or np.ptp(periods) > 1e-6 * np.mean(periods):
+        if self.tree.coordinates.free or np.ptp(periods) > 1e-6 * np.mean(periods):
             return []
         return [float(np.mean(periods)) / n for n in PARTS]
 
@@ -377,7 +376,7 @@ class Candidates(Ranking):
             s.pieces[p].part(int(samples[0]), min(int(samples[-1]) + 1, len(s.pieces[p].times) - 1))
             for samples, p in zip(s.samples, s.of_piece, strict=True)
         ]
-        segment_fit = Fit(self.model, fit.law, self.chart, fit.unknowns, parts, fit.noise, fixed=True)
+        segment_fit = Fit(self.model, fit.law, fit.unknowns, parts, fit.noise, fixed=True)
         try:
             return segment_fit.solve(z, starts, SETTLING).starts
         except SimulationError:

@@ -19,12 +19,14 @@ from drake_diff.identification.fit import cut_segments
 from drake_diff.identification.identify import Problem
 from drake_diff.identification.judge import HOPELESS, likelihood_of, noise_of
 from drake_diff.identification.motion import EulerMotion, Law, TreeMotion
-from drake_diff.identification.recordings import Chart, Excerpt, guess_states, noise_by_differences
+from drake_diff.identification.recordings import Excerpt, guess_states, noise_by_differences
 from drake_diff.identification.results import Explanation
 from drake_diff.identification.tree import Tree
 from drake_diff.identification.unknowns import Unknowns
+from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
+from drake_diff.model.tangent import tangent_space
 
 SEGMENTS = 12  # of the recording, on which mistakes are compared
 FITTED = 3  # number of best mistakes that are fitted to whole recordings
@@ -53,15 +55,15 @@ class Mistake:
 Fitted = Callable[[Sequence[Excerpt]], tuple[float, bool]]  # (-2 log likelihood, whether the residuals are noise)
 
 
-def mistakes(model: Model, chart: Chart, pieces: Sequence[Excerpt]) -> list[Mistake]:
+def mistakes(model: Model, pieces: Sequence[Excerpt]) -> list[Mistake]:
     """Return all mistakes to try; unmeasured columns and quaternions have none."""
-    nq, nx = model.nq, model.nx
+    nq, nx, coordinates = model.nq, model.nx, coordinates_of(model)
     seen = np.any([np.isfinite(piece.ys).any(axis=0) for piece in pieces], axis=0)
     sliding = {model.places(joint)[0].start for joint in joints(model.plant) if joint.type_name() == "prismatic"}
-    along = [(i, nq + j) for i, j in chart.coordinates.single if i in sliding]
-    along += [(i + 4 + k, nq + j + 3 + k) for i, j in chart.coordinates.free for k in range(3)]
-    turning = [(i, nq + j) for i, j in chart.coordinates.single if i not in sliding]
-    spins = [nq + j + k for _, j in chart.coordinates.free for k in range(3)]
+    along = [(i, nq + j) for i, j in coordinates.single if i in sliding]
+    along += [(i + 4 + k, nq + j + 3 + k) for i, j in coordinates.free for k in range(3)]
+    turning = [(i, nq + j) for i, j in coordinates.single if i not in sliding]
+    spins = [nq + j + k for _, j in coordinates.free for k in range(3)]
     inputs, names, hypotheses = range(nx, nx + model.nu), (*model.state_names, *model.input_names), list[Mistake]()
 
     def add(words: str, columns: Sequence[int], sources: Sequence[int], factor: float = 1.0) -> None:
@@ -101,16 +103,14 @@ def _listed(names: Sequence[str]) -> str:
     return f"columns {', '.join(names[:-1])} and {names[-1]} have"
 
 
-def mistaken_columns(
-    model: Model, chart: Chart, pieces: Sequence[Excerpt], law: Law, fits: Sequence[Fitted]
-) -> Explanation | None:
+def mistaken_columns(model: Model, pieces: Sequence[Excerpt], law: Law, fits: Sequence[Fitted]) -> Explanation | None:
     """Find the mistake that explains the recordings, or return None if none does or the given columns are explained.
 
     `law` simulates short segments. Each of `fits` measures how well the unchanged model follows whole recordings.
     """
-    every = mistakes(model, chart, pieces)
+    every = mistakes(model, pieces)
     none = Mistake("", np.arange(model.nx + model.nu), np.ones(model.nx + model.nu))
-    left, *others = _left(model, law, chart, pieces, [none, *every])
+    left, *others = _left(model, law, pieces, [none, *every])
     nearer = [(every[i], others[i]) for i in np.argsort(others, kind="stable")[:FITTED] if others[i] < NEARER * left]
     measured = np.isfinite(np.concatenate([piece.ys for piece in pieces])).sum(axis=0)
     for fitted in fits:
@@ -133,9 +133,7 @@ def mistaken_columns(
     return None
 
 
-def mistaken_in_the_air(
-    model: Model, tree: Tree, chart: Chart, pieces: Sequence[Excerpt], stated: Array
-) -> Explanation | None:
+def mistaken_in_the_air(model: Model, tree: Tree, pieces: Sequence[Excerpt], stated: Array) -> Explanation | None:
     """Find such a mistake in motions without contact, in continuous time or with the model's own Euler steps.
 
     `stated` (2 nv,) is the given noise, NaN if unknown.
@@ -143,30 +141,28 @@ def mistaken_in_the_air(
     arguments = model, tree, Unknowns((), as_in_files=True)
     periods = np.concatenate([np.diff(piece.times) for piece in pieces]) / model.time_step
     whole = np.round(periods)
-    steps = not chart.coordinates.free and np.all(whole > 0) and np.all(np.abs(periods - whole) < CLOCK_TOLERANCE)
+    steps = not tree.coordinates.free and np.all(whole > 0) and np.all(np.abs(periods - whole) < CLOCK_TOLERANCE)
     law = TreeMotion(*arguments)
-    fits = [partial(_fitted, model, law, chart, stated)]
+    fits = [partial(_fitted, model, law, stated)]
     if steps:
         euler = EulerMotion(*arguments, model.time_step)
-        fits.append(partial(_fitted, model, euler, chart, stated))
-    return mistaken_columns(model, chart, pieces, law, fits)
+        fits.append(partial(_fitted, model, euler, stated))
+    return mistaken_columns(model, pieces, law, fits)
 
 
-def _left(
-    model: Model, law: Law, chart: Chart, pieces: Sequence[Excerpt], candidates: Sequence[Mistake]
-) -> list[float]:
+def _left(model: Model, law: Law, pieces: Sequence[Excerpt], candidates: Sequence[Mistake]) -> list[float]:
     """Return the loss of short segments without each mistake, from guessed states: the mean of log(1 + r^2)."""
     s, nx, losses = cut_segments(law, pieces, model.nu), model.nx, list[float]()
     some = np.unique(np.linspace(0, len(s.first) - 1, SEGMENTS).round().astype(int))
     for candidate in candidates:
         mended = [candidate.mended(piece) for piece in pieces]
-        starts = [guess_states(model, chart, mended[s.of_piece[k]], s.first[k : k + 1]) for k in some]
+        starts = [guess_states(model, mended[s.of_piece[k]], s.first[k : k + 1]) for k in some]
         us = s.us[some][:, :, candidate.order[nx:] - nx] * candidate.factors[nx:]
-        noise = noise_by_differences(chart, mended)
+        noise = noise_by_differences(model, mended)
         with np.errstate(all="ignore"):
             xs = law.run(np.zeros(0), np.concatenate(starts), s.hs[some], us)
             misses = [
-                chart.minus(mended[s.of_piece[k]].ys[s.samples[k]], x[s.at[k]]) / noise
+                tangent_space(model).minus(mended[s.of_piece[k]].ys[s.samples[k]], x[s.at[k]]) / noise
                 for k, x in zip(some, xs, strict=True)
             ]
         squares = np.concatenate(misses) ** 2
@@ -175,13 +171,13 @@ def _left(
     return losses
 
 
-def _fitted(model: Model, law: Law, chart: Chart, stated: Array, pieces: Sequence[Excerpt]) -> tuple[float, bool]:
+def _fitted(model: Model, law: Law, stated: Array, pieces: Sequence[Excerpt]) -> tuple[float, bool]:
     """Return (-2 log likelihood with the noise of the residuals, whether the residuals are noise).
 
     The fit ends early if the first few steps leave residuals far above noise.
     """
     nothing = Unknowns((), as_in_files=True)
-    problem = Problem(model, chart, nothing, list(pieces), stated, noise_by_differences(chart, pieces))
+    problem = Problem(model, nothing, list(pieces), stated, noise_by_differences(model, pieces))
     try:
         with np.errstate(over="ignore", invalid="ignore"):
             fit, starts = problem.prepared(law)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff.certificates.truth import overlaps_along
 from drake_diff.comparison.recordings import CLOCK_TOLERANCE
 from drake_diff.exceptions import DrakeDiffError, SimulationError
 from drake_diff.identification.candidates import Ranking, Tried
@@ -20,13 +21,15 @@ from drake_diff.identification.fit import Fit, FittedMotion, Solved
 from drake_diff.identification.judge import HOPELESS
 from drake_diff.identification.messages import NO_CHANGE
 from drake_diff.identification.motion import DiscreteMotion, discrete_motion
-from drake_diff.identification.recordings import Chart, Excerpt, guess_states
+from drake_diff.identification.recordings import Excerpt, guess_states
 from drake_diff.identification.results import Explanation
 from drake_diff.identification.unknowns import BIAS, CENTER, MASS, Unknown, Unknowns, choose_unknowns
+from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, list_parameters, select
 from drake_diff.model.plant import bodies, labelled
 from drake_diff.model.step import set_state
+from drake_diff.model.tangent import tangent_space
 
 FIRST, LONGER = 3, 1.5  # samples of the first stage; ratio of the lengths of successive stages
 BEGIN = (0.1, -0.1, 0.3, -0.3, 0.8, -0.8)  # initial changes of one number, in its logarithm or in units of HEIGHT
@@ -44,21 +47,18 @@ LARGER = 1.2  # factor of the radii with which bodies that nearly touch are foun
 NOTHING = Unknowns(())
 
 
-def may_touch(model: Model, chart: Chart, pieces: Sequence[Excerpt]) -> bool:
+def may_touch(model: Model, pieces: Sequence[Excerpt]) -> bool:
     """Return whether bodies would touch with a higher ground and larger spheres; needs whole steps between samples."""
     periods = np.concatenate([np.diff(piece.times) for piece in pieces]) / model.time_step
     stride = np.round(np.median(periods))
     if not model.contract.contact.collision_pairs or stride < 1 or np.any(np.abs(periods - stride) > CLOCK_TOLERANCE):
         return False
-    lower = [model.position_names.index(name) for name in _heights(model, chart)]
+    lower = [model.position_names.index(name) for name in _heights(model)]
     radii = {p.name: p.value for p in list_parameters(model) if p.name.endswith(".radius") and "/" not in p.name}
     with applied(select(model, {name: LARGER * value for name, value in radii.items()})) as larger:
-        for x in (x for p in pieces for x in guess_states(model, chart, p, np.arange(len(p.times)))):
-            x[lower] -= HEIGHT
-            set_state(larger.double, x)
-            if larger.double.overlaps():
-                return True
-    return False
+        states = np.concatenate([guess_states(model, piece, np.arange(len(piece.times))) for piece in pieces])
+        states[:, lower] -= HEIGHT
+        return any(overlaps_along(larger, states))
 
 
 class FitStage(NamedTuple):
@@ -88,7 +88,7 @@ class ContactExplanation(Ranking):
         base = self.judged((), NOTHING, stages[-1])
         if not base.explains:
             law = replace(self.law(NOTHING), segment=SEGMENT)
-            columns = mistaken_columns(self.model, self.chart, self.pieces, law, [self.unchanged])
+            columns = mistaken_columns(self.model, self.pieces, law, [self.unchanged])
             if columns is not None:
                 return columns
         tried: list[Tried] = []
@@ -99,7 +99,7 @@ class ContactExplanation(Ranking):
         end = None  # unchanged model from the first states of the best change, which may give smaller residuals
         if explaining:
             starts = min(explaining, key=self.bic).starts
-            end = self.to_end(NOTHING, len(self.stages) - 1, np.zeros(0), starts)
+            end = self.to_end(len(self.stages) - 1, starts)
         again = [] if end is None else [self.judged((), NOTHING, end)]
         none = [candidate for candidate in explaining if self.is_nothing(candidate)]
         base = min([base, *again], key=lambda fitted: fitted.score)
@@ -182,13 +182,13 @@ class ContactExplanation(Ranking):
         moves = (
             np.array([size * spread @ random.standard_normal(len(spread)) for spread in spreads]) for _ in range(DRAWS)
         )
-        points = [fit.at(z, self.chart.plus(before.solved.starts, move)) for move in moves]
+        points = [fit.at(z, tangent_space(self.model).plus(before.solved.starts, move)) for move in moves]
         best = sorted((point for point in points if point is not None), key=lambda point: point.value)
         return [point.starts for point in best[:BEST]]
 
-    def to_end(self, unknowns: Unknowns, first: int, z: Array, starts: Array | None) -> FitStage | None:
-        """Return the fit of the last stage, or None if the change does not reach the end of the recordings."""
-        stages = list(self.stages_of(unknowns, first, z, starts))
+    def to_end(self, first: int, starts: Array | None) -> FitStage | None:
+        """Return the last stage of the unchanged model, or None if it does not reach the end of the recordings."""
+        stages = list(self.stages_of(NOTHING, first, np.zeros(0), starts))
         return stages[-1] if stages and stages[-1].stage == len(self.stages) - 1 else None
 
     def first_points(self, begin: FitStage) -> Iterator[tuple[Unknown, list[FittedMotion]]]:
@@ -233,8 +233,8 @@ class ContactExplanation(Ranking):
 
     def unchanged(self, pieces: Sequence[Excerpt]) -> tuple[float, bool]:
         """Return (score, whether it explains) of the unchanged model on other pieces."""
-        other = ContactExplanation(self.model, self.chart, list(pieces), self.stated)
-        end = other.to_end(NOTHING, 0, np.zeros(0), None)
+        other = ContactExplanation(self.model, list(pieces), self.stated)
+        end = other.to_end(0, None)
         base = None if end is None else other.judged((), NOTHING, end)
         return (np.inf, False) if base is None else (base.score, base.explains)
 
@@ -243,7 +243,7 @@ class ContactExplanation(Ranking):
         """All quantities that are tried: first those of contact, then those of motion."""
         known, plant = {p.name: p.value for p in list_parameters(self.model)}, self.model.plant
         names = [n for q in OF_CONTACT for n in known if n.endswith(f".{q}") and "/" not in n and np.all(known[n] > 0)]
-        names += [f"{height}.{BIAS}" for height in _heights(self.model, self.chart)]
+        names += [f"{height}.{BIAS}" for height in _heights(self.model)]
         names += [n for q in OF_MOTION for n in known if n.endswith(f".{q}")]
         fixed = {body.index() for body in plant.GetBodiesWeldedTo(plant.world_body())}
         moving = {label for label, body in labelled(bodies(plant)).items() if body.index() not in fixed}
@@ -263,10 +263,11 @@ class ContactExplanation(Ranking):
         return unknown.start, "m" if unknown.quantity == BIAS else unknown.unit
 
 
-def _heights(model: Model, chart: Chart) -> list[str]:
+def _heights(model: Model) -> list[str]:
     """Return the positions along which nearly all weight acts; the ground's height is a bias of these."""
     set_state(model.double, model.default_state)
     pulls = np.abs(model.plant.CalcGravityGeneralizedForces(model.double.context))
-    pairs = [*chart.coordinates.single, *((i + 6, j + 5) for i, j in chart.coordinates.free)]
+    coordinates = coordinates_of(model)
+    pairs = [*coordinates.single, *((i + 6, j + 5) for i, j in coordinates.free)]
     most = float(np.max(pulls, initial=0.0))
     return [model.position_names[i] for i, j in pairs if most > 0 and pulls[j] > 0.9 * most]

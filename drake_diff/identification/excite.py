@@ -16,19 +16,18 @@ from scipy.optimize import linprog
 
 from drake_diff._base.arrays import Array, frozen, positive_float, positive_int
 from drake_diff._base.values import Refusal, ShowsItsRepr
+from drake_diff.certificates.truth import overlaps_along
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.identification.fit import Fit, growth_cuts
 from drake_diff.identification.judge import deviations_of, known_of
 from drake_diff.identification.messages import excitation_sentence, unidentifiable
 from drake_diff.identification.motion import TreeMotion
-from drake_diff.identification.recordings import LEAST, Chart, Excerpt, given_noise
+from drake_diff.identification.recordings import LEAST, Excerpt, given_noise
 from drake_diff.identification.tree import ORDER_4, Tree, TreeDynamics, numbers_of, tree_for_identification
 from drake_diff.identification.unknowns import FAR, Unknowns, choose_unknowns
-from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
-from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
 
 NOISE = 1e-3  # [rad] or [m] default standard deviation of positions
@@ -129,12 +128,12 @@ def excite(
     tree = tree_for_identification(model)
     if isinstance(tree, Refusal):
         raise ModelError(f"{model.name}: motion in continuous time is not supported: {tree}")
-    unknowns, chart = choose_unknowns(model, tree, parameters), Chart(coordinates_of(model))
+    unknowns = choose_unknowns(model, tree, parameters)
     if noise is None:
         names = tangent_space(model).names[: model.nv]
         noise = dict.fromkeys(names, NOISE)
-    stated, first = given_noise(model, chart, noise), _first(model, x0)
-    design = _Design(model, tree, chart, unknowns, stated, first, duration, limits, period, harmonics)
+    stated, first = given_noise(model, noise), _first(model, x0)
+    design = _Design(model, tree, unknowns, stated, first, duration, limits, period, harmonics)
     return design.excitation(max_iterations, seed, dict(noise))
 
 
@@ -160,7 +159,6 @@ class _Design:
 
     model: Model
     tree: Tree
-    chart: Chart
     unknowns: Unknowns
     noise: Array  # (2 nv,)
     x0: Array
@@ -197,7 +195,7 @@ class _Design:
     def follows(self) -> bool:
         """Whether inputs exist for every motion of the joints."""
         reach = np.linalg.matrix_rank(self.dynamics.efforts)
-        return not self.chart.coordinates.free and self.model.nu > 0 and int(reach) == self.model.nv
+        return not self.tree.coordinates.free and self.model.nu > 0 and int(reach) == self.model.nv
 
     @cached_property
     def limits(self) -> tuple[Array, Array]:
@@ -320,7 +318,7 @@ class _Design:
             Excerpt("planned", times, x, u, held_out=False, recording=k)
             for k, (x, u) in enumerate(zip(xs, us, strict=True))
         ]
-        fit = Fit(self.model, law, self.chart, self.unknowns, pieces, self.noise)
+        fit = Fit(self.model, law, self.unknowns, pieces, self.noise)
         return fit, self.starts(fit)
 
     def starts(self, fit: Fit) -> Array:
@@ -342,7 +340,7 @@ class _Design:
         """Return (R of one motion with the pieces of `identify`, the unidentifiable combinations)."""
         z = self.unknowns.z_start
         fit, starts = self.fit(self.law, xs[None], us[None], self.times)
-        cut = Fit(self.model, self.law, self.chart, self.unknowns, growth_cuts(fit, z, starts), self.noise)
+        cut = Fit(self.model, self.law, self.unknowns, growth_cuts(fit, z, starts), self.noise)
         point = cut.at(z, self.starts(cut))
         if point is None:
             raise ModelError(f"{self.model.name}: the motion under the planned inputs is not finite")
@@ -399,13 +397,7 @@ class _Design:
         return None
 
     def touches(self, xs: Array) -> bool:
-        if not self.model.contract.contact.collision_pairs:
-            return False
-        for x in xs:
-            set_state(self.model.double, x)
-            if self.model.double.overlaps():
-                return True
-        return False
+        return any(overlaps_along(self.model, xs))
 
     def feasible(self, c: Array) -> tuple[Array, Array] | None:
         """Return the motion, scaled down a little if needed, if it is within all limits at every sample."""

@@ -31,17 +31,13 @@ from drake_diff.identification.columns import mistaken_in_the_air
 from drake_diff.identification.contact import ContactExplanation, may_touch
 from drake_diff.identification.identify import TOUCH, what_acts
 from drake_diff.identification.messages import NO_CHANGE
-from drake_diff.identification.recordings import Chart, given_noise, read_pieces
+from drake_diff.identification.recordings import given_noise, read_pieces
 from drake_diff.identification.results import Explanation
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import DELAY, LIMIT
-from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 
 BESIDE, LOOKED_AT_BESIDE = 3, 4  # number of first changes of pairs, and number of second changes for each
-DELAYS_SEEN, NEAR = 4, 0.02  # maximum number of linearizations at delays; relative change of the delay that ends them
-BEHIND = 4.0  # times the best prediction: worse candidates are tried only among the first LOOKED_AT_BESIDE
-SHORTEST_DELAY = 1e-4  # [s] least delay of a pair
 TIME_STEP = "model.time_step"
 MOTIONS = ("auto", "continuous")
 Search = Callable[[], list[Tried]]
@@ -93,21 +89,21 @@ def explain(
     """
     if motion not in MOTIONS:
         raise UnknownNameError("motion", got=motion, known=MOTIONS)
-    chart, pieces = Chart(coordinates_of(model)), read_pieces(model, recordings, 0.0)
-    tree = tree_for_identification(model)
+    pieces, tree = read_pieces(model, recordings, 0.0), tree_for_identification(model)
+    stated = given_noise(model, noise)
     if not isinstance(tree, Refusal):
-        columns = mistaken_in_the_air(model, tree, chart, pieces, given_noise(model, chart, noise))
+        columns = mistaken_in_the_air(model, tree, pieces, stated)
         if columns is not None:
             return columns
-    why = str(tree) if isinstance(tree, Refusal) else what_acts(model, chart, pieces) if motion == "auto" else ""
+    why = str(tree) if isinstance(tree, Refusal) else what_acts(model, pieces) if motion == "auto" else ""
     if why == TOUCH:
-        return ContactExplanation(model, chart, pieces, given_noise(model, chart, noise)).explanation()
+        return ContactExplanation(model, pieces, stated).explanation()
     if why or isinstance(tree, Refusal):
         raise ModelError(f"{model.name}: causes can be found in motion in continuous time only, and {why}")
-    explanation = _Search(model, chart, pieces, given_noise(model, chart, noise), tree=tree).explanation()
-    if explanation.explained or motion != "auto" or not may_touch(model, chart, pieces):
+    explanation = _Search(model, pieces, stated, tree=tree).explanation()
+    if explanation.explained or motion != "auto" or not may_touch(model, pieces):
         return explanation
-    touched = ContactExplanation(model, chart, pieces, given_noise(model, chart, noise)).explanation()
+    touched = ContactExplanation(model, pieces, stated).explanation()
     if touched.explained:
         return touched
     more = f"With contact, no change that was tried explains it either{touched.sentence.removeprefix(NO_CHANGE)}"

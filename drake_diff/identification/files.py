@@ -34,7 +34,7 @@ from drake_diff.pages.html import Line, Plot, page_data, write_page
 from drake_diff.runs import other_records as records
 from drake_diff.runs.differences import Reproduced
 from drake_diff.runs.directory import name_of, written_whole
-from drake_diff.runs.fields import DataBoundary, DataUse, finite, reproducible
+from drake_diff.runs.fields import DataBoundary, DataUse, evidence, finite, reproducible
 from drake_diff.runs.other_records import FitRecord
 from drake_diff.runs.provenance import contract_of, header, write_bundle
 from drake_diff.runs.rebuild import TRACE, rebuilt
@@ -173,9 +173,9 @@ def _recording(i: int, e: Identification, asked: Request) -> records.RecordingEv
     spans: dict[bool, list[list[float]]] = {True: [], False: []}
     for piece in (motion.piece for motion in e.motions if motion.piece.recording == i):
         spans[piece.held_out].append([float(piece.times[0]), float(piece.times[-1])])
-    return records.RecordingEvidence(
-        name=recording.name,
-        version=recording.version,
+    return evidence(
+        records.RecordingEvidence,
+        recording,
         facts=dict(recording.facts),
         file=None if given is None else given[0].name,
         path=_path(i, asked),

@@ -22,7 +22,7 @@ from scipy.optimize import lsq_linear
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.identification.motion import DiscreteMotion, Law, TreeMotion
-from drake_diff.identification.recordings import LEAST, Chart, Excerpt
+from drake_diff.identification.recordings import LEAST, Excerpt
 from drake_diff.identification.sensors import Sensors
 from drake_diff.identification.unknowns import BIAS, Unknowns
 from drake_diff.model.model import Model
@@ -145,7 +145,6 @@ class Fit:
         self,
         model: Model,
         law: Law,
-        chart: Chart,
         unknowns: Unknowns,
         pieces: Sequence[Excerpt],
         noise: Array,
@@ -155,9 +154,10 @@ class Fit:
     ):
         self.sensors = Sensors(None, (), ()) if sensors is None else sensors
         self.fixed = fixed  # whether the unknowns are fixed, and only first states are estimated
-        self.model, self.law, self.chart, self.unknowns, self.noise = model, law, chart, unknowns, noise
+        self.model, self.law, self.unknowns, self.noise = model, law, unknowns, noise
+        self.space = tangent_space(model)
         self.segments = cut_segments(law, pieces, model.nu, None if unknowns.delay is None else 0.0)
-        self.gap_scale = np.empty(chart.size)
+        self.gap_scale = np.empty(self.space.size)
         nv, period = model.nv, max(float(np.median(np.diff(pieces[0].times))), 1e-3)
         from_positions = np.where(np.isfinite(noise[:nv]), noise[:nv], 1.0) / (5 * period)
         self.gap_scale[:nv] = np.where(np.isfinite(noise[:nv]), noise[:nv], 1.0)
@@ -181,7 +181,7 @@ class Fit:
 
     def _measured(self, p: int) -> Array:
         piece = self.segments.pieces[p]
-        every = np.hstack([self.chart.minus(piece.ys, piece.ys), *([] if piece.outs is None else [piece.outs])])
+        every = np.hstack([self.space.minus(piece.ys, piece.ys), *([] if piece.outs is None else [piece.outs])])
         return np.where(np.isfinite(self.noise), every, np.nan)
 
     def at(self, z: Array, starts: Array) -> "FittedMotion | None":
@@ -199,14 +199,14 @@ class Fit:
             return None
         residuals, shift, read = [], self._shift(values), self._read(values, s, xs)
         for k, piece in enumerate(s.pieces[p] for p in s.of_piece):
-            e = self.chart.minus(piece.ys[s.samples[k]], xs[k, s.at[k]])
+            e = self.space.minus(piece.ys[s.samples[k]], xs[k, s.at[k]])
             if piece.outs is not None:
                 e = np.hstack([e, piece.outs[s.samples[k]] - read[k]])
             residuals.append((e - shift) / self.noise)
-        gaps = np.zeros((len(s.first), self.chart.size))
+        gaps = np.zeros((len(s.first), self.space.size))
         inner = np.flatnonzero(s.of_piece[:-1] == s.of_piece[1:])
         if len(inner):
-            gaps[inner] = self.chart.minus(xs[inner, s.counts[inner]], starts[inner + 1])
+            gaps[inner] = self.space.minus(xs[inner, s.counts[inner]], starts[inner + 1])
         value = sum(float(np.nansum(r**2)) for r in residuals) + self._pull(z)
         return FittedMotion(z, starts, xs, residuals, gaps, value, float(np.linalg.norm(gaps / self.gap_scale)), s)
 
@@ -247,23 +247,19 @@ class Fit:
     def _read_slopes(self, z: Array, s: Segments, xs: Array) -> list[tuple[Array, Array]]:
         """Return the readings' derivatives with respect to state (samples, m, 2 nv) and z (samples, m, np)."""
         dynamics = self._continuous.dynamics(self.unknowns.values(z))
-        by_x, by_z = self.sensors.slopes(dynamics, *self._samples(s, xs), self._continuous.by(z))
+        by_x, by_z = self.sensors.slopes(self.space, dynamics, *self._samples(s, xs), self._continuous.by(z))
         return list(zip(self._split(s, by_x), self._split(s, by_z), strict=True))
 
     def _shift(self, values: Array) -> Array:
-        shift = np.zeros(self.chart.size + self.sensors.count)
+        shift = np.zeros(self.space.size + self.sensors.count)
         for column, entry in self._bias_columns():
             shift[entry] += values[column]
         return shift
 
     def _bias_columns(self) -> list[tuple[int, int]]:
         """Return (column of z, entry of a tangent vector) for each bias."""
-        names = (*tangent_space(self.model).names, *self.sensors.columns)
-        return [
-            (s.start, names.index(unknown.label))
-            for unknown, s in zip(self.unknowns.each, self.unknowns.slices, strict=True)
-            if unknown.quantity == BIAS
-        ]
+        names = (*self.space.names, *self.sensors.columns)
+        return [(s.start, names.index(u.label)) for u, s in self.unknowns.items() if u.quantity == BIAS]
 
     def _pull(self, z: Array) -> float:
         weak = np.sum(((z - self.unknowns.z_start) / self.unknowns.pulls) ** 2)
@@ -273,7 +269,7 @@ class Fit:
     def reduce(self, point: "FittedMotion", reach: float = 1.0) -> Reduced:
         """Linearize, close the gaps to first order, and eliminate the first states; `reach` enlarges their region."""
         z, starts, xs, residuals, gaps = point.z, point.starts, point.xs, point.residuals, point.gaps
-        s, nt, nz = point.segments, self.chart.size, len(z)
+        s, nt, nz = point.segments, self.space.size, len(z)
         A, C = self.law.slopes(z, xs, s.hs, s.us)
         if self.unknowns.delay is not None:
             flat = xs[:, 1:].reshape(-1, xs.shape[2]), s.us.reshape(-1, s.us.shape[2])
@@ -281,7 +277,7 @@ class Fit:
             C[..., self.unknowns.delay] = rates * s.by_delay[..., None]
         K, M, nx = A.shape[:3]
         along = np.zeros((K, M + 1, nx, nt + nz))
-        along[:, 0, :, :nt] = self.chart.from_motion(starts)
+        along[:, 0, :, :nt] = self.space.derivative_of_plus(starts)
         for m in range(M):
             along[:, m + 1] = A[:, m] @ along[:, m]
             along[:, m + 1, :, nt:] += C[:, m]
@@ -293,7 +289,7 @@ class Fit:
             for k in np.flatnonzero(s.of_piece == p):
                 nodes.append((D, e))
                 states = xs[k, s.at[k]]
-                moved = self.chart.to_motion(states) @ along[k, s.at[k]]
+                moved = self.space.derivative_of_minus(states) @ along[k, s.at[k]]
                 if read:
                     by_x, by_z = read[k]
                     of_outputs = by_x @ moved
@@ -308,7 +304,7 @@ class Fit:
                 seen = np.isfinite(r)
                 rows.append(np.column_stack([J[seen], r[seen]]))
                 linearized[s.samples[k]] = r
-                end = self.chart.to_motion(xs[k, s.counts[k]]) @ along[k, s.counts[k]]
+                end = self.space.derivative_of_minus(xs[k, s.counts[k]]) @ along[k, s.counts[k]]
                 e = end[:, :nt] @ e + gaps[k]
                 D = end[:, :nt] @ D
                 D[:, nt:] += end[:, nt:]
@@ -353,12 +349,12 @@ class Fit:
             first[p] = np.linalg.lstsq(R, b - R_z @ dz, rcond=1e-14)[0]
         for k, (D, e) in enumerate(reduced.nodes):
             d = D @ np.concatenate([first[int(self.segments.of_piece[k])], dz]) + e
-            after[k] = self.chart.plus(starts[k], fraction * d)
+            after[k] = self.space.plus(starts[k], fraction * d)
         return after
 
     def by(self, law: Law) -> "Fit":
         """Return the same fit with another law, whose segments have the same length."""
-        arguments = self.model, law, self.chart, self.unknowns, self.segments.pieces, self.noise
+        arguments = self.model, law, self.unknowns, self.segments.pieces, self.noise
         return Fit(*arguments, sensors=self.sensors, fixed=self.fixed)
 
     def solve(self, z: Array, starts: Array, most: int) -> "Solved":
@@ -451,7 +447,7 @@ class Solved:
 
 def growth_cuts(fit: Fit, z: Array, starts: Array) -> list[Excerpt]:
     """Return the pieces, cut where a perturbation of their start has grown by GROWTH."""
-    s, nt = fit.segments, fit.chart.size
+    s, nt = fit.segments, fit.space.size
     point = fit.at(z, starts)
     if point is None:
         return list(s.pieces)

@@ -10,6 +10,7 @@ from scipy import stats
 
 from drake_diff._base.arrays import Array, frozen, positive_int
 from drake_diff._base.values import Refusal
+from drake_diff.certificates.truth import overlaps_along
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.identification.fit import Fit, Solved, growth_cuts
@@ -19,6 +20,7 @@ from drake_diff.identification.judge import (
     FALSE_ALARM,
     Known,
     colour_of,
+    covariance_of,
     freedom_of,
     intervals_of,
     known_of,
@@ -29,7 +31,6 @@ from drake_diff.identification.judge import (
 from drake_diff.identification.messages import unidentifiable
 from drake_diff.identification.motion import Law, TreeMotion, discrete_motion
 from drake_diff.identification.recordings import (
-    Chart,
     Excerpt,
     columns_of,
     given_noise,
@@ -42,9 +43,7 @@ from drake_diff.identification.results import Followed, Identification, Request,
 from drake_diff.identification.sensors import Sensors, choose_sensors
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import Unknowns, choose_unknowns
-from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
-from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
 
 MOTIONS = ("auto", "continuous", "steps", "impacts")
@@ -119,9 +118,9 @@ def identify(
         raise UnknownNameError("motion", got=motion, known=MOTIONS)
     given, files = read_given(model, recordings)
     columns = columns_of(given)
-    chart, pieces = Chart(coordinates_of(model)), read_pieces(model, given, held_out, columns)
+    pieces = read_pieces(model, given, held_out, columns)
     tree = tree_for_identification(model)
-    why = str(tree) if isinstance(tree, Refusal) else what_acts(model, chart, pieces)
+    why = str(tree) if isinstance(tree, Refusal) else what_acts(model, pieces)
     if motion == "continuous" and isinstance(tree, Refusal):
         raise ModelError(f"{model.name}: motion in continuous time is not supported: {why}")
     continuous = motion == "continuous" or (motion == "auto" and not why)
@@ -130,9 +129,9 @@ def identify(
         raise ModelError(f"{model.name}: sensors need motion in continuous time, but {why or 'steps are fitted'}")
     outputs = choose_sensors(model, own_tree, columns, sensors)
     unknowns = choose_unknowns(model, own_tree, parameters, priors, bounds, columns)
-    stated = given_noise(model, chart, noise, columns)
-    scatter = noise_by_differences(chart, pieces)
-    problem = Problem(model, chart, unknowns, pieces, stated, scatter, outputs)
+    stated = given_noise(model, noise, columns)
+    scatter = noise_by_differences(model, pieces)
+    problem = Problem(model, unknowns, pieces, stated, scatter, outputs)
     if motion == "impacts":
         if priors or bounds:
             raise InputError("priors and bounds", got="given", expected='no priors and no bounds with motion="impacts"')
@@ -160,7 +159,7 @@ def identify(
     return replace(result, asked=asked)
 
 
-def what_acts(model: Model, chart: Chart, pieces: Sequence[Excerpt]) -> str:
+def what_acts(model: Model, pieces: Sequence[Excerpt]) -> str:
     """Return what acts in the recordings but not in continuous-time motion (contact, limits), or "" if nothing."""
     lower, upper = model.position_limits
     for piece in pieces:
@@ -169,11 +168,8 @@ def what_acts(model: Model, chart: Chart, pieces: Sequence[Excerpt]) -> str:
             beyond = np.any((q < lower) | (q > upper), axis=0)
         if np.any(beyond):
             return f"{model.position_names[int(np.argmax(beyond))]} is beyond its limit"
-        if model.contract.contact.collision_pairs:
-            for x in guess_states(model, chart, piece, np.arange(len(piece.times))):
-                set_state(model.double, x)
-                if model.double.overlaps():
-                    return TOUCH
+        if any(overlaps_along(model, guess_states(model, piece, np.arange(len(piece.times))))):
+            return TOUCH
     return ""
 
 
@@ -182,7 +178,6 @@ class Problem:
     """An estimation problem: recordings, unknowns, and the noise that weights the residuals."""
 
     model: Model
-    chart: Chart
     unknowns: Unknowns
     pieces: list[Excerpt]
     stated: Array  # (2 nv + m,) the given noise; NaN if not given
@@ -196,11 +191,11 @@ class Problem:
         return (*tangent_space(self.model).names, *(() if self.sensors is None else self.sensors.columns))
 
     def fit(self, law: Law, pieces: Sequence[Excerpt], noise: Array, *, fixed: bool = False) -> Fit:
-        return Fit(self.model, law, self.chart, self.unknowns, pieces, noise, sensors=self.sensors, fixed=fixed)
+        return Fit(self.model, law, self.unknowns, pieces, noise, sensors=self.sensors, fixed=fixed)
 
     def guess(self, fit: Fit) -> Array:
         s = fit.segments
-        guesses = [guess_states(self.model, self.chart, p, s.first[s.of_piece == i]) for i, p in enumerate(s.pieces)]
+        guesses = [guess_states(self.model, p, s.first[s.of_piece == i]) for i, p in enumerate(s.pieces)]
         return np.concatenate(guesses)
 
     @property
@@ -265,7 +260,8 @@ class Problem:
                 segments = other.cut(self.unknowns.values(z))
                 xs = law.run(self.unknowns.values(z), starts, segments.hs, segments.us)
             ends.append(xs[np.arange(len(xs)), segments.counts])
-        gap = self.chart.minus(*ends) / fit.gap_scale
+        with np.errstate(over="ignore", invalid="ignore"):
+            gap = fit.space.minus(*ends) / fit.gap_scale
         return bool(np.all(np.isfinite(gap)) and np.max(np.abs(gap)) <= STEP_ERROR)
 
     def shortened(self, fit: Fit, pieces: Sequence[Excerpt], noise: Array) -> Fit:
@@ -296,16 +292,11 @@ class Problem:
         freedom = freedom_of(fit, solved)
         known = known_of(unknowns, z, solved.reduced.R)
         intervals = intervals_of(unknowns, z, known.covariance, freedom.left)
-        values, by_z = unknowns.values(z), unknowns.by_z(z)
         before, after, why_not, motions = self._predicted(fit, solved, known, freedom.left)
         reason = self.doubt(fit, solved, why_not)
-        lost = ~np.isfinite(np.diag(known.covariance))
-        covariance = by_z @ np.where(np.isfinite(known.covariance), known.covariance, 0.0) @ by_z.T
-        hidden = np.any(by_z[:, lost] != 0, axis=1)
-        covariance[hidden, hidden] = np.inf
         return identification(
             unknowns,
-            values,
+            unknowns.values(z),
             intervals,
             open_=unidentifiable(unknowns, z, known.open),
             errors=(before, after),
@@ -313,7 +304,7 @@ class Problem:
             noise={n: float(s) for n, s in zip(self.entries, fit.noise, strict=True) if np.isfinite(s)},
             residuals=tuple(frozen(r) for r in solved.reduced.residuals),
             entries=self.entries,
-            covariance=frozen(covariance),
+            covariance=frozen(covariance_of(unknowns, z, known.covariance)),
             score=score_of(fit, solved),
             count=freedom.numbers,
             converged=solved.converged,

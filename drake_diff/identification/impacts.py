@@ -23,19 +23,20 @@ import numpy as np
 from scipy import stats
 
 from drake_diff._base.arrays import Array, frozen, positive_float
+from drake_diff.certificates.truth import overlaps_along
 from drake_diff.comparison.recordings import CLOCK_TOLERANCE, Recording
 from drake_diff.derivatives.step import derivatives_along
 from drake_diff.exceptions import InputError, SimulationError
 from drake_diff.identification.judge import SCATTER
 from drake_diff.identification.motion import DiscreteMotion, discrete_motion
-from drake_diff.identification.recordings import Chart, Excerpt, noise_by_differences, read_pieces
+from drake_diff.identification.recordings import Excerpt, noise_by_differences, read_pieces
 from drake_diff.identification.results import Followed, Identification, identification
 from drake_diff.identification.unknowns import BIAS, CENTER, INERTIA, STRENGTH, Unknown, Unknowns, choose_unknowns
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
-from drake_diff.model.step import advance, set_state
-from drake_diff.model.tangent import tangent_space
+from drake_diff.model.tangent import TangentSpace, tangent_space
+from drake_diff.motion.rollout import roll_states
 
 LEAST = 6  # minimum number of samples of a flight, which must determine a velocity
 CLEAR = 1  # samples between a flight and a sample at which shapes overlap
@@ -46,11 +47,7 @@ def flights_of(model: Model, xs: Array) -> list[tuple[int, int]]:
     """Return the first and last sample of each part of xs (n, nx) without contact."""
     if not model.contract.contact.collision_pairs:
         return [(0, len(xs) - 1)]
-    touching = np.zeros(len(xs), dtype=bool)
-    for k, x in enumerate(xs):
-        set_state(model.double, x)
-        touching[k] = model.double.overlaps()
-    edges = np.flatnonzero(np.diff(np.concatenate([[1], touching.astype(int), [1]])))
+    edges = np.flatnonzero(np.diff(np.array([True, *overlaps_along(model, xs), True], dtype=int)))
     flights = []
     for first, end in edges.reshape(-1, 2):
         a, b = first + CLEAR * (first > 0), end - 1 - CLEAR * (end < len(xs))
@@ -65,33 +62,33 @@ class Start(NamedTuple):
     x: Array  # (nx,)
     spread: Array  # (2 nv, k): tangent vectors at x, of one standard deviation each
 
-    def others(self, chart: Chart, count: int, random: np.random.Generator) -> list[Array]:
+    def others(self, space: TangentSpace, random: np.random.Generator) -> list[Array]:
         """Draw first states (nx,) that agree with the same positions."""
-        return [chart.plus(self.x, self.spread @ random.standard_normal(self.spread.shape[1])) for _ in range(count)]
+        return [space.plus(self.x, self.spread @ random.standard_normal(self.spread.shape[1])) for _ in range(OTHERS)]
 
 
-def start_of(model: Model, chart: Chart, piece: Excerpt, scale: Array) -> Start:
+def start_of(model: Model, piece: Excerpt, scale: Array) -> Start:
     """Fit the first state of a piece without contact to its measured positions.
 
     The fit is by least squares, with each position in units of its `scale` (nv,). The spread is from the scatter of the
     residuals. Applied parameters take effect.
     """
-    stride, nv = steps_between(model, piece), model.nv
+    stride, nv, space = steps_between(model, piece), model.nv, tangent_space(model)
     us, x, none = np.repeat(piece.us, stride, axis=0), piece.ys[0], select(model, ())
     for _ in range(ITERATIONS):
         steps = derivatives_along(model, x, us, vector=none)
         xs = np.array([x] + [step.x_next for step in steps[stride - 1 :: stride]])
-        by_start, slopes = chart.from_motion(x), []
+        by_start, slopes = space.derivative_of_plus(x), []
         for k, step in enumerate(steps):
             if k % stride == 0:
                 slopes.append(by_start)
             by_start = step.A @ by_start
         slopes.append(by_start)
-        J = (chart.to_motion(xs) @ np.array(slopes))[:, :nv] / scale[:, None]
-        e = chart.minus(piece.ys, xs)[:, :nv] / scale
+        J = (space.derivative_of_minus(xs) @ np.array(slopes))[:, :nv] / scale[:, None]
+        e = space.minus(piece.ys, xs)[:, :nv] / scale
         inverse = np.linalg.pinv(J.reshape(-1, 2 * nv))
         d = np.asarray(inverse @ e.ravel(), dtype=float)
-        x = chart.plus(x, d)
+        x = space.plus(x, d)
     left = np.sqrt(np.sum((e - J @ d) ** 2, axis=0) / (len(e) - 2))  # minus two fitted numbers: position and velocity
     return Start(np.asarray(x), inverse * np.tile(left, len(e)))
 
@@ -107,10 +104,10 @@ def steps_between(model: Model, piece: Excerpt) -> int:
     return count
 
 
-def millisecond(chart: Chart, pieces: list[Excerpt]) -> Array:
+def millisecond(model: Model, pieces: list[Excerpt]) -> Array:
     """Return the distance (nv,) that each position moves in 1 ms: the effect of a change of an impact's time."""
-    speeds = np.sqrt(np.mean(np.concatenate([p.ys[:, chart.coordinates.nq :] ** 2 for p in pieces]), axis=0))
-    for _, j in chart.coordinates.free:  # its motion may have no component along an axis
+    speeds = np.sqrt(np.mean(np.concatenate([p.ys[:, model.nq :] ** 2 for p in pieces]), axis=0))
+    for _, j in coordinates_of(model).free:  # its motion may have no component along an axis
         for three in (slice(j, j + 3), slice(j + 3, j + 6)):
             speeds[three] = np.sqrt(np.mean(speeds[three] ** 2))
     return np.asarray(1e-3 * np.maximum(speeds, max(1e-3 * np.max(speeds), 1e-9)))
@@ -144,12 +141,11 @@ def first_state(model: Model, recording: Recording, *, parameters: Mapping[str, 
         1.0
     """
     (piece,) = read_pieces(model, recording, 0.0)
-    chart, vector = Chart(coordinates_of(model)), select(model, parameters or ())
     flights = flights_of(model, piece.ys)
     if not flights or flights[0][0] > 0:
         return np.array(piece.ys[0])
-    with applied(vector) as applied_model:
-        return start_of(applied_model, chart, piece.part(*flights[0]), millisecond(chart, [piece])).x
+    with applied(select(model, parameters or ())) as applied_model:
+        return start_of(applied_model, piece.part(*flights[0]), millisecond(model, [piece])).x
 
 
 ROUNDS = 5  # of iterative reweighting
@@ -270,7 +266,7 @@ class ImpactSearch:
         build: Build | None = None,
     ):
         self.model, self.build, self.lengths, self.names = model, build, dict(lengths or {}), names
-        self.chart, self.pieces = Chart(coordinates_of(model)), list(pieces)
+        self.space, self.pieces = tangent_space(model), list(pieces)
         for piece in self.pieces:
             if np.any(np.isnan(piece.ys)):
                 raise InputError(f"recording {piece.name}", got="NaN", expected="measured positions and velocities")
@@ -280,7 +276,7 @@ class ImpactSearch:
         self.unknowns = Unknowns((*chosen.each, *of_lengths))
         scales = [(*self._scale(unknown),) for unknown in self.unknowns.each for _ in unknown.start]
         self.scale, self.by_log = np.array([s for s, _ in scales]), np.array([b for _, b in scales], dtype=bool)
-        self.unit = millisecond(self.chart, [piece for piece in self.pieces if not piece.held_out])
+        self.unit = millisecond(model, [piece for piece in self.pieces if not piece.held_out])
 
     def _scale(self, unknown: Unknown) -> tuple[float, bool]:
         """Return the change of the unknown for w = 1, and whether it is a change of the logarithm."""
@@ -337,7 +333,7 @@ class ImpactSearch:
                     segments.append(Segment(p, 0, min(count, last), piece.ys[0]))
                 for a, b in flights:
                     if a == 0 or np.isfinite(length):
-                        start = start_of(model, self.chart, piece.part(a, b), self.unit)
+                        start = start_of(model, piece.part(a, b), self.unit)
                         segments.append(Segment(p, a, min(b + count, last), start.x))
                 rest = max(0, last - max(5, round(REST / period)))
                 segments.append(Segment(p, rest, last, piece.ys[rest]))
@@ -351,7 +347,7 @@ class ImpactSearch:
                 flights = flights_of(model, piece.ys)
                 is_flying = flights and flights[0][0] == 0
                 starts.append(
-                    start_of(model, self.chart, piece.part(*flights[0]), self.unit)
+                    start_of(model, piece.part(*flights[0]), self.unit)
                     if is_flying
                     else Start(piece.ys[0], np.diag(noise))
                 )
@@ -371,22 +367,19 @@ class ImpactSearch:
         with applied(self.vector(w)) as model:
             for segment in segments:
                 piece = self.pieces[segment.piece].part(segment.first, segment.last)
-                x, xs = segment.x0 - shift, np.full((len(piece.us), self.model.nx), np.nan)
+                stride = steps_between(model, piece)
                 try:
-                    for k, u in enumerate(piece.us):
-                        for _ in range(steps_between(model, piece)):
-                            x = advance(model.double, x, u)
-                        xs[k] = x + shift
+                    xs = roll_states(model, segment.x0 - shift, np.repeat(piece.us, stride, axis=0))[stride::stride]
                 except SimulationError:
-                    xs[:] = np.nan
-                motions.append(xs)
+                    xs = np.full((len(piece.us), self.model.nx), np.nan)
+                motions.append(xs + shift)
         return motions
 
     def residual(self, w: Array, segments: Sequence[Segment]) -> Array:
         """Return measured minus simulated positions at every third sample of all segments, concatenated."""
         residuals = []
         for segment, xs in zip(segments, self.motions(w, segments), strict=True):
-            e = self.chart.minus(self.pieces[segment.piece].ys[segment.first + 1 : segment.last + 1], xs)
+            e = self.space.minus(self.pieces[segment.piece].ys[segment.first + 1 : segment.last + 1], xs)
             residuals.append((e[:, : self.model.nv] / self.unit)[SAMPLES - 1 :: SAMPLES].ravel())
         r = np.concatenate(residuals)
         return np.asarray(np.clip(np.where(np.isfinite(r), r, LOST), -LOST, LOST))
@@ -466,8 +459,8 @@ def identify_contact(
         raise InputError("model", got=got, expected=expected)
     begin = {name: positive_float(name, value) for name, value in (lengths or {}).items()}
     first_model, build = (model, None) if isinstance(model, Model) else (model(**begin), model)
-    pieces, chart = read_pieces(first_model, recordings, 0.0), Chart(coordinates_of(first_model))
-    noise = noise_by_differences(chart, pieces)
+    pieces = read_pieces(first_model, recordings, 0.0)
+    noise = noise_by_differences(first_model, pieces)
     return fit_through_impacts(first_model, pieces, parameters, noise, lengths=begin, build=build, seed=seed)
 
 
@@ -557,14 +550,14 @@ def _predicted(search: ImpactSearch, w: Array, noise: Array) -> tuple[list[Array
     """Return the motion (n, nx) of each recording, and residuals (n, 2 nv) in units of their noise; NaN for v."""
     starts, random, nv = search.starts(w, noise), np.random.default_rng(SEED), search.model.nv
     xs = search.recordings(w, [start.x for start in starts])
-    others = [start.others(search.chart, OTHERS, random) for start in starts]
+    others = [start.others(search.space, random) for start in starts]
     squares = [np.zeros((len(x), 2 * nv)) for x in xs]
     for k in range(OTHERS):
         for square, other, x in zip(squares, search.recordings(w, [draws[k] for draws in others]), xs, strict=True):
-            square += search.chart.minus(other, x) ** 2 / OTHERS
+            square += search.space.minus(other, x) ** 2 / OTHERS
     left = []
     for piece, x, square in zip(search.pieces, xs, squares, strict=True):
-        r = search.chart.minus(piece.ys, x) / np.sqrt(noise**2 + square)
+        r = search.space.minus(piece.ys, x) / np.sqrt(noise**2 + square)
         r[:, nv:] = np.nan
         left.append(r)
     return xs, left

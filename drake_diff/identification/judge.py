@@ -69,14 +69,18 @@ def _sparse(directions: Array) -> list[Array]:
     return basis
 
 
+def covariance_of(unknowns: Unknowns, z: Array, covariance: Array) -> Array:
+    """Return the covariance (np, np) of the values for that of z; its diagonal is infinite if nothing is known."""
+    by_z, lost = unknowns.by_z(z), ~np.isfinite(np.diag(covariance))
+    of_values = by_z @ np.where(np.isfinite(covariance), covariance, 0.0) @ by_z.T
+    hidden = np.any(by_z[:, lost] != 0, axis=1)
+    of_values[hidden, hidden] = np.inf
+    return np.asarray(of_values)
+
+
 def deviations_of(unknowns: Unknowns, z: Array, covariance: Array) -> Array:
     """Return the standard deviations (np,) of the values for a covariance of z; infinite if nothing is known."""
-    by_z = unknowns.by_z(z)
-    finite = np.where(np.isfinite(np.diag(covariance)), 1.0, 0.0)
-    safe = np.where(np.isfinite(covariance), covariance, 0.0)
-    spread = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", by_z, safe, by_z), 0.0))
-    spread[(np.abs(by_z) @ (1 - finite)) > 0] = np.inf
-    return np.asarray(spread)
+    return np.asarray(np.sqrt(np.maximum(np.diag(covariance_of(unknowns, z, covariance)), 0.0)))
 
 
 def intervals_of(unknowns: Unknowns, z: Array, covariance: Array, freedom: float) -> Array:
@@ -84,7 +88,7 @@ def intervals_of(unknowns: Unknowns, z: Array, covariance: Array, freedom: float
     t = float(stats.t.ppf((1 + CONFIDENCE) / 2, max(freedom, 1.0)))
     values, spread = unknowns.values(z), deviations_of(unknowns, z, covariance)
     intervals = np.empty((len(z), 2))
-    for unknown, s in zip(unknowns.each, unknowns.slices, strict=True):
+    for unknown, s in unknowns.items():
         if unknown.quantity == MASS:
             wide = t * spread[s] / values[s]
             with np.errstate(over="ignore"):

@@ -35,6 +35,7 @@ from drake_diff.mechanics.coordinates import euler_jacobian, euler_step
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameter, ParameterVector, applied, select
 from drake_diff.model.step import advance
+from drake_diff.motion.rollout import roll_states
 
 MOST_PHASES = 60  # maximum number of phases of a step: a step with more is given up, and its state is NaN
 SEARCHED, MET = 99, 1e-9  # iterations of the search for a phase's end; its tolerance [rad/s, m/s] or of friction
@@ -339,12 +340,10 @@ class DiscreteMotion:
 
     def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
         """Return the states (K, M+1, nx) from starts (K, nx) by steps of hs (K, M) [s], 0 for none, under us."""
-        vector = self.vector.at(values[self.own])
-        xs = np.repeat(starts[:, None], hs.shape[1] + 1, axis=1)
-        with applied(vector) as model:
+        xs = np.empty((len(starts), hs.shape[1] + 1, self.model.nx))
+        with applied(self.vector.at(values[self.own])) as model:
             for k, count in enumerate(np.count_nonzero(hs, axis=1)):
-                for i in range(count):
-                    xs[k, i + 1] = advance(model.double, xs[k, i], us[k, i])
+                xs[k, : count + 1] = roll_states(model, starts[k], us[k, :count])
                 xs[k, count + 1 :] = xs[k, count]
         return xs
 
@@ -414,7 +413,6 @@ def discrete_motion(model: Model, unknowns: Unknowns, pieces: Sequence[Excerpt])
     h = period / max(1, round(period / model.time_step))
     if abs(h - model.time_step) > CLOCK_TOLERANCE * model.time_step:
         model = model.at_time_step(h)
-    parameters = [unknown for unknown in unknowns.each if unknown.quantity != BIAS]
-    places = [s for unknown, s in zip(unknowns.each, unknowns.slices, strict=True) if unknown.quantity != BIAS]
-    entries = np.concatenate([np.arange(s.start, s.stop) for s in places]) if places else np.zeros(0, dtype=int)
-    return DiscreteMotion(model, unknowns, select(model, [unknown.name for unknown in parameters]), entries)
+    parameters = {unknown.name: s for unknown, s in unknowns.items() if unknown.quantity != BIAS}
+    entries = [i for s in parameters.values() for i in range(s.start, s.stop)]
+    return DiscreteMotion(model, unknowns, select(model, list(parameters)), np.array(entries, dtype=int))

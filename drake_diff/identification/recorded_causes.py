@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array
 from drake_diff.comparison.files import MOTION, PAGE, REPLAY, TRACE, hash_of_arrays, made_of_record, row_of
 from drake_diff.comparison.recordings import Recording, place_of, read_arrays
 from drake_diff.comparison.result import slug
@@ -24,7 +23,8 @@ from drake_diff.identification.explain import explain
 from drake_diff.logs.mcap_file import read_mcap
 from drake_diff.model.model import Model
 from drake_diff.runs.differences import ABSOLUTE, NUMBER, Reproduced, is_near
-from drake_diff.runs.other_records import CauseEvidence, ComparisonRecord, Numbers
+from drake_diff.runs.fields import plain
+from drake_diff.runs.other_records import CauseEvidence, ComparisonRecord
 from drake_diff.runs.provenance import contract_of, model_input
 from drake_diff.runs.rebuild import rebuilt
 from drake_diff.runs.reproduce import as_given
@@ -202,13 +202,9 @@ def cause_of(model: Model, recording: Recording) -> CauseEvidence:
         return CauseEvidence(names=[], values={}, intervals={}, alternatives=[], explained=False, sentence=sentence)
     return CauseEvidence(
         names=list(explanation.names),
-        values={name: _numbers(np.atleast_1d(value)) for name, value in explanation.values.items()},
-        intervals={n: [_numbers(row) for row in np.atleast_2d(ends)] for n, ends in explanation.intervals.items()},
+        values={name: plain(np.atleast_1d(value)) for name, value in explanation.values.items()},
+        intervals={name: plain(np.atleast_2d(ends)) for name, ends in explanation.intervals.items()},
         alternatives=[list(names) for names in explanation.alternatives],
         explained=explanation.explained,
         sentence=explanation.sentence,
     )
-
-
-def _numbers(values: Array) -> Numbers:
-    return [float(value) if np.isfinite(value) else None for value in values]

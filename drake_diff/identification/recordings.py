@@ -13,82 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_diff._base.arrays import MOST_STEPS, Array, array_with_gaps, finite_array
-from drake_diff.comparison.recordings import Recording, check_sizes, read_recording
+from drake_diff._base.arrays import MOST_STEPS, Array, array_with_gaps
+from drake_diff.comparison.recordings import Recording, check_sizes, checked_motion, read_recording
 from drake_diff.exceptions import InputError, UnknownNameError
-from drake_diff.mechanics.coordinates import Coordinates
+from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 from drake_diff.model.tangent import tangent_space
-
-
-@dataclass(frozen=True, eq=False)
-class Chart:
-    """The chart between states (..., nx) and tangent vectors (..., 2 nv)."""
-
-    coordinates: Coordinates
-
-    @property
-    def size(self) -> int:
-        return 2 * self.coordinates.nv
-
-    def plus(self, x: Array, d: Array) -> Array:
-        """Return the states x moved by the tangent vectors d; quaternions are normalized."""
-        nq, nv = self.coordinates.nq, self.coordinates.nv
-        moved = np.concatenate([x[..., :nq], x[..., nq:] + d[..., nv:]], axis=-1)
-        for i, j in self.coordinates.single:
-            moved[..., i] += d[..., j]
-        for i, j in self.coordinates.free:
-            small = np.concatenate([np.ones((*d.shape[:-1], 1)), d[..., j : j + 3] / 2], axis=-1)
-            turned = _product(small, x[..., i : i + 4])
-            moved[..., i : i + 4] = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
-            moved[..., i + 4 : i + 7] += d[..., j + 3 : j + 6]
-        return moved
-
-    def minus(self, y: Array, x: Array) -> Array:
-        """Return the tangent vector from x to y; NaN where y is NaN."""
-        nq, nv = self.coordinates.nq, self.coordinates.nv
-        motion = np.empty((*np.broadcast_shapes(y.shape, x.shape)[:-1], 2 * nv))
-        motion[..., nv:] = y[..., nq:] - x[..., nq:]
-        for i, j in self.coordinates.single:
-            motion[..., j] = y[..., i] - x[..., i]
-        for i, j in self.coordinates.free:
-            between = _product(y[..., i : i + 4], x[..., i : i + 4] * np.array([1.0, -1.0, -1.0, -1.0]))
-            with np.errstate(divide="ignore", invalid="ignore"):
-                motion[..., j : j + 3] = 2 * between[..., 1:] / between[..., :1]
-            motion[..., j + 3 : j + 6] = y[..., i + 4 : i + 7] - x[..., i + 4 : i + 7]
-        return motion
-
-    def to_motion(self, x: Array) -> Array:
-        """Return the matrices (..., 2 nv, nx) from changes of the state to tangent vectors."""
-        nq, nv = self.coordinates.nq, self.coordinates.nv
-        matrix = np.zeros((*x.shape[:-1], 2 * nv, nq + nv))
-        matrix[..., :nv, :nq] = self.coordinates.motion(x[..., :nq])
-        matrix[..., nv:, nq:] = np.eye(nv)
-        return matrix
-
-    def from_motion(self, x: Array) -> Array:
-        """Return the matrices (..., nx, 2 nv) from tangent vectors to changes of the state."""
-        nq, nv = self.coordinates.nq, self.coordinates.nv
-        matrix = np.zeros((*x.shape[:-1], nq + nv, 2 * nv))
-        matrix[..., :nq, :nv] = self.coordinates.rate(x[..., :nq])
-        matrix[..., nq:, nv:] = np.eye(nv)
-        return matrix
-
-
-def _product(a: Array, b: Array) -> Array:
-    """Return the product a * b of quaternions (w, x, y, z)."""
-    aw, ax, ay, az = np.moveaxis(a, -1, 0)
-    bw, bx, by, bz = np.moveaxis(b, -1, 0)
-    return np.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=-1,
-    )
-
 
 LEAST = 8  # minimum number of samples of a piece
 WINDOW = 9  # minimum number of samples for a cubic fit
@@ -203,19 +133,8 @@ def columns_of(recordings: Sequence[Recording]) -> tuple[str, ...]:
 
 def _checked(recording: Recording, model: Model, columns: Sequence[str]) -> Excerpt:
     subject = f"recording {recording.name}"
-    times = finite_array(f"{subject}: times", recording.times, ("n",))
-    if len(times) < LEAST:
-        raise InputError(f"{subject}: samples", got=len(times), expected=f"{LEAST} or more")
-    if np.any(np.diff(times) <= 0):
-        k = int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1
-        raise InputError(
-            f"{subject}: time of sample {k}", got=f"{times[k]} s", expected="a time after the previous sample"
-        )
-    ys = np.array(array_with_gaps(f"{subject}: xs", recording.xs, (len(times), model.nx)))
-    us = finite_array(f"{subject}: us", recording.us, (len(times) - 1, model.nu))
-    check_sizes(f"{subject}: times", times[:, None], ["s"])
-    check_sizes(f"{subject}: xs", ys, model.state_names)
-    check_sizes(f"{subject}: us", us, model.input_names)
+    times, xs, us = checked_motion(recording, model, least=LEAST, gaps=True)
+    ys = np.array(xs)
     if times[-1] - times[0] > MOST_STEPS * model.time_step:
         k = int(np.argmax(np.diff(times)))
         got = f"{times[-1] - times[0]:.6g} s, with {times[k + 1] - times[k]:.6g} s between samples {k} and {k + 1}"
@@ -242,7 +161,7 @@ def _checked(recording: Recording, model: Model, columns: Sequence[str]) -> Exce
     return Excerpt(recording.name, times - times[0], ys, us, held_out=False, outs=outs)
 
 
-def given_noise(model: Model, chart: Chart, noise: Mapping[str, float] | None, columns: Sequence[str] = ()) -> Array:
+def given_noise(model: Model, noise: Mapping[str, float] | None, columns: Sequence[str] = ()) -> Array:
     """Return the user's noise (2 nv + m,) of each entry; NaN if not given.
 
     Names are those of states; a free body's rotation is named base_rx, base_ry, base_rz.
@@ -258,13 +177,14 @@ def given_noise(model: Model, chart: Chart, noise: Mapping[str, float] | None, c
     return deviations
 
 
-def noise_by_differences(chart: Chart, pieces: Sequence[Excerpt], *, jumps: bool = False) -> Array:
+def noise_by_differences(model: Model, pieces: Sequence[Excerpt], *, jumps: bool = False) -> Array:
     """Return an upper estimate (2 nv + m,) of the noise of each entry: the least by differences of orders 1 to ORDERS.
 
     White noise s gives the difference of order d the deviation s sqrt(binomial(2 d, d)); motion increases it. If the
     motion `jumps`, as at impacts, the median of the differences is used, as jumps are few.
     """
-    increments = [chart.minus(piece.ys[1:], piece.ys[:-1]) for piece in pieces]
+    space = tangent_space(model)
+    increments = [space.minus(piece.ys[1:], piece.ys[:-1]) for piece in pieces]
     increments = [
         rows if piece.outs is None else np.hstack([rows, np.diff(piece.outs, axis=0)])
         for rows, piece in zip(increments, pieces, strict=True)
@@ -288,12 +208,12 @@ def noise_by_differences(chart: Chart, pieces: Sequence[Excerpt], *, jumps: bool
     return np.where(seen, np.maximum(least, NO_NOISE * np.maximum(reach, 1e-3)), np.nan)
 
 
-def guess_states(model: Model, chart: Chart, piece: Excerpt, samples: NDArray[np.intp]) -> Array:
+def guess_states(model: Model, piece: Excerpt, samples: NDArray[np.intp]) -> Array:
     """Guess states (len(samples), nx) at some samples by cubic fits to the samples around each.
 
     An unmeasured velocity is the derivative of its position. An unmeasured position is the model's default.
     """
-    nq, default = model.nq, model.default_state
+    nq, default, coordinates = model.nq, model.default_state, coordinates_of(model)
     states = np.empty((len(samples), model.nx))
     seen = [(piece.times[known], y[known]) for y in piece.ys.T for known in [np.isfinite(y)]]
     for row, k in enumerate(samples):
@@ -302,13 +222,13 @@ def guess_states(model: Model, chart: Chart, piece: Excerpt, samples: NDArray[np
             fitted = _cubic(*seen[i], piece.times[k])
             if fitted is not None:
                 q[i], q_dot[i] = fitted
-        for i, _ in chart.coordinates.free:
+        for i, _ in coordinates.free:
             q[i : i + 4] /= np.linalg.norm(q[i : i + 4])
         for i in range(model.nv):
             fitted = _cubic(*seen[nq + i], piece.times[k])
             if fitted is not None:
                 v[i] = fitted[0]
-        slope = chart.coordinates.motion(q) @ q_dot
+        slope = coordinates.motion(q) @ q_dot
         states[row] = np.concatenate([q, np.where(np.isnan(v), slope, v)])
     return states
 

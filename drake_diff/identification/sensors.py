@@ -12,10 +12,10 @@ from pydrake.math import RollPitchYaw
 
 from drake_diff._base.arrays import Array, cross, finite_array
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.identification.recordings import Chart
 from drake_diff.identification.tree import Tree, TreeDynamics
 from drake_diff.model.model import Model
 from drake_diff.model.plant import bodies, joints, labelled
+from drake_diff.model.tangent import TangentSpace
 
 AXES = ("x", "y", "z")
 OF_BODY = ("position", "gyro", "accel")  # [m] in world; [rad/s] and [m/s^2] in the sensor's frame
@@ -130,14 +130,13 @@ class Sensors:
             read[:, i] = dynamics.inverse_dynamics(q, v, a)[0][:, k]
         return read
 
-    def slopes(self, dynamics: TreeDynamics, x: Array, u: Array, by: Array) -> tuple[Array, Array]:
+    def slopes(self, space: TangentSpace, dynamics: TreeDynamics, x: Array, u: Array, by: Array) -> tuple[Array, Array]:
         """Return derivatives with respect to tangent vectors (N, m, 2 nv) and parameters (N, m, np) for `by`."""
-        nv, plus = dynamics.nv, Chart(dynamics.tree.coordinates).plus
-        a, by_state = dynamics.acceleration_jacobians(x, u, by)
+        nv, (a, by_state) = dynamics.nv, dynamics.acceleration_jacobians(x, u, by)
         q, v, numbers = x[:, : x.shape[1] - nv], x[:, -nv:], dynamics.numbers
         moved, by_a = np.zeros((len(x), self.count, 2 * nv)), np.zeros((len(x), self.count, nv))
         for j, e in enumerate(np.eye(nv)):  # quadratic in v, linear in a: central differences are exact
-            turned = [plus(x, np.tile(np.append(sign * STEP * e, 0 * e), (len(x), 1)))[:, :-nv] for sign in (1, -1)]
+            turned = [space.plus(x, np.append(sign * STEP * e, 0 * e))[:, :-nv] for sign in (1, -1)]
             ahead, back = (self._of_links(dynamics, q_end, v, a) for q_end in turned)
             moved[..., j] = (ahead - back) / (2 * STEP)
             ahead, back = (self._of_links(dynamics, q, v + sign * e, a) for sign in (1, -1))

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen, slices_of
+from drake_diff._base.differences import complex_steps
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.identification.tree import Numbers, Tree, ten_numbers
 from drake_diff.mechanics.description import names_of
@@ -182,7 +183,7 @@ class Unknowns:
 
     def by_z(self, z: Array) -> Array:
         """Return the derivative (np, np) of the values with respect to z."""
-        return by_complex_step(self.values, z)
+        return complex_steps(self.values, z)
 
     def named(self, values: Array) -> dict[str, Any]:
         """Return the values by name; a single entry becomes a float."""
@@ -209,16 +210,6 @@ class Unknowns:
                 if room_of_inertia(np.asarray(inertia, dtype=float)) < 0:
                     return False
         return True
-
-
-def by_complex_step(function: Any, z: Array) -> Array:
-    """Return the derivative (m, n) of an analytic function of z (n,), exact to rounding."""
-    tiny, columns = 1e-30, []
-    for j in range(len(z)):
-        moved = np.array(z, dtype=complex)
-        moved[j] += 1j * tiny
-        columns.append(np.imag(function(moved)) / tiny)
-    return np.array(columns).T if columns else np.zeros((len(function(z)), 0))
 
 
 def _spread(unknown: Unknown) -> float:
@@ -373,7 +364,7 @@ def numbers_at(model: Model, tree: Tree, unknowns: Unknowns, z: Array) -> tuple[
     def flat(z: Array) -> Array:
         return np.asarray(set_numbers(model, tree, unknowns, unknowns.values(z)).flat)
 
-    return set_numbers(model, tree, unknowns, unknowns.values(z)), by_complex_step(flat, z)
+    return set_numbers(model, tree, unknowns, unknowns.values(z)), complex_steps(flat, z)
 
 
 def set_numbers(model: Model, tree: Tree, unknowns: Unknowns, values: Any) -> Numbers:

@@ -6,7 +6,7 @@ channel are generated while they are written, so that a long motion is not store
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
@@ -20,6 +20,7 @@ from drake_diff._base.arrays import Array
 from drake_diff.exceptions import SimulationError
 from drake_diff.logs.mcap_file import Channel
 from drake_diff.model.contact import ContactPoint
+from drake_diff.model.contract import CoordinateTerms
 from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators, bodies, joints
 from drake_diff.model.step import set_state
@@ -123,16 +124,6 @@ GHOST = "planned/"  # prefix of a body's name for its planned frame
 Rows = Iterator[tuple[int, Any]]
 
 
-class Coordinate(Protocol):
-    """The properties of an entry of states or inputs that a channel needs."""
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def unit(self) -> str: ...
-
-
 @dataclass(frozen=True, eq=False)
 class Shown:
     """A model, its planned states, and the motion of the discrete plant if there is one."""
@@ -187,7 +178,7 @@ def _stamp(stamp: Any, time: float) -> None:
 
 
 def state_channel(
-    topic: str, times: Array, xs: Array, positions: Sequence[Coordinate], velocities: Sequence[Coordinate]
+    topic: str, times: Array, xs: Array, positions: Sequence[CoordinateTerms], velocities: Sequence[CoordinateTerms]
 ) -> Channel:
     """Return drake_diff.State of states (n, nx) at `times` (n,) [s], not rounded, with names and units as metadata."""
     kind, nq, parts = TYPES["State"], len(positions), {"q": positions, "v": velocities}
@@ -197,14 +188,14 @@ def state_channel(
     return Channel(topic, kind.cls, rows, _column_metadata(parts))
 
 
-def input_channel(topic: str, times: Array, us: Array, inputs: Sequence[Coordinate]) -> Channel:
+def input_channel(topic: str, times: Array, us: Array, inputs: Sequence[CoordinateTerms]) -> Channel:
     """Return drake_diff.Input of inputs (n, nu) at `times` (n,) [s]."""
     kind = TYPES["Input"]
     rows = ((nanoseconds(t), kind.cls(time=t, u=u)) for t, u in zip(times.tolist(), us.tolist(), strict=True))
     return Channel(topic, kind.cls, rows, _column_metadata({"u": inputs}))
 
 
-def _column_metadata(parts: Mapping[str, Sequence[Coordinate]]) -> dict[str, Any]:
+def _column_metadata(parts: Mapping[str, Sequence[CoordinateTerms]]) -> dict[str, Any]:
     units = {piece: {c.name: c.unit for c in coordinates} for piece, coordinates in parts.items()}
     names = {piece: [c.name for c in coordinates] for piece, coordinates in parts.items()}
     return {"units": {"time": "s", **units}, "names": names}

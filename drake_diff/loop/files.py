@@ -58,7 +58,7 @@ from drake_diff.runs import directory as directories
 from drake_diff.runs.differences import RELATIVE, Reproduced
 from drake_diff.runs.fields import Event, Failure, Label, Metric, plain, read_fields, reproducible
 from drake_diff.runs.measurement import contact_events, failure, invariants_of, measured
-from drake_diff.runs.page import PageCheck
+from drake_diff.runs.page import PageCheck, padded
 from drake_diff.runs.plan_record import ClosedLoopSection, LoopEvidence, PlanRecord, PredictiveControl, PushEvidence
 from drake_diff.runs.provenance import contract_of, header, model_input, write_bundle
 from drake_diff.runs.rebuild import GUESS, PLAN, TRACE, rebuilt
@@ -549,15 +549,15 @@ def loop_plots(
 
     def of_plant(rows: Array) -> Array:
         """Convert rows of the controller's steps to rows of the plant's steps."""
-        return _padded(np.repeat(rows, run.loop.substeps, axis=0), count)
+        return padded(np.repeat(rows, run.loop.substeps, axis=0), count)
 
     def lines(i: int, rows: Sequence[tuple[str, Array]], plan: Array | None, **options: Any) -> list[Line]:
         made = [Line(label, values[:, i], held=label != "true") for label, values in rows]
         return made if plan is None else [*made, Line("plan", plan[:, i], dashed=True, **options)]
 
-    true = _padded(run.xs, count)
+    true = padded(run.xs, count)
     states = ("true", true), ("observed", of_plant(run.observations)), ("estimated", of_plant(run.estimates))
-    plan_xs, plan_us = (None, None) if planned is None else (planned[0], _padded(planned[1], count))
+    plan_xs, plan_us = (None, None) if planned is None else (planned[0], padded(planned[1], count))
     order = np.arange(model.nx)
     if plan_xs is not None and scale is not None:
         order = np.argsort(-np.nanmax(np.abs(true - plan_xs), axis=0) / scale, kind="stable")
@@ -577,12 +577,6 @@ def loop_plots(
     ok = of_plant(np.array([[float(status == OK)] for status in run.controller_status]).reshape(-1, 1))
     status = [Line("status", ok[:, 0], held=True)]
     yield Plot("controller status", "1: ok", times, status, range=[-0.1, 1.1], note=note, group="Inputs")
-
-
-def _padded(rows: Array, count: int) -> Array:
-    """Pad `rows` (n, m) with NaN to (count, m). If a single row is missing, the last row is repeated instead."""
-    rows = np.vstack([rows, rows[-1:]]) if len(rows) == count - 1 else rows[:count]
-    return np.vstack([rows, np.full((count - len(rows), rows.shape[1]), np.nan)])
 
 
 def _other_plots(run: ClosedLoop, loop: LoopEvidence) -> Iterator[Plot]:

@@ -37,7 +37,7 @@ from drake_diff.model.plant import bodies
 from drake_diff.model.step import advance, set_state
 from drake_diff.model.tangent import TangentSpace, tangent_space
 from drake_diff.motion.policy import PD
-from drake_diff.motion.rollout import Meter, Rollout
+from drake_diff.motion.rollout import Meter, Rollout, roll_states
 
 Controller = Callable[[Array, float], Any]  # u (nu,) = controller(x (nx,), t [s])
 OK, LATE = "ok", "late"
@@ -165,10 +165,7 @@ class Predictor:
             self._seen = observation
             while len(self._since) > min(self.delay, self._k):
                 self._since.popleft()
-        x = np.array(self._seen)
-        for command in self._since:
-            x = np.asarray(advance(self.model.double, x, command))
-        return x
+        return np.asarray(roll_states(self.model, self._seen, np.array(self._since))[-1])
 
     def __repr__(self) -> str:
         return f"Predictor of {self.model.name}: samples {self.delay} steps old"

@@ -35,23 +35,26 @@ class TangentSpace:
         return self.nx - len(self.quaternions)
 
     def plus(self, x: Array, dx: Array) -> Array:
-        """Return the state `x` (nx,) moved by the tangent vector `dx` (size,)."""
+        """Return the states `x` (..., nx) moved by the tangent vectors `dx` (..., size)."""
         moved, (of_x, of_d) = np.array(x, dtype=float), self._plain
-        moved[of_x] += dx[of_d]
+        moved[..., of_x] += dx[..., of_d]
         for q, r in self._turns:
-            turned = _right_product(x[q]) @ np.concatenate([[1.0], dx[r] / 2])
-            moved[q] = turned * (np.linalg.norm(x[q]) / np.linalg.norm(turned))
+            turned = x[..., q] + (_right_product(x[..., q])[..., 1:] @ dx[..., r, None])[..., 0] / 2
+            norms = (np.linalg.norm(values, axis=-1, keepdims=True) for values in (x[..., q], turned))
+            moved[..., q] = turned * np.divide(*norms)
         return moved
 
     def minus(self, x1: Array, x0: Array) -> Array:
-        """Return the tangent vector (size,) at `x0` that leads to `x1`."""
+        """Return the tangent vectors (..., size) at `x0` (..., nx) that lead to `x1` (..., nx)."""
         if not self.quaternions:
             return x1 - x0
-        difference, (of_x, of_d) = np.empty(self.size, np.result_type(x1, x0)), self._plain  # also for AutoDiffXd
-        difference[of_d] = x1[of_x] - x0[of_x]
+        of_x, of_d = self._plain
+        plain = x1[..., of_x] - x0[..., of_x]
+        difference = np.empty((*plain.shape[:-1], self.size), plain.dtype)  # also for AutoDiffXd
+        difference[..., of_d] = plain
         for q, r in self._turns:
-            between = _right_product(_conjugate(x0[q])) @ x1[q]
-            difference[r] = 2 * between[1:] / between[0]
+            between = (_right_product(_conjugate(x0[..., q])) @ x1[..., q, None])[..., 0]
+            difference[..., r] = 2 * between[..., 1:] / between[..., :1]
         return difference
 
     def scale(self, ranges: Array) -> Array:
@@ -66,19 +69,20 @@ class TangentSpace:
         return scales
 
     def derivative_of_plus(self, x: Array) -> Array:
-        """Return the derivative (nx, size) of plus(x, d) with respect to d at d = 0."""
-        derivative = np.zeros((self.nx, self.size))
-        derivative[self._plain] = 1.0
+        """Return the derivatives (..., nx, size) of plus(x, d) with respect to d at d = 0."""
+        derivative = np.zeros((*x.shape[:-1], self.nx, self.size))
+        derivative[..., *self._plain] = 1.0
         for q, r in self._turns:
-            derivative[q, r] = 0.5 * _right_product(x[q])[:, 1:]
+            derivative[..., q, r] = 0.5 * _right_product(x[..., q])[..., 1:]
         return derivative
 
     def derivative_of_minus(self, x: Array) -> Array:
-        """Return the derivative (size, nx) of minus(y, x) with respect to y at y = x."""
-        derivative = np.zeros((self.size, self.nx))
-        derivative[self._plain[::-1]] = 1.0
+        """Return the derivatives (..., size, nx) of minus(y, x) with respect to y at y = x."""
+        derivative = np.zeros((*x.shape[:-1], self.size, self.nx))
+        derivative[..., *self._plain[::-1]] = 1.0
         for q, r in self._turns:
-            derivative[r, q] = 2 * _right_product(_conjugate(x[q]))[1:] / (x[q] @ x[q])
+            squares = (x[..., q] ** 2).sum(axis=-1)[..., None, None]
+            derivative[..., r, q] = 2 * _right_product(_conjugate(x[..., q]))[..., 1:, :] / squares
         return derivative
 
     def jacobian(self, x: Array, x_next: Array, by_x: Array, *others: Array) -> Array:
@@ -115,9 +119,15 @@ def _conjugate(q: Array) -> Array:
 
 
 def _right_product(q: Array) -> Array:
-    """Return the matrix R (4, 4) with R p = p * q."""
-    w, x, y, z = q
-    return np.array([[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]])
+    """Return the matrices R (..., 4, 4) with R p = p * q, for quaternions (..., 4)."""
+    return (q @ _RIGHT_PRODUCT).reshape(*q.shape[:-1], 4, 4)
+
+
+_W, _X, _Y, _Z = np.eye(4)
+# Row k is R of the k-th unit quaternion, flattened.
+_RIGHT_PRODUCT = (
+    np.array([[_W, -_X, -_Y, -_Z], [_X, _W, _Z, -_Y], [_Y, -_Z, _W, _X], [_Z, _Y, -_X, _W]]).reshape(16, 4).T
+)
 
 
 FREE, CONTACT = "free", "contact"

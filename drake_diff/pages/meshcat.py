@@ -179,7 +179,7 @@ class Stills:
             if mark.origin is not None:
                 self.meshcat.SetTransform(f"level/{i}", RigidTransform(scene.poses[mark.body][-1] @ mark.origin))
         radius = THICKNESS * self.size
-        if not _draw_tube(self.meshcat, "trail", scene.trail, radius):
+        if not _draw_trail(self.meshcat, scene.trail, radius):
             self.meshcat.Delete("trail")
         for root, steps, colour in (("contacts", scene.contacts, RED), ("thrusts", scene.thrusts, VIOLET)):
             seen = [item for k in places[:-1] for item in (steps[k] if k < len(steps) else ()) if np.any(item.force)]
@@ -205,7 +205,7 @@ def draw(meshcat: Meshcat, scene: Scene) -> None:
         if mark.origin is not None
     }
     radius = THICKNESS * scene.size
-    _draw_tube(meshcat, "trail", scene.trail, radius)
+    _draw_trail(meshcat, scene.trail, radius)
     arrows = [_arrows_of("contacts", scene.contacts, RED, scene), _arrows_of("thrusts", scene.thrusts, VIOLET, scene)]
     for some in arrows:
         some.make(meshcat, radius)
@@ -288,7 +288,7 @@ def _hull(shape: Mesh) -> tuple[Array, Any]:
     return np.array([hull.vertex(i) for i in range(hull.num_vertices())]).T, np.array(corners, dtype=np.int32).T
 
 
-def _draw_tube(meshcat: Meshcat, path: str, points: Array, radius: float) -> bool:
+def _draw_trail(meshcat: Meshcat, points: Array, radius: float) -> bool:
     """Draw a tube along `points` (n, 3), as browsers only draw thin lines; return False if it has no length."""
     apart = np.append(True, np.linalg.norm(np.diff(points, axis=0), axis=1) > radius / 10)
     points = points[apart]
@@ -307,7 +307,7 @@ def _draw_tube(meshcat: Meshcat, path: str, points: Array, radius: float) -> boo
         for i in range(6):
             a, b = 6 * k + i, 6 * k + (i + 1) % 6
             faces += [[a, b, a + 6], [b, b + 6, a + 6]]
-    meshcat.SetTriangleMesh(path, vertices.T, np.array(faces, dtype=np.int32).T, TRAIL)
+    meshcat.SetTriangleMesh("trail", vertices.T, np.array(faces, dtype=np.int32).T, TRAIL)
     return True
 
 

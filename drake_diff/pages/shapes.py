@@ -165,7 +165,7 @@ def _skeleton(plant: Any, context: Any, drawn: Sequence[Any], bare: Sequence[Any
             ends = [np.asarray(body.default_com())]
         ends = [end for end in ends if np.linalg.norm(end - start) > SHORTEST_BONE * size]
         result[index] = [_bone(path, start, end, BONE_PART * size) for end in ends]
-        result[index] += [_ball(path, position, JOINT_PART * size) for position in (start, *ends)]
+        result[index] += [ball(path, position, JOINT_PART * size, JOINT) for position in (start, *ends)]
     return result
 
 
@@ -181,14 +181,10 @@ def _bone(path: str, start: Array, end: Array, radius: float) -> Drawn:
     return Drawn(path, Cylinder(radius, length), pose, BONE, middle, length / 2)
 
 
-def _ball(path: str, centre: Array, radius: float) -> Drawn:
-    return Drawn(path, Sphere(radius), RigidTransform(centre), JOINT, centre, radius)
-
-
-def ball(path: str, centre: ArrayLike = (0.0, 0.0, 0.0)) -> Drawn:
-    """Return a ball that represents an unknown body, at `centre` (3,) [m] on it."""
+def ball(path: str, centre: ArrayLike = (0.0, 0.0, 0.0), radius: float = BALL, colour: Rgba = GREY) -> Drawn:
+    """Return a ball at `centre` (3,) [m] on a body, by default one that represents an unknown body."""
     position = np.asarray(centre, dtype=float)
-    return Drawn(path, Sphere(BALL), RigidTransform(position), GREY, position, BALL)
+    return Drawn(path, Sphere(radius), RigidTransform(position), colour, position, radius)
 
 
 def body_path(body: Any) -> str:

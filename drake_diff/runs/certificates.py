@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_diff._base.arrays import positive_int
+from drake_diff._base.arrays import LARGEST_SEED, count, positive_int
 from drake_diff._base.files import write_whole
 from drake_diff.certificates.certify import certify
 from drake_diff.derivatives.sources import check_method
-from drake_diff.exceptions import GradientError, InputError, SimulationError
+from drake_diff.exceptions import GradientError, SimulationError
 from drake_diff.model.contact import active_modes
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameters, select
@@ -61,18 +61,17 @@ def certify_model(
     start = time.monotonic()
     check_method(method)
     positive_int("states", states)
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise InputError("seed", got=repr(seed), expected="a whole number of at least 0")
+    seed = count("seed", seed, 0, LARGEST_SEED)
     names = [p.name for p in select(model, parameters).parameters]
 
     def record(verdict: Passed, sentence: str, certified: Sequence[CertifiedState] = ()) -> PlanRecord:
-        section = CertificationSection(seed=int(seed), method=method, parameters=names, states=list(certified))
+        section = CertificationSection(seed=seed, method=method, parameters=names, states=list(certified))
         fields = header(model.name, model, time.monotonic() - start)
         contract = contract_of(model)
         return PlanRecord(verdict=verdict, sentence=sentence, certification=section, contract=contract, **fields)
 
     def certified() -> PlanRecord:
-        rows = [_certify_state(model, state, parameters, method) for state in sample_states(model, states, int(seed))]
+        rows = [_certify_state(model, state, parameters, method) for state in sample_states(model, states, seed)]
         agree = sum(row.verdict == "agree" for row in rows)
         sentence = f"{agree} of {len(rows)} sampled states have a certified derivative"
         return record("pass" if agree == len(rows) else "fail", sentence, rows)

@@ -194,20 +194,20 @@ def _input_plots(m: Measurement) -> Iterator[Plot]:
     """Yield a plot for each input, relative to its limit if it has one."""
     held, motion = len(m.us) < len(m.times), m.shown[0]
     for i, c in enumerate(m.inputs):
-        planned = Line("plan", _as_long(m.us[:, i], m.times), held=held)
+        planned = Line("plan", padded(m.us[:, i], len(m.times)), held=held)
         lines = [planned]
         if motion is not None:
             applied = motion.us[:: _parts(m), i]
             same = held and not differ(applied[:, None], m.us[:, i : i + 1])
-            ours = Line("motion", _as_long(applied, m.times), held=True)
+            ours = Line("motion", padded(applied, len(m.times)), held=True)
             lines = [ours] if same else [ours, replace(planned, dashed=True)]
         yield Plot(f"input {c.name}", c.unit, m.times, lines, limits=(c.lower, c.upper), percent=True, group="Inputs")
 
 
-def _as_long(values: Array, times: Array) -> Array:
-    """Extend `values` to the number of times: repeat the last value if one is missing, else append NaN."""
-    missing = max(0, len(times) - len(values))
-    return np.append(values, np.full(missing, values[-1] if missing == 1 and len(values) else np.nan))
+def padded(rows: Array, count: int) -> Array:
+    """Pad `rows` (n, ...) with NaN to (count, ...). If a single row is missing, the last row is repeated instead."""
+    rows = np.concatenate([rows, rows[-1:]]) if len(rows) == count - 1 else rows[:count]
+    return np.concatenate([rows, np.full((count - len(rows), *rows.shape[1:]), np.nan)])
 
 
 def _replay_plots(m: Measurement) -> Iterator[Plot]:

@@ -218,14 +218,6 @@ class PerturbationEvidence(Fields):
     worst: str  # the directory of its worst trial
 
 
-class EventEvidence(Fields):
-    """An event in a closed loop, at simulated time."""
-
-    t_s: float
-    kind: str
-    message: str
-
-
 class TrialEvidence(Fields):
     """One trial, with everything needed to repeat it: `loop.panel_trial.evaluate` accepts it unchanged.
 
@@ -248,7 +240,7 @@ class TrialEvidence(Fields):
     controller_period_s: float
     parameters: dict[str, float | list[float]]  # of the plant, if they differ from the model's
     start: list[float]
-    events: list[EventEvidence]
+    events: list[Event]
 
 
 class Nominal(Fields):

@@ -39,7 +39,7 @@ from drake_diff.runs.rebuild import (
     solve_again,
 )
 from drake_diff.runs.save import RECOVERED, REPLAY, REPORT, phases_in, write_measured
-from drake_diff.runs.sections import COSTS, unknown_functions
+from drake_diff.runs.sections import COSTS, numbers_of, unknown_functions
 from drake_diff.runs.trace import read_trace
 
 # Fields about the record itself and its machine, which cannot be reproduced.
@@ -330,11 +330,7 @@ def odd_metrics(record: PlanRecord, plan: dict[str, Array]) -> Iterator[str]:
     p: dict[str, Any] = dict(record.problem)
     metrics = {metric.name: metric.value for metric in record.metrics}
     xs = plan["xs"]
-
-    def numbers(name: str, missing: float) -> Array:
-        return np.array([missing if v is None else v for v in p[name]], dtype=float)
-
-    goal, start = numbers("x_goal", np.nan), numbers("x0", np.nan)
+    goal, start = numbers_of(p["x_goal"], np.nan), numbers_of(p["x0"], np.nan)
     start[np.array(p["initial_state_free"], dtype=bool)] = np.nan
     end = _turned(record, xs[-1], goal)
     for name, x, wanted in (("goal error", end, goal), ("initial state error", xs[0], start)):
@@ -345,8 +341,8 @@ def odd_metrics(record: PlanRecord, plan: dict[str, Array]) -> Iterator[str]:
             yield f"{record.FILE}: metrics[{name}] is {recorded}, but the plan gives {again}"
     us = np.vstack([plan[name] for name in ("us", "us_mid", "u_final") if name in plan])
     later = xs[1:] if np.all(np.isfinite(start)) else xs
-    beyond = [numbers("u_lower", -np.inf) - us, us - numbers("u_upper", np.inf)]
-    beyond += [numbers("x_lower", -np.inf) - later, later - numbers("x_upper", np.inf)]
+    beyond = [numbers_of(p["u_lower"], -np.inf) - us, us - numbers_of(p["u_upper"], np.inf)]
+    beyond += [numbers_of(p["x_lower"], -np.inf) - later, later - numbers_of(p["x_upper"], np.inf)]
     least = max(float(np.max(excess, initial=0.0)) for excess in beyond)
     recorded = metrics.get("bound violation")
     if recorded is not None and not recorded >= least - ROUNDED:  # the plan does not contain the midpoint states
@@ -378,7 +374,7 @@ def _odd_phases(section: PhasesSection, records: Sequence[PlanRecord], plans: Se
             continue
         matrix: Any = link.reset.get("matrix")
         reset = np.array(matrix["rows"], dtype=float) if isinstance(matrix, dict) else np.eye(len(before))
-        recorded = np.array([np.nan if error is None else error for error in link.errors])
+        recorded = numbers_of(link.errors, np.nan)
         errors = np.abs(after - reset @ before)
         if not np.allclose(recorded, errors, rtol=ROUNDED, atol=ROUNDED, equal_nan=True):
             yield f"{file}: phases.links[{i}].errors is {link.errors}, but the plans give {errors.tolist()}"

@@ -233,11 +233,11 @@ def rebuild_problem(record: PlanRecord, model: Model, us: Array, start_us: Array
     """
     p: dict[str, Any] = dict(record.problem)
     starts = np.array([entry.start for entry in record.parameters])
-    lower, upper = (_numbers([getattr(e, side) for e in record.parameters], gap) for side, gap in MISSING.items())
+    lower, upper = (numbers_of([getattr(e, side) for e in record.parameters], gap) for side, gap in MISSING.items())
     vector = select(model, p["parameters"])
     pairs = list(zip(vector.parameters, vector.slices, strict=True))
     mask = np.array(p["initial_state_free"], dtype=bool)
-    goal = _numbers(p["x_goal"], np.nan)
+    goal = numbers_of(p["x_goal"], np.nan)
     system = FixedContacts(model, **p["fixed_contacts"]) if p.get("fixed_contacts") else model
     requests: dict[str, Any] = {
         "running_cost": _rebuild_cost(p["running_cost"]),
@@ -250,14 +250,14 @@ def rebuild_problem(record: PlanRecord, model: Model, us: Array, start_us: Array
         requests["final_cost"] = QuadraticCost(Q=np.zeros((model.nx, model.nx)))  # a Problem needs a cost or goal
     return Problem(
         system,
-        x0=_numbers(p["x0"], np.nan),
+        x0=numbers_of(p["x0"], np.nan),
         num_steps=p["num_steps"],
         x_goal=goal,
-        goal_tolerance=_numbers(p["goal_tolerance"], np.nan) if "goal_tolerance" in p else None,
-        waypoints={int(k): _numbers(x, np.nan) for k, x in p["waypoints"].items()},
+        goal_tolerance=numbers_of(p["goal_tolerance"], np.nan) if "goal_tolerance" in p else None,
+        waypoints={int(k): numbers_of(x, np.nan) for k, x in p["waypoints"].items()},
         horizon=p["free_horizon_s"],
         motion=p.get("motion", STEPS),
-        bounds=Bounds(**{name: _numbers(p[name], MISSING[name[2:]]) for name in LIMITS}),
+        bounds=Bounds(**{name: numbers_of(p[name], MISSING[name[2:]]) for name in LIMITS}),
         optimize=p["optimize"],
         initial_state_mask=mask if mask.any() else None,
         us=start_us if "controls" in p["optimize"] else us,
@@ -276,7 +276,7 @@ def _rebuild_constraint(c: dict[str, Any], system: Model | FixedContacts) -> Con
         function = recorded_quantity(system, kind, values)
     else:
         function = made_from(system if isinstance(system, Model) else system.plant.model, content)
-    lower, upper = (_numbers(c[side], gap) for side, gap in MISSING.items())
+    lower, upper = (numbers_of(c[side], gap) for side, gap in MISSING.items())
     knots = None if c["every_knot"] else c["knots"]
     return Constraint(function, lower=lower, upper=upper, knots=knots, name=c["name"])
 
@@ -297,7 +297,7 @@ def _rebuild(subject: str, kinds: Mapping[str, Any], described: Any) -> Any:
     return kinds[kind](**values)
 
 
-def _numbers(values: Any, missing: float) -> Array:
+def numbers_of(values: Any, missing: float) -> Array:
     """Convert `values` to an array (n,) with `missing` in place of None."""
     return np.array([missing if v is None else v for v in values], dtype=float)
 

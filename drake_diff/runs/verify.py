@@ -240,13 +240,6 @@ def call_with_limits(
     return call(function, given, seconds, memory)
 
 
-def require_readable(function: str, folder: Path, models: str | Path | None) -> None:
-    """Call `function` in a child process first; raise ArtifactError if that process fails."""
-    answer = call_with_limits(function, folder, models)
-    if answer.error:
-        raise ArtifactError(f"{folder}: {answer.error}")
-
-
 def verify_own(directory: Path, models: Path | None = ANYWHERE) -> Verification:
     """Verify a directory in this process without limits, which needs trust; its model may be anywhere."""
     result = _looked_at(directory)
@@ -336,7 +329,9 @@ def recalled(directory: str | Path, *, models: str | Path | None = None, trusted
     """
     folder = Path(directory)
     if not trusted:
-        require_readable("drake_diff.runs.verify:_recalled_apart", folder, models)
+        answer = call_with_limits("drake_diff.runs.verify:_recalled_apart", folder, models)
+        if answer.error:
+            raise ArtifactError(f"{folder}: {answer.error}")
     with _recalled(folder, None if models is None else Path(models)) as solution:
         yield solution
 

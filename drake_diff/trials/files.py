@@ -28,9 +28,8 @@ from drake_diff.model.parameters import applied, select
 from drake_diff.pages.html import Line, Plot, page_again, page_data, write_page
 from drake_diff.runs.differences import Reproduced
 from drake_diff.runs.directory import load_plan_record, name_of, written_whole
-from drake_diff.runs.fields import DataBoundary, DataUse, WallClock, canonical, evidence, read_fields
+from drake_diff.runs.fields import DataBoundary, DataUse, Event, WallClock, canonical, evidence, read_fields
 from drake_diff.runs.plan_record import (
-    EventEvidence,
     LoopEvidence,
     Nominal,
     PlanRecord,
@@ -269,7 +268,7 @@ def write_trial(folder: Path, task: Task, trial: Trial, run: str | None) -> None
         controller_period_s=setup.loop.substeps * setup.model.time_step,
         parameters={key: np.asarray(value).tolist() for key, value in setup.parameters.items()},
         start=setup.x0.tolist(),
-        events=[EventEvidence(t_s=e.t, kind=e.kind, message=e.message) for e in loop_run.events],
+        events=[Event.model_validate({"t_s": e.t, "kind": e.kind, "message": e.message}) for e in loop_run.events],
     )
     latencies = {"budget_s": loop_run.latency_budget, "latencies_s": loop_run.latencies.tolist()}
     write_whole(folder / TRIAL, canonical(record.model_dump(mode="json")).encode())

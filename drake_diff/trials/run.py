@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_diff._base.arrays import LARGEST_SEED, Array, count, positive_int
+from drake_diff._base.differences import central_differences
 from drake_diff._base.statistics import Rate, margin, success_rate
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.derivatives.step import derivatives_along
@@ -406,12 +407,12 @@ class LoopSensitivity:
         """
         task, gains = self.task, []
         for k, x in enumerate(task.nominal.run.motion.xs[:-1]):
-            columns = []
-            for e in DIFFERENCE * np.eye(self.space.size):
-                try:
-                    ahead, behind = (task.policy(self.space.plus(x, d), k * task.model.time_step) for d in (e, -e))
-                except Exception:
-                    return None
-                columns.append((np.asarray(ahead, dtype=float) - np.asarray(behind, dtype=float)) / (2 * DIFFERENCE))
-            gains.append(np.array(columns).T.reshape(task.model.nu, self.space.size))
+
+            def commanded(d: Array, x: Array = x, t: float = k * task.model.time_step) -> Array:
+                return np.asarray(task.policy(self.space.plus(x, d), t), dtype=float).reshape(task.model.nu)
+
+            try:
+                gains.append(central_differences(commanded, self.space.size, DIFFERENCE))
+            except Exception:
+                return None
         return gains

@@ -225,7 +225,7 @@ def changed(row, column, value):
         ([*HEADER[:5], "frce"], ROWS, r"column: expected one of .*force.*, got 'frce'"),
         ([*HEADER[:5], "slide_x"], ROWS, r"column slide_x: expected once, got twice"),
         (HEADER, [*ROWS[:2], ROWS[2][:3]], r"line 4: expected 6, got 3 cells"),
-        (HEADER, ROWS[:1], r"expected two or more"),
+        (HEADER, ROWS[:1], r"expected 2 or more"),
     ],
 )
 def test_a_bad_csv_is_named_by_line_and_column(load, tmp_path, header, rows, match):

@@ -81,8 +81,8 @@ def test_casadi_is_drake_with_two_free_bodies_and_an_arm_on_the_world():
 def test_a_swapped_quaternion_or_a_transposed_rotation_is_found(monkeypatch, wrong):
     from drake_diff.engines import casadi as casadi_engine
 
-    real = casadi_engine.rotation
-    monkeypatch.setattr(casadi_engine, "rotation", lambda q: wrong(real, q))
+    real = casadi_engine.quaternion_rotation
+    monkeypatch.setattr(casadi_engine, "quaternion_rotation", lambda q: wrong(real, q))
     model = turned(free=True)
     assert different_from_drake(model, engine_of("casadi", model)).keys() & {"M(q)", "bias(q, v)"}
 

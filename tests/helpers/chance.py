@@ -4,9 +4,8 @@ import numpy as np
 
 from drake_diff.comparison.recordings import Recording
 from drake_diff.identification.candidates import Candidates
-from drake_diff.identification.recordings import Chart, given_noise, read_pieces
+from drake_diff.identification.recordings import given_noise, read_pieces
 from drake_diff.identification.tree import tree_for_identification
-from drake_diff.mechanics.description import coordinates_of
 
 
 def chance_of_a_name(model, recording: Recording, draws: int, seed: int = 0) -> tuple[float, float]:
@@ -15,9 +14,8 @@ def chance_of_a_name(model, recording: Recording, draws: int, seed: int = 0) -> 
     If the model is correct and residuals are white, b of the least squares |b - R dz|^2 has independent normal entries,
     and a change by itself reduces the squares by the part of b in the change's own columns.
     """
-    chart = Chart(coordinates_of(model))
-    pieces, noise = read_pieces(model, recording, 0.0), given_noise(model, chart, None)
-    setting = Candidates(model, chart, pieces, noise, tree=tree_for_identification(model))
+    pieces, noise = read_pieces(model, recording, 0.0), given_noise(model, None)
+    setting = Candidates(model, pieces, noise, tree=tree_for_identification(model))
     setting.prepare()
     view = setting.view(setting.cut, setting.unknowns.z_start, setting.starts)
     pulled = np.random.default_rng(seed).standard_normal((draws, len(view.reduced.b))) @ view.reduced.R

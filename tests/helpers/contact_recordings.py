@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 import drake_diff as dd
-from drake_diff.identification.recordings import Chart
 from drake_diff.mechanics.description import coordinates_of
+from drake_diff.model.tangent import tangent_space
 from helpers.legged import LEGGED, legged_model, rest
 
 MODELS = Path(__file__).parents[2] / "models"
@@ -108,14 +108,14 @@ def moved(model, x0, command, parameters, bias, by="same"):
 
 
 def scales(model):
-    """Return the chart and the scales (2 nv,) of the noise."""
-    chart = Chart(coordinates_of(model))
+    """Return the tangent space and the scales (2 nv,) of the noise."""
+    coordinates = coordinates_of(model)
     turns = np.zeros(model.nv, dtype=bool)
-    for i, j in chart.coordinates.single:
+    for i, j in coordinates.single:
         turns[j] = model.position_names[i].endswith("_q")
-    for _, j in chart.coordinates.free:
+    for _, j in coordinates.free:
         turns[j : j + 3] = True
-    return chart, np.concatenate(
+    return tangent_space(model), np.concatenate(
         [np.where(turns, NOISE["angle"], NOISE["length"]), np.where(turns, NOISE["turn"], NOISE["speed"])]
     )
 
@@ -123,7 +123,7 @@ def scales(model):
 def recorded(robot, step, is_changed, seed, by="same"):
     random = np.random.default_rng(seed)
     model = made(robot, step)
-    chart, size = scales(model)
+    space, size = scales(model)
     while True:
         x0, command = started(robot, model, random)
         name = str(random.choice(KINDS[robot])) if is_changed else ""
@@ -131,9 +131,9 @@ def recorded(robot, step, is_changed, seed, by="same"):
         xs, us = moved(model, x0, command, parameters, bias, by)
         if not name:
             break
-        apart = chart.minus(xs, moved(model, x0, lambda k, x, us=us: us[k], {}, {}, by)[0]) / size
+        apart = space.minus(xs, moved(model, x0, lambda k, x, us=us: us[k], {}, {}, by)[0]) / size
         if np.max(np.sqrt(np.mean(apart**2, axis=0))) > SEEN:
             break
-    measured = chart.plus(xs, size * random.standard_normal((len(xs), len(size))))
+    measured = space.plus(xs, size * random.standard_normal((len(xs), len(size))))
     log = dd.Recording("MuJoCo" if by == "mujoco" else "Drake", "1", PERIOD * np.arange(len(xs)), measured, us)
     return model, log, name, {**parameters, **bias}

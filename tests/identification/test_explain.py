@@ -19,10 +19,8 @@ from drake_diff.cli.main import app
 from drake_diff.exceptions import ModelError, UnknownNameError
 from drake_diff.identification.candidates import FALSE_NAME
 from drake_diff.identification.motion import TreeMotion
-from drake_diff.identification.recordings import Chart
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import Unknowns, choose_unknowns, set_numbers
-from drake_diff.mechanics.description import coordinates_of
 from drake_diff.runs.directory import load_record
 
 pytestmark = pytest.mark.solve
@@ -120,7 +118,7 @@ def test_beside_an_inertia_a_mass_takes_it_along():
 def test_dry_friction_stops_and_holds_and_lets_go(load):
     """A hinge of 0.25 kg m^2 without gravity matches the closed form, with stops and releases inside the steps."""
     model = load("pendulum.urdf")
-    tree, _chart = tree_for_identification(model), Chart(coordinates_of(model))
+    tree = tree_for_identification(model)
     tree = replace(tree, numbers=replace(tree.numbers, gravity=np.zeros(3), damping=np.zeros(1)))
     unknowns = choose_unknowns(model, tree, ["hinge.coulomb_friction"])
     law = TreeMotion(model, tree, unknowns, 0.04)
@@ -156,7 +154,7 @@ def test_of_a_right_model_nothing_is_said(pendulum, seed):
 def test_chance_names_a_change_of_a_right_arm_in_less_than_0_3_percent():
     """The limit keeps false names below the rate FALSE_NAME. The BIC penalty alone would not, for so many changes."""
     model = example_robot("ur5_robot.urdf")
-    tree, _chart, period = tree_for_identification(model), Chart(coordinates_of(model)), 0.01
+    tree, period = tree_for_identification(model), 0.01
     us = np.random.default_rng(0).uniform(-3, 3, (40, model.nu))
     law = TreeMotion(model, tree, Unknowns(()), period)
     xs = law.run(np.zeros(0), model.default_state[None], np.full((1, 40), period), us[None])[0]

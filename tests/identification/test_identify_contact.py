@@ -7,8 +7,8 @@ import drake_diff as dd
 from drake_diff.exceptions import InputError
 from drake_diff.identification import first_state, identify_contact
 from drake_diff.identification.impacts import shrink_to, start_of
-from drake_diff.identification.recordings import Chart, read_pieces
-from drake_diff.mechanics.description import coordinates_of
+from drake_diff.identification.recordings import read_pieces
+from drake_diff.model.tangent import tangent_space
 
 pytestmark = pytest.mark.solve
 
@@ -165,13 +165,13 @@ def test_a_fall_by_less_than_gravity_is_told_without_bounds_that_there_are_not(b
 
 def test_the_spread_of_a_first_state_is_that_of_first_states_by_other_noise(ball):
     """Compare the spread with repeated measurements of the same flight."""
-    chart, found, told = Chart(coordinates_of(ball)), [], []
+    space, found, told = tangent_space(ball), [], []
     for seed in range(20):
         piece = read_pieces(ball, noisy(ball, (0.25, 0.25), seed)[2], 0.0)[0].part(0, 15)
-        start = start_of(ball, chart, piece, np.full(6, 1e-4))
+        start = start_of(ball, piece, np.full(6, 1e-4))
         found.append(start.x)
         told.append(np.sqrt(np.sum(start.spread**2, axis=1)))
-    scattered = np.std(chart.minus(np.array(found), np.mean(found, axis=0)), axis=0, ddof=1)
+    scattered = np.std(space.minus(np.array(found), np.mean(found, axis=0)), axis=0, ddof=1)
     # For 20 flights, the root of chi^2 / 19 of all 12 numbers is within 0.55 and 1.55 with probability 0.99.
     ratio = scattered / np.sqrt(np.mean(np.square(told), axis=0))
     assert np.all((ratio > 0.55) & (ratio < 1.55)), ratio

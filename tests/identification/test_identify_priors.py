@@ -12,10 +12,9 @@ from drake_diff.cli.main import app
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.identification.fit import Fit, cut_segments
 from drake_diff.identification.motion import TreeMotion
-from drake_diff.identification.recordings import Chart, Excerpt
+from drake_diff.identification.recordings import Excerpt
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import choose_unknowns
-from drake_diff.mechanics.description import coordinates_of
 
 pytestmark = pytest.mark.solve
 
@@ -54,14 +53,14 @@ def test_a_delay_is_found_to_a_part_of_a_sample(write_urdf):
 def test_the_derivative_by_a_delay_is_that_of_differences(load):
     """Inputs jump between samples, at a sample of the previous piece, and several times in one step."""
     model = load("double_pendulum.urdf")
-    tree, chart = tree_for_identification(model), Chart(coordinates_of(model))
+    tree = tree_for_identification(model)
     unknowns = choose_unknowns(model, tree, ["model.input_delay", "lower.mass"])
     random = np.random.default_rng(0)
     times = np.cumsum(random.uniform(0.005, 0.03, 40))
     whole = Excerpt("lab", times, np.zeros((40, 4)), random.uniform(-1, 1, (39, 2)), held_out=False)
     piece = whole.part(8, 30)
     law = TreeMotion(model, tree, unknowns, 0.01)
-    fit = Fit(model, law, chart, unknowns, [piece], np.array([1e-3, 1e-3, np.nan, np.nan]))
+    fit = Fit(model, law, unknowns, [piece], np.array([1e-3, 1e-3, np.nan, np.nan]))
     s = fit.segments
     starts = 0.3 * np.sin(np.arange(4 * len(s.first))).reshape(-1, 4)
 

@@ -13,11 +13,10 @@ from pydrake.multibody.tree import JacobianWrtVariable
 import drake_diff as dd
 from drake_diff.comparison import read_recording
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.identification.recordings import Chart
 from drake_diff.identification.sensors import choose_sensors
 from drake_diff.identification.tree import TreeDynamics, tree_for_identification
-from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.step import set_state
+from drake_diff.model.tangent import tangent_space
 
 pytestmark = pytest.mark.solve
 
@@ -33,7 +32,7 @@ def columns(label):
 )
 def test_readings_are_drakes_and_their_slopes_those_of_differences(name, body, joint):
     model, random = example_robot(name), np.random.default_rng(0)
-    tree, plant, chart = tree_for_identification(model), model.plant, Chart(coordinates_of(model))
+    tree, plant, space = tree_for_identification(model), model.plant, tangent_space(model)
     sensors = choose_sensors(model, tree, [*columns("imu"), f"{joint}.force"], {"imu": (body, POSE)})
     x, u = state_in_range(model, random), random.uniform(-1, 1, model.nu)
     nq, nv, numbers = model.nq, model.nv, tree.numbers
@@ -60,12 +59,12 @@ def test_readings_are_drakes_and_their_slopes_those_of_differences(name, body, j
     assert read[9] == pytest.approx(drive[k], abs=1e-9 * np.abs(a).max())
 
     by = np.eye(len(numbers.flat))
-    by_x, by_numbers = sensors.slopes(dynamics, x[None], u[None], by)
+    by_x, by_numbers = sensors.slopes(space, dynamics, x[None], u[None], by)
     direction = random.uniform(-1, 1, 2 * nv)
     change = random.uniform(-1, 1, len(by)) * np.clip(np.abs(numbers.flat), 1e-3, 1e3)
 
     def at(h):
-        moved = chart.plus(x[None], h * direction[None])
+        moved = space.plus(x[None], h * direction[None])
         return sensors.read(TreeDynamics(tree, numbers.moved(h * change)), moved, u[None])[0]
 
     difference = (at(1e-5) - at(-1e-5)) / 2e-5
