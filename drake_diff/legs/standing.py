@@ -47,7 +47,7 @@ AT_REST = 1e-7  # [rad/s or m/s] largest velocity after a step
 SINK, RELAXES, DISSIPATION, NEAR_RIGID = 0.0625, 2.5, 0.5, 0.1  # DISSIPATION is in s/m
 FIRST_SINK = 1e-4  # [m] least initial depth, because a sole in the air has no derivative
 # A motion from rest to rest.
-DURATIONS, HOLDING = (0.6, 1.0, 2.0), 0.5  # [s] of the motion, and of holding its end
+DURATIONS, HOLDING = (0.6, 1.0, 1.6), 0.3  # [s] of the motion, and of holding its end
 SIZES = ((1.0, 1.0), (1.0, 0.2), (0.5, 0.2), (0.25, 0.1), (0.12, 0.0))  # factors on a random shift of base and arms
 TURNED, SHIFTED, LOWERED = 0.1, 0.06, 0.12  # of the base: [rad], and fractions of the centre of mass's height
 MOVED = 0.1  # fraction of a joint's range, for joints outside the legs
@@ -56,7 +56,8 @@ FEET_STAY, STILL = 1e-3, 1e-7  # [m] largest distance of a foot from its stance,
 FREE_BASE, FREE_JOINT, ALONG = 0.1, 0.3, 0.05  # [rad or m] deviations that cost 1; ALONG applies on the way
 BASE_TURN, BASE_PLACE = 0.003, 0.001  # the same for a base whose pose is required
 OVER_FEET = 0.02  # [m] the same for the centre of mass
-CORRECTIONS, FRAME_MISS, JOINT_MISS = 3, 3e-4, 1e-3  # [m], [rad or m] errors that need no further correction
+FRAME_TOLERANCE = 1e-2  # [m] of a frame's goal; a plan aims at the middle 0.1 / 3^0.5 of it
+CORRECTIONS, FRAME_MISS, JOINT_MISS = 3, 5.5e-4, 1e-3  # [m], [rad or m] errors that need no further correction
 NEAR, SLOW = 0.02, 0.5  # [rad or m], [rad/s or m/s] deviations that cost 1 in a regulator
 EFFORT_SHARE = 0.2  # the same for an input, as a fraction of its holding effort (at least a tenth of the largest)
 

@@ -18,7 +18,7 @@ from drake_diff.certificates.finding import Finding
 from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, ModelWarning, WriteError
 from drake_diff.legs.feet import Legs
-from drake_diff.legs.standing import Rest, random_shift, shift_to
+from drake_diff.legs.standing import FRAME_TOLERANCE, Rest, random_shift, shift_to
 from drake_diff.model.assembly import single_coordinates
 from drake_diff.model.model import Model
 from drake_diff.optimize.options import Options
@@ -326,7 +326,7 @@ def _of_flying(robot: Robot, task: Goals, seed: int) -> Iterator[_Attempt]:
         x_goal[q + 4 : q + 7] = np.nan if task.frames else x0[q + 4 : q + 7] + flown(np.random.default_rng([seed, 4]))
     for longer in (1, 2):
         steps = longer * guess.num_steps
-        problem = _problem(task, guess, x_goal, running_cost=_effort(model), num_steps=steps)
+        problem = _problem(robot, task, guess, x_goal, running_cost=_effort(model), num_steps=steps)
         options = {"method": "collocation", "time_limit": LONG_BUDGET, "options": Options(refine=True)}
         yield _Attempt(f"least effort in {steps} steps", robot, problem, None, options)
 
@@ -395,7 +395,7 @@ def _collocated(robot: Robot, task: Goals, guess: MotionGuess, least: str | None
         whole = guess.num_steps * model.time_step
         guess = guess.in_steps(min(guess.num_steps, FEW))
         asked = {"running_cost": 1.0, "horizon": (FASTER[0] * whole, FASTER[1] * whole)}
-    problem = _problem(task, guess, x1, **asked)
+    problem = _problem(robot, task, guess, x1, **asked)
     what = "least time" if least else "least effort"
     error, limit = (COARSE, LONG_BUDGET) if least else (FINE, BUDGET)
     refined = Options(refine=True, error_tolerance=error)
@@ -408,12 +408,13 @@ def _collocated(robot: Robot, task: Goals, guess: MotionGuess, least: str | None
 
 def _feasible(robot: Robot, task: Goals, guess: MotionGuess) -> _Attempt:
     """Find any motion to the end of the guess within all limits; the guess itself if it is feasible."""
-    problem = _problem(task, guess, guess.xs[-1])
+    problem = _problem(robot, task, guess, guess.xs[-1])
     return _Attempt(guess.name, robot, problem, guess, {"method": "shooting", "time_limit": BUDGET})
 
 
-def _problem(task: Goals, guess: MotionGuess, x_goal: Array, **asked: Any) -> Problem:
-    goals = [FrameGoal(name, position=position) for name, position in task.frames.items()]
+def _problem(robot: Robot, task: Goals, guess: MotionGuess, x_goal: Array, **asked: Any) -> Problem:
+    tolerance = {} if robot.standing is None else {"tolerance": FRAME_TOLERANCE}
+    goals = [FrameGoal(name, position=position, **tolerance) for name, position in task.frames.items()]
     asked = {"num_steps": guess.num_steps, **asked}
     return Problem(
         guess.model, x0=guess.xs[0], x_goal=x_goal, goals=[*goals, *task.avoid], bounds=_bounds(guess.model), **asked
