@@ -18,7 +18,7 @@ import _one_thread  # noqa: F401 (before NumPy)
 import compare
 from cases import CASES
 from peers import QUANTITIES
-from solves import QUICK_SOLVES, SOLVES, solved
+from solves import SOLVES, solved
 from starts import started
 from suite import QUICK_MODELS, Missing, Row, measured
 from table import document, machine, save, show
@@ -36,7 +36,7 @@ def chosen(only: str, quick: bool) -> tuple[list[str], list[str], list[str]]:
             raise UnknownNameError("benchmark", got=name, known=(*CASES, *KINDS, *SOLVES))
     places = [name for name in names if name not in KINDS]
     models = [n for n in CASES if (n in places if places else not quick or n in QUICK_MODELS)]
-    solves = [n for n in SOLVES if (n in places if places else not quick or n in QUICK_SOLVES)]
+    solves = [n for n in SOLVES if n in places or not places]
     kinds = [n for n in KINDS if n in names] or [n for n in KINDS if n != "start" or not places]
     return models, kinds, solves if "solve" in kinds else []
 

@@ -37,7 +37,7 @@ def _task(random, h, kind, first, phases, text, *, way=0.0):
     shift = np.mean(begun, axis=(0, 1))[:2] - np.mean(_soles(end), axis=(0, 1))[:2]
     end[4:6] += shift + np.array([way, 0.0])
     steps = [(round(seconds / h), [facts.feet[i] for i in feet]) for seconds, feet in phases]
-    problem, _, guess, asks = scheduled_problem(model, facts, x0, end, steps, SWING)
+    problem, guess, asks = scheduled_problem(model, facts, x0, end, steps, SWING)
     if way:
         ends = np.mean(_soles(end), axis=1)
         asks += [(f"{facts.feet[i]} from where it lands [m]", partial(_off_foot, i, ends[i]), LANDED) for i in BOTH]

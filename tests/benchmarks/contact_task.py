@@ -19,9 +19,9 @@ Ask = tuple[str, Callable[[np.ndarray, np.ndarray], float], float]  # name, (xs,
 class Task:
     """A problem with `options`, the keywords of `dd.solve`, and `asks`, the requirements beyond the input limits.
 
-    `schedule` is the input for Crocoddyl, or None if Crocoddyl cannot express the task. `build` returns Drake's
-    (plant, diagram) for a time step, 0 for continuous time, or is None if the model's own plant is used. If `falls`, a
-    change of 1e-12 leads to another motion, as for a biped on one foot. Such a plan is measured step by step.
+    `build` returns Drake's (plant, diagram) for a time step, 0 for continuous time, or is None if the model's own plant
+    is used. If `falls`, a change of 1e-12 leads to another motion, as for a biped on one foot. Such a plan is measured
+    step by step.
     """
 
     name: str
@@ -29,7 +29,6 @@ class Task:
     goal_text: str
     options: dict[str, Any] = field(default_factory=dict)
     asks: tuple[Ask, ...] = ()
-    schedule: Any = None
     build: Callable[[float], Any] | None = None
     falls: bool = False
 

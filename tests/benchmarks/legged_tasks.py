@@ -86,7 +86,7 @@ def _task(robot, random, h, kind, first, last, phases, text, *, way=0.0, pushed=
     if pushed:
         x0[nq:] = _pushed(robot, model, x0, random)
     steps = [(round(seconds / h), [facts.feet[i] for i in feet]) for seconds, feet in phases]
-    problem, schedule, guess, asks = scheduled_problem(model, facts, x0, end, steps, SWING * HEIGHTS[robot])
+    problem, guess, asks = scheduled_problem(model, facts, x0, end, steps, SWING * HEIGHTS[robot])
     plant = _kinematics(robot)
     knot = 0
     for count, standing in steps:
@@ -101,13 +101,12 @@ def _task(robot, random, h, kind, first, last, phases, text, *, way=0.0, pushed=
         goal_text=text,
         options={**OPTIONS, "initial_guess": guess},
         asks=tuple(asks),
-        schedule=schedule,
         build=partial(build, robot, h),
     )
 
 
 def scheduled_problem(model, facts, x0, end, steps, swing):
-    """Return (problem, schedule, guess, the referee's measures of the base) of a robot that comes to rest at `end`."""
+    """Return (problem, guess, the referee's measures of the base) of a robot that comes to rest at `end`."""
     schedule = dd.optimize.ContactSchedule(steps, feet=facts.feet)
     guess = schedule.guess(model, x0, end, swing=swing)
     goals = [
@@ -122,7 +121,7 @@ def scheduled_problem(model, facts, x0, end, steps, swing):
         ("base from level [rad]", tilt, LEVEL),
         ("speed of the base [m/s]", partial(speed, model.nq), AT_REST),
     ]
-    return dd.Problem(model, x0=x0, num_steps=schedule.num_steps, goals=goals, **follow), schedule, guess, asks
+    return dd.Problem(model, x0=x0, num_steps=schedule.num_steps, goals=goals, **follow), guess, asks
 
 
 @cache

@@ -31,13 +31,28 @@ def pendulum(x, u, math):
     return [x[1], (u[0] - 0.1 * x[1] - GRAVITY * 0.5 * math.sin(x[0])) / 0.25]
 
 
-def cart_pole(x, u, math):
-    """Return x' of models/cart_pole.urdf by the formulas of Kelly's paper."""
-    l, m1, m2, g = 0.5, 1.0, 0.3, GRAVITY  # noqa: E741
+def cart_pole(x, u, math, l=0.5, m1=1.0, m2=0.3):  # noqa: E741
+    """Return x' of a cart and a pole, by default models/cart_pole.urdf, by the formulas of Kelly's paper."""
+    g = GRAVITY
     s, c, rate = math.sin(x[1]), math.cos(x[1]), x[3]
     cart = (l * m2 * s * rate**2 + u[0] + m2 * g * c * s) / (m1 + m2 * s**2)
     pole = -(l * m2 * c * s * rate**2 + u[0] * c + (m1 + m2) * g * s) / (l * m1 + l * m2 * s**2)
     return [x[2], x[3], cart, pole]
+
+
+def three_masses(x, u, math):
+    """Return x' of a chain of three masses: the first is fixed, u (3,) is the velocity of the last.
+
+    x: positions of the second and the last mass, velocity of the second. The springs have 1 N/m and a length of 0.033 m
+    at rest, the masses 0.033 kg.
+    """
+    before, after = [x[i] for i in range(3)], [x[i + 3] - x[i] for i in range(3)]
+    pulls = []
+    for way in (before, after):
+        length = math.sqrt(way[0] ** 2 + way[1] ** 2 + way[2] ** 2)
+        pulls.append([(1 - 0.033 / length) / 0.033 * d for d in way])
+    falls = [0.0, 0.0, -GRAVITY]
+    return [x[6], x[7], x[8], u[0], u[1], u[2], *[b - a + f for a, b, f in zip(*pulls, falls)]]  # noqa: B905
 
 
 def two_links(x, u, math, first, second, damping, motors):

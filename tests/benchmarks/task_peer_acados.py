@@ -5,8 +5,10 @@
     pip install comma-deps-acados numpy scipy     # in a separate environment, with a C compiler
 
 A free final time is a state. The Hessian is that of Gauss-Newton for costs of least squares, otherwise exact and
-mirrored. A merit function shortens the steps. Tolerances are the default, 1e-6. The output contains processor time [s]:
-`build` to write, compile and load C, including child processes, and `solve` for the solver alone.
+mirrored. A merit function shortens the steps. Tolerances are the default, 1e-6. A task of `peers_examples.py` has
+weights `Q` and `Q_final` of states and no goal. It is solved with full steps, as acados' examples are, and compiled
+once. The output contains processor time [s]: `build` to write, compile and load C, including child processes, and
+`solve` for the solver alone.
 """
 
 import contextlib
@@ -39,6 +41,8 @@ from acados.acados_template import AcadosModel, AcadosOcp, AcadosOcpSolver  # no
 FAR, GOAL = 1e8, 1e3  # GOAL: weight of the linear and the squared distance from the goal
 ENDED = {0: "solved", 1: "not a number", 2: "iteration limit", 3: "smallest step", 4: "failure of the QP solver"}
 
+COMPILED: dict[str, "AcadosOcpSolver"] = {}  # solvers of the tasks that are solved again
+
 
 class CasadiMath:
     sin, cos, tan, sqrt, exp = ca.sin, ca.cos, ca.tan, ca.sqrt, ca.exp
@@ -63,6 +67,8 @@ def problem_of(task: dict, number: int) -> "AcadosOcp":
         ocp.cost.cost_type, ocp.cost.cost_type_e = "EXTERNAL", "EXTERNAL"
         model.cost_expr_ext_cost = ca.SX(0)
         model.cost_expr_ext_cost_e = task["time_weight"] * x[nx]
+    elif "Q" in task:
+        track(ocp.cost, task)
     else:
         ocp.cost.cost_type, ocp.cost.cost_type_e = "LINEAR_LS", "LINEAR_LS"
         ocp.cost.W, ocp.cost.yref = 2 * np.array(task["R"]), np.array(task["u_ref"], dtype=float)
@@ -88,6 +94,9 @@ def problem_of(task: dict, number: int) -> "AcadosOcp":
         constraints.ubx_0 = np.append(constraints.ubx_0, task["horizon"][1])
         constraints.idxbx_0 = np.arange(nx + 1)
     given = [i for i in range(nx) if task["x_goal"][i] is not None]
+    set_options(ocp.solver_options, task)
+    if not given:
+        return ocp
     constraints.lbx_e = constraints.ubx_e = np.array([task["x_goal"][i] for i in given], dtype=float)
     constraints.idxbx_e = np.array(given)
     constraints.idxsbx_e = np.arange(len(given))  # slacks of the goal and disks, as the QPs have no elastic mode
@@ -100,27 +109,42 @@ def problem_of(task: dict, number: int) -> "AcadosOcp":
         constraints.uh = np.full(len(task["disks"]), FAR)
         constraints.idxsh = np.arange(len(task["disks"]))
         ocp.cost.zl = ocp.cost.zu = ocp.cost.Zl = ocp.cost.Zu = np.full(len(task["disks"]), GOAL)
-    set_options(ocp.solver_options, task)
     return ocp
+
+
+def track(cost: Any, task: dict) -> None:
+    """Set the weighted squares of the distance from a state, along the motion and at its end."""
+    nx, nu = task["nx"], task["nu"]
+    cost.cost_type, cost.cost_type_e = "LINEAR_LS", "LINEAR_LS"
+    cost.W, cost.W_e = 2 * np.diag([*task["Q"], *np.diag(task["R"])]), 2 * np.diag(task["Q_final"])
+    cost.yref, cost.yref_e = np.append(task["x_ref"], np.zeros(nu)), np.array(task["x_ref"])
+    cost.Vx, cost.Vu, cost.Vx_e = np.eye(nx + nu, nx), np.eye(nx + nu, nu, -nx), np.eye(nx)
 
 
 def set_options(options: Any, task: dict) -> None:
     free = task["horizon"][0] < task["horizon"][1]
     options.tf = 1.0 if free else task["horizon"][0]
     options.qp_solver, options.nlp_solver_type = "PARTIAL_CONDENSING_HPIPM", "SQP"
-    options.integrator_type, options.sim_method_num_stages, options.sim_method_num_steps = "ERK", 4, 1
+    options.integrator_type, options.sim_method_num_stages, options.sim_method_num_steps = (
+        "ERK",
+        4,
+        task.get("substeps", 1),
+    )
     options.hessian_approx = "EXACT" if free else "GAUSS_NEWTON"
     options.regularize_method = "MIRROR" if free else "NO_REGULARIZE"
-    options.globalization = "MERIT_BACKTRACKING"
+    options.globalization = "FIXED_STEP" if "Q" in task else "MERIT_BACKTRACKING"
     options.nlp_solver_max_iter, options.qp_solver_iter_max, options.print_level = 500, 200, 0
-    if not free:
+    if not (free or "Q" in task):
         options.hpipm_mode, options.levenberg_marquardt = "ROBUST", 1e-2
 
 
 def solve(task: dict, number: int) -> dict:
     begun, nx, count, free = spent(), task["nx"], task["count"], task["horizon"][0] < task["horizon"][1]
-    ocp = problem_of(task, number)
-    solver = AcadosOcpSolver(ocp, json_file=f"task{number}.json")
+    text = json.dumps(task)
+    solver = COMPILED.get(text) or AcadosOcpSolver(problem_of(task, number), json_file=f"task{number}.json")
+    solver.reset()
+    if "Q" in task:
+        COMPILED[text] = solver
     built, process = spent(), time.process_time()
     x0 = np.array(task["x0"], dtype=float)
     goal = np.array([x0[i] if v is None else v for i, v in enumerate(task["x_goal"])])

@@ -21,6 +21,7 @@ from task_cases import Case
 from task_plants import NAMED
 
 import drake_diff as dd
+from drake_diff.optimize import run
 from drake_diff.optimize.problem.cost import ConstantCost
 from drake_diff.optimize.transcription.collocation import Transcription
 
@@ -34,6 +35,7 @@ PEERS = {  # name -> script and its arguments
 }
 CHEAPER = 0.01  # relative difference of costs that indicates another optimum
 TOLERANCE = 1e-8  # of dd.solve
+SEARCHES = ("solve_ilqr", "solve_through_jumps", "solve_continuation", "solve_shooting")  # in the model's own steps
 Row = dict[str, Any]
 
 
@@ -141,26 +143,31 @@ class Peer:
 
 @contextmanager
 def search_seconds() -> Iterator[list[float]]:
-    """Add up the processor time of transcription and search, without certificates and measures."""
-    spent, own = [0.0], {name: getattr(Transcription, name) for name in ("__init__", "_solve_on")}
+    """Add up the processor time of transcription and search by all methods, without certificates and measures."""
+    spent, inside = [0.0], [False]
+    timed_calls = [(Transcription, "__init__"), (Transcription, "_solve_on"), *((run, name) for name in SEARCHES)]
+    originals = [(owner, name, getattr(owner, name)) for owner, name in timed_calls]
 
     def timed(function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*given: Any, **named: Any) -> Any:
-            begun = time.process_time()
+            if inside[0]:
+                return function(*given, **named)
+            begun, inside[0] = time.process_time(), True
             try:
                 return function(*given, **named)
             finally:
                 spent[0] += time.process_time() - begun
+                inside[0] = False
 
         return call
 
-    for name, function in own.items():
-        setattr(Transcription, name, timed(function))
+    for owner, name, function in originals:
+        setattr(owner, name, timed(function))
     try:
         yield spent
     finally:
-        for name, function in own.items():
-            setattr(Transcription, name, function)
+        for owner, name, function in originals:
+            setattr(owner, name, function)
 
 
 def plan_from(answer: Row, case: Case) -> dict[str, Any]:

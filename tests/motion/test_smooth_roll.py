@@ -83,7 +83,7 @@ def test_what_it_leaves_out_it_does_not_move(write_urdf):
 
 
 def reach(model):
-    """Return the reaching problem of `tests/benchmarks/ilqr.py`."""
+    """Return the reaching problem of `tests/benchmarks/peers_examples.py`."""
     goal = np.array([0.5, -1.2, 1.0, -0.8, 0.6, 0.3, 0, 0, 0, 0, 0, 0])
     weights = np.repeat([0.1, 0.01], 6), np.repeat([1000.0, 10.0], 6)
     effort, final = (dd.QuadraticCost(Q=np.diag(q), R=1e-3 * np.eye(6), x_ref=goal) for q in weights)
