@@ -19,7 +19,7 @@ from drake_diff.model.step import set_state
 from drake_diff.motion.intervals import roll
 from drake_diff.motion.rollout import CONTINUOUS
 from drake_diff.optimize.continuation import check_schedule
-from drake_diff.optimize.guess import another_guess, first_guesses, other_guess, sampled
+from drake_diff.optimize.guess import another_guess, first_guess, first_guesses, other_guess, sampled
 from drake_diff.optimize.ilqr.ilqr import check_problem, takes
 from drake_diff.optimize.options import Options
 from drake_diff.optimize.path_timing import PathTiming
@@ -416,7 +416,7 @@ def _conversion(
         if rows:
             return None
         task.collocated.append(plan)
-        _convert(task, _shooting(asked), plan, rows)
+        _convert(task, _to_steps(task.problem, asked)[0], plan, rows)
         last = task.converted[-1] if task.converted else None
         return last if last is not None and last.status in (Status.CONVERGED, Status.INTERRUPTED) else None
 
@@ -432,14 +432,7 @@ def _in_steps(task: _Task, asked: Attempt, plan: Solution, chain: list[dict[str,
     """
     if not (plan.success and plan.transcribed is not None and _has_steps(task.problem)):
         return plan
-    first = _shooting(asked)
-    nearest = "the motion in the model's own steps that is nearest to the collocated plan"
-    attempts = (
-        first,
-        replace(asked.by("ilqr", f"{first.reason}, by iLQR"), max_iterations=REFINING),
-        replace(first, reason=nearest, closest=True, max_iterations=5 * REFINING),
-    )
-    for attempt in attempts[1 if task.converted and "refinements" not in plan.options else 0 :]:
+    for attempt in _to_steps(task.problem, asked)[1 if task.converted and "refinements" not in plan.options else 0 :]:
         if task.converted and task.converted[-1].status in ENDED:
             break
         if attempt.method == "shooting" or _is_possible(task.problem, attempt):
@@ -449,8 +442,14 @@ def _in_steps(task: _Task, asked: Attempt, plan: Solution, chain: list[dict[str,
     return task.converted[-1] if task.converted[-1].success else not_in_steps(plan, task.converted[0])
 
 
-def _shooting(asked: Attempt) -> Attempt:
-    return replace(asked.by("shooting", "the collocated plan in the model's own steps"), max_iterations=REFINING)
+def _to_steps(problem: Problem, asked: Attempt) -> tuple[Attempt, ...]:
+    """Return the attempts in the model's own steps from a collocated plan, in their order."""
+    reason = "the collocated plan in the model's own steps"
+    nearest = "the motion in the model's own steps that is nearest to the collocated plan"
+    shooting = replace(asked.by("shooting", reason), max_iterations=REFINING)
+    by_ilqr = replace(asked.by("ilqr", f"{reason}, by iLQR"), max_iterations=REFINING)
+    last = replace(shooting, reason=nearest, closest=True, max_iterations=5 * REFINING)
+    return (by_ilqr, shooting, last) if _has_soft_goals(problem) else (shooting, by_ilqr, last)
 
 
 def _has_steps(problem: Problem) -> bool:
@@ -521,10 +520,11 @@ def _restarted(task: _Task, asked: Attempt, first: Solution, restarts: int) -> S
 
 def _from_other_starts(task: _Task, asked: Attempt, first: Solution) -> Solution:
     """Return a verified plan that is cheaper than `first`, from a few random guesses, or else `first` with a note."""
-    plan = task.collocated[-1] if task.collocated else first
-    if plan.transcribed is None or first.status not in PLANS or not task.problem.has_cost or task.is_late:
+    plan, problem = task.collocated[-1] if task.collocated else first, task.problem
+    if first.status not in PLANS or not problem.has_cost or task.is_late or choose_method(problem)[0] != "collocation":
         return first
-    starts = search_cheaper(plan, asked.seed, lambda: task.limits_of(asked), task.report)
+    scheme = asked.options.scheme or default_scheme(problem)
+    starts = search_cheaper(plan, scheme, asked.seed, lambda: task.limits_of(asked), task.report)
     chain = [*first.options.get("chain", ()), {**OTHER_STARTS, "ended": str(starts)}]
     best = first
     for guess in starts.cheaper[:MOST_VERIFIED]:
@@ -561,6 +561,7 @@ def _attempts(problem: Any, asked: Attempt, given: Any, solutions: list[Any]) ->
         yield from _in_continuous_time(problem, asked.by(method, reason), given, solutions)
         return
     first = asked.by(method, reason)
+    yield from _by_ilqr_first(problem, first, given)
     if method == "ilqr" or (method == "shooting" and problem.couplings):
         yield from _without_contact(problem, asked, given, solutions)
     yield first, given
@@ -581,6 +582,21 @@ def _attempts(problem: Any, asked: Attempt, given: Any, solutions: list[Any]) ->
             guess = solutions[-1]
         after = "collocation" if method == "collocation" else "shooting"
         yield asked.by(after, "from the motion that iLQR found"), guess
+
+
+def _by_ilqr_first(problem: Problem, first: Attempt, given: Any) -> Iterator[tuple[Attempt, Any]]:
+    """Yield an attempt by iLQR before collocation if all goals are costs, from the states of collocation's guess."""
+    attempt = replace(first.by("ilqr", "all goals are costs"), max_iterations=first.options.guess_iterations)
+    if first.method == "collocation" and _has_soft_goals(problem) and _is_possible(problem, attempt):
+        guess = first_guess(problem, "collocation", given, first.seed)
+        yield attempt, (guess.xs, guess.us)
+
+
+def _has_soft_goals(problem: Problem) -> bool:
+    """Return whether the problem asks only for small costs of inputs within their limits, which suits iLQR in steps."""
+    hard = problem.constraints or problem.couplings or problem.waypoints or problem.optimizes_parameters
+    hard = hard or np.any(np.isfinite(problem.goal)) or any(goal.weight is None for goal in problem.goals)
+    return _has_steps(problem) and not hard and problem.optimizes_controls and problem.has_cost
 
 
 def _without_contact(

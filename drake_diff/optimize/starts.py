@@ -7,15 +7,17 @@ import numpy as np
 
 from drake_diff._base.clock import noted_interrupts
 from drake_diff.optimize.guess import another_guess
+from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Limits, Outcome, Report
 from drake_diff.optimize.run import arrays_of
 from drake_diff.optimize.solution import Solution, Status
 from drake_diff.optimize.transcription.collocation import FOUND, Transcribed, Transcription
 
 MOST_STARTS, FEWEST_STARTS = 12, 5  # if the first few all lead to the plan's cost, the others are not tried
-# Of all starts together, times the knots' states and inputs, so that they take about as long for robots as for small
-# systems, and of one start. A search that needs more iterations rarely ends at a cheaper motion.
-MOST_ITERATIONS, MOST_OF_A_START, SIZED_ITERATIONS = 600, 100, 200_000
+# Of all starts together, times the steps and the square of the states and inputs, so that they take about as long for
+# robots as for small systems, and of one start. A search that needs more iterations rarely ends at a cheaper motion. No
+# start is made if all of them together would have fewer than the last number.
+MOST_ITERATIONS, MOST_OF_A_START, SIZED_ITERATIONS, FEWEST_ITERATIONS = 600, 100, 4_000_000, 20
 CHEAPER = 0.01  # fraction of the cost: smaller differences may be due to the mesh or the steps
 ENDED_BY_THE_USER = (Outcome.INTERRUPTED, Outcome.TIME_LIMIT)
 
@@ -39,15 +41,15 @@ class Starts:
         return f"{result}, before the user or the time limit ended the search" if self.ended else result
 
 
-def search_cheaper(plan: Solution, seed: int, limits: Callable[[], Limits], report: Report) -> Starts:
-    """Search from random guesses by `seed` for motions that cost less than a collocated `plan`.
+def search_cheaper(plan: Solution, scheme: str, seed: int, limits: Callable[[], Limits], report: Report) -> Starts:
+    """Search by collocation in `scheme` from random guesses by `seed` for motions that cost less than a plan.
 
     The number of starts depends on iterations alone, so that the same seed gives the same result on all machines.
     """
     problem, first = plan.problem, _cost(plan)
-    size = problem.num_steps * (problem.nx + problem.nu)
-    most = min(MOST_ITERATIONS, SIZED_ITERATIONS // size)
-    transcription = Transcription(problem, plan.scheme)
+    most = min(MOST_ITERATIONS, SIZED_ITERATIONS // (problem.num_steps * (problem.nx + problem.nu) ** 2))
+    most = most if most >= FEWEST_ITERATIONS else 0
+    transcription = Transcription(problem, scheme)
     scale = max(abs(first), problem.least_cost(plan.xs[0], plan.time_step))
     motions: list[Solution] = []
     used, number, alike, ended = 0, 0, True, False
@@ -60,7 +62,7 @@ def search_cheaper(plan: Solution, seed: int, limits: Callable[[], Limits], repo
             motion = transcription.solve([guess], limits=few, report=None)
             used += len(motion.result.iterations)
             if motion.result.outcome in FOUND:
-                motions.append(_solution(plan, motion, f"random {number} of seed {seed}"))
+                motions.append(_solution(problem, scheme, motion, f"random {number} of seed {seed}"))
                 report.say(f"random first guess {number}: cost {_cost(motions[-1]):.6g}")
             alike = alike and motion.result.outcome in FOUND and abs(_cost(motions[-1]) - first) <= CHEAPER * scale
             ended = motion.result.outcome in ENDED_BY_THE_USER or interrupted.is_set()
@@ -72,13 +74,13 @@ def search_cheaper(plan: Solution, seed: int, limits: Callable[[], Limits], repo
     return Starts(tuple(cheaper), number, used, ended)
 
 
-def _solution(plan: Solution, motion: Transcribed, name: str) -> Solution:
-    """Return a motion for the problem of `plan` as a solution that is not verified."""
+def _solution(problem: Problem, scheme: str, motion: Transcribed, name: str) -> Solution:
+    """Return a motion for `problem` as a solution that is not verified."""
     phase = motion.phases[0]
-    fields = {"scheme": plan.scheme, "multipliers": motion.result.multipliers, **arrays_of(phase)}
-    return Solution(plan.problem, "collocation", "ipopt", Status.FAILED, name, phase.xs, phase.us[:-1], **fields)
+    fields = {"scheme": scheme, "multipliers": motion.result.multipliers, **arrays_of(phase)}
+    return Solution(problem, "collocation", "ipopt", Status.FAILED, name, phase.xs, phase.us[:-1], **fields)
 
 
 def _cost(plan: Solution) -> float:
-    """Return the cost by the scheme's quadrature, which the search minimizes."""
-    return np.inf if plan.transcribed is None else plan.transcribed.quadrature
+    """Return the cost by the scheme's quadrature, which the search minimizes, or in the model's own steps."""
+    return plan.cost if plan.transcribed is None else plan.transcribed.quadrature
