@@ -506,13 +506,13 @@ class MovingTree:
 
     @cached_property
     def _in_world(self) -> tuple[list[tuple[Any, Any]], list[list[int]], Any]:
-        """Each link's rotation, origin and moving dofs, and the motion of each dof (6, nv), in world.
+        """Each link's rotation, origin and moving dofs, and the motion of each dof (6, n), in world.
 
         The motion is [angular; linear] about the world's origin.
         """
         places: list[tuple[Any, Any]] = []
         above: list[list[int]] = []
-        S = ca.SX(6, self.nv)
+        S = ca.SX(6, self.all_v.numel())
         for link, (R, p), motion in zip(self.links, self.frames, self.motions, strict=True):
             if link.parent >= 0:
                 R_up, p_up = places[link.parent]
@@ -526,7 +526,7 @@ class MovingTree:
 
     @property
     def S(self) -> Any:
-        """The motion (6, nv) of each dof at unit speed, [angular; linear] in world about the world's origin."""
+        """The motion (6, n) of each dof at unit speed, [angular; linear] in world about the world's origin."""
         return self._in_world[2]
 
     def body(self, name: str) -> tuple[Any, Any, list[int]]:

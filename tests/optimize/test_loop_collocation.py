@@ -254,3 +254,35 @@ def test_stance_with_a_closed_loop(tmp_path):
     forces = stance.forces(x, [0.0, 0.0])
     assert forces.shape == (2,)
     assert forces[1] == pytest.approx((1 + 3 * MASS) * G, rel=1e-9)
+
+
+PARALLELOGRAM = (
+    '<mujoco model="loop"><worldbody><body name="first" pos="0 0 1"><joint name="a" axis="0 1 0"/>{rod}'
+    '<body name="bar" pos="0 0 -0.3"><joint name="b" axis="0 1 0"/>'
+    '<inertial pos="0.2 0 0" mass="0.5" diaginertia="1e-4 0.01 0.01"/></body></body>'
+    '<body name="second" pos="0.4 0 1"><joint name="c" axis="0 1 0"/>{rod}</body>'
+    '<body name="wheel" pos="0 1 1"><joint name="d" axis="0 1 0"/>'
+    '<inertial pos="0 0 0" mass="1" diaginertia="0.02 0.03 0.02"/></body></worldbody>'
+    '<equality><connect body1="bar" body2="second" anchor="0.4 0 0"/><joint joint1="d" joint2="a" polycoef="0 -2"/>'
+    '</equality><actuator><motor name="m" joint="a" ctrlrange="-9 9"/></actuator></mujoco>'
+)
+
+
+@pytest.mark.solve
+def test_a_loop_beside_a_coupled_joint_has_its_closed_form(tmp_path):
+    """The cranks turn by the same angle a, the bar not, and the wheel by -2 a, which adds 4 times its inertia."""
+    rod = '<inertial pos="0 0 -0.15" mass="0.7" diaginertia="{0} {0} 1e-4"/>'.format(0.7 * 0.3**2 / 12)
+    (tmp_path / "loop.xml").write_text(PARALLELOGRAM.format(rod=rod))
+    model = load(tmp_path / "loop.xml", mimic="reduce")
+    assert model.coupling is not None
+    a = [model.position_names.index(f"{name}_q") for name in "abc"]
+    x = np.zeros(model.nx)
+    x[a] = -0.4, 0.4, -0.4
+    rates = dd.optimize.plant_dynamics(model)(x, [1.5])[model.nq :]
+    inertia = 2 * 0.7 * 0.3**2 / 3 + 0.5 * 0.3**2 + 4 * 0.03
+    wanted = (1.5 + (0.7 + 0.5) * G * 0.3 * np.sin(0.4)) / inertia
+    np.testing.assert_allclose(rates[a], np.array([1, -1, 1]) * wanted, rtol=1e-9)
+    problem = problem_of(model, x_goal={"a_q": 0.5, "a_w": 0.0})
+    solution = dd.solve(problem, method="collocation")
+    assert solution.success, solution.message
+    assert worst_gap(model, solution.xs) < 1e-9
