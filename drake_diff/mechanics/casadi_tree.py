@@ -52,7 +52,7 @@ class PlantFunctions:
 
     The Hessian takes a knot, weights (nx,) and the Jacobian at the knot, which saves a third of the work. With m fixed
     velocities, `forces` (m,) act along them, and `jump` (nv,) and `impulses` (m,) are those of an impact that stops
-    them.
+    them. `closing` (2 m,) are the distances of the points along them, and they.
     """
 
     function: Any
@@ -61,6 +61,7 @@ class PlantFunctions:
     forces: Any
     jump: Any
     impulses: Any
+    closing: Any
 
 
 def symbolic_plant(
@@ -154,9 +155,9 @@ def plant_functions(
     for force, value in zip(model.body_forces, u.elements()[nu - len(model.body_forces) :], strict=True):
         driven += moving.body_force(force) * value
     mass, r, at_rest = moving.mass(), moving.residual(a[:n]) - driven, moving.residual(ca.SX.zeros(n)) - driven
-    speed = ca.SX(0, 1)
+    apart = speed = ca.SX(0, 1)
     if fixed is not None:
-        speed, turning = (rows[fixed] for rows in moving.relative_motion(model, held, rates))
+        apart, speed, turning = (rows[fixed] for rows in moving.relative_motion(model, held, rates))
         J = ca.densify(ca.jacobian(speed, v))
         mass = ca.blockcat([[mass, -J.T], [-J, ca.SX(ca.DM.zeros(m, m))]])
         r, at_rest = ca.vertcat(r - J.T @ a[n:], -J @ a[:n] - turning), ca.vertcat(at_rest, -turning)
@@ -199,7 +200,10 @@ def plant_functions(
         ca.Function("plant", [knot], [ca.vertcat(rates, solved[:n])]),
         jacobian,
         ca.Function("hessian", [knot, weights, rows], [ca.triu(hessian)]),
-        *(ca.Function("fixed", [knot], [ca.densify(value)]) for value in (solved[n:], stopped[:n], stopped[n:])),
+        *(
+            ca.Function("fixed", [knot], [ca.densify(value)])
+            for value in (solved[n:], stopped[:n], stopped[n:], ca.vertcat(apart, speed))
+        ),
     )
 
 
@@ -416,20 +420,19 @@ class MovingTree:
             rates[link.q + 4 : link.q + 7] = self.v[link.v + 3 : link.v + 6]
         return rates
 
-    def relative_motion(self, model: Model, held: Sequence[HeldPoints], rates: Any) -> tuple[Any, Any]:
-        """Return J v and (dJ/dt) v (3 L,) of the first points of `held` relative to the second, in the second's frame.
+    def relative_motion(self, model: Model, held: Sequence[HeldPoints], rates: Any) -> list[Any]:
+        """Return the positions, J v and (dJ/dt) v (3 L,) of the points of `held` relative to the second ones.
 
-        `rates` (nq,) are those of q.
+        They are in the second points' frames. `rates` (nq,) are those of q.
         """
         names = {body.index(): label for label, body in labelled(bodies(model.plant)).items()}
-        speeds, bias = [], []
+        rows = []
         for pair in held:
             (R, p, _), (R_other, p_other, _) = (self.body(names.get(index, "world")) for index in pair.bodies)
             apart = p + R @ ca.DM(pair.points[0]) - p_other - R_other @ ca.DM(pair.points[1])
             speed = ca.jtimes(apart, self.q, rates)
-            speeds.append(R_other.T @ speed)
-            bias.append(R_other.T @ ca.jtimes(speed, self.q, rates))
-        return ca.vertcat(*speeds), ca.vertcat(*bias)
+            rows.append([R_other.T @ vector for vector in (apart, speed, ca.jtimes(speed, self.q, rates))])
+        return [ca.vertcat(*column) for column in zip(*rows, strict=True)]
 
     def body_force(self, force: BodyForce) -> Any:
         """Return the generalized force (nv,) of a BodyForce of 1 N, in a tree without coupling."""

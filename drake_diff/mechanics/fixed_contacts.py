@@ -99,8 +99,13 @@ class FixedContactPlant:
 
     @cached_property
     def expressions(self) -> dict[str, _Expression]:
-        """Functions of a knot: the contact `forces` (m,), and for an impact the `jump` (nv,) and `impulses` (m,)."""
-        return {name: _Expression(getattr(self.functions, name)) for name in ("forces", "jump", "impulses")}
+        """The functions of a knot of `PlantFunctions` that other functions use."""
+        names = "forces", "jump", "impulses", "closing"
+        return {name: _Expression(getattr(self.functions, name)) for name in names}
+
+    def closing(self, x: Any) -> Any:
+        """Return the distances [m] and velocities [m/s] (2 m,) that are zero if the loops are closed in x (nx,)."""
+        return self.expressions["closing"](np.concatenate([np.asarray(x), np.zeros(self.model.nu)]))
 
 
 def slopes_at(model: Model, held: Sequence[HeldPoints], x: Array) -> tuple[Array, Array]:

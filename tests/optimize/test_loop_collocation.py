@@ -286,3 +286,26 @@ def test_a_loop_beside_a_coupled_joint_has_its_closed_form(tmp_path):
     solution = dd.solve(problem, method="collocation")
     assert solution.success, solution.message
     assert worst_gap(model, solution.xs) < 1e-9
+
+
+@pytest.mark.solve
+@pytest.mark.parametrize("free", [[1, 1, 1, 0, 0, 0], [0, 0, 0, 1, 1, 1]])
+def test_a_free_start_closes_the_loop(four_bar_plan, free):
+    """Without a constraint at the start, the cheapest start has an open loop."""
+    model, plan = four_bar_plan
+    problem = problem_of(model, optimize=("controls", "initial_state"), initial_state_mask=np.array(free, dtype=bool))
+    solution = dd.solve(problem, method="collocation")
+    assert solution.success, solution.message
+    assert solution.cost < plan.cost
+    start = solution.xs[0]
+    assert np.abs(loop_plant(model).closing(start)).max() < 1.1e-7  # the tolerance, and IPOPT's relaxation of it
+    a, b, c = closed_form(start[0])
+    np.testing.assert_allclose(start[:3], [a, b - a, c], atol=1e-5)
+
+
+@pytest.mark.solve
+def test_a_saved_plan_of_a_loop_is_made_again(four_bar_plan, tmp_path):
+    _, plan = four_bar_plan
+    record = dd.save(plan, tmp_path / "run")
+    assert 0 < next(metric.value for metric in record.metrics if metric.name == "loop gap") < 0.005
+    assert dd.verify(tmp_path / "run").holds
