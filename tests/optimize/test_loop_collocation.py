@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+from helpers.linkages import LEG
 from helpers.table import each_row
 from scipy.integrate import solve_ivp
 
@@ -309,3 +310,19 @@ def test_a_saved_plan_of_a_loop_is_made_again(four_bar_plan, tmp_path):
     record = dd.save(plan, tmp_path / "run")
     assert 0 < next(metric.value for metric in record.metrics if metric.name == "loop gap") < 0.005
     assert dd.verify(tmp_path / "run").holds
+
+
+@pytest.mark.solve
+def test_a_leg_with_a_rod_moves_in_least_time(tmp_path):
+    """The rod keeps the shank parallel to the crank, as both have the same length: hip + knee = drive."""
+    (tmp_path / "leg.xml").write_text(LEG)
+    model = load(tmp_path / "leg.xml")
+    goal = {"hip_q": 0.4, "drive_q": -0.3, "rail_x": 0.05, "hip_w": 0.0, "drive_w": 0.0, "rail_v": 0.0}
+    cost = lambda x, u: 1.0 + 1e-4 * u.dot(u)  # noqa: E731
+    solution = dd.solve(problem_of(model, x_goal=goal, num_steps=30, horizon=(0.05, 2.0), running_cost=cost))
+    assert solution.success, solution.message
+    assert solution.method == "collocation"
+    assert 0.1 < solution.times[-1] < 0.2
+    hip, knee, drive, pin = solution.xs[:, 1:5].T
+    np.testing.assert_allclose(hip + knee, drive, atol=1e-9)
+    np.testing.assert_allclose(drive + pin, hip, atol=1e-9)
