@@ -807,7 +807,7 @@ def choose_method(problem: Problem) -> tuple[str, str]:
     if contract.contact.collision_pairs:
         return "ilqr", "the model has geometries that can touch, which collocation leaves out"
     if not smooth:
-        return "ilqr", "the model has constraints or PD control, which collocation leaves out"
+        return "ilqr", "the model has constraints or PD control, which its own steps include"
     if problem.optimizes_parameters:
         return "collocation", f"the model is smooth, with {', '.join(problem.parameters.names[:3])} among its variables"
     return "collocation", "the model is smooth"
