@@ -9,11 +9,16 @@ derivatives of r, whose expression is half as long:
 
     a_z = -M^-1 (r_z - B_z),    d^2 (w' a) = -(H_zz + H_za a_z + (H_za a_z)'),    H = d^2 (mu' r), mu = M^-1 w fixed
 
+If the motion leaves velocities J(q) v of points at zero, forces f act along them. a then is [dv/dt; f], and
+
+    r = [M dv/dt - J' f + ...; -J dv/dt - (dJ/dt) v],    dr/da = [M  -J'; -J  0]
+
 Parameters of the model may be symbols too. Their coordinates c are then the end of the knot: z = [q, v, u, c]. r
 remains quadratic in v and linear in a. The functions are compared with Drake's plant, and a model whose forces or
 constraints the tree does not include is refused.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -21,7 +26,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from drake_diff._base.arrays import Array
+from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.clock import Pace, check_time
 from drake_diff._base.values import Refusal
 from drake_diff.mechanics.description import Link, RigidLink, read_links, springs_of
@@ -29,9 +34,10 @@ from drake_diff.mechanics.symbol import Mapped
 from drake_diff.mechanics.tree import TreeModel, tree_for, tree_of
 from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.inputs import BodyForce
+from drake_diff.model.loops import HeldPoints
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterCoordinates, ParameterVector, applied
-from drake_diff.model.plant import actuators, labelled
+from drake_diff.model.plant import actuators, bodies, labelled
 from drake_diff.model.step import set_state
 
 SAME_PLANT = 1e-9  # tolerance relative to the largest rate: rounding, magnified by a badly conditioned mass matrix
@@ -44,12 +50,18 @@ Z = ca.DM([0, 0, 1])
 class PlantFunctions:
     """CasADi functions of a knot: x' (nx,), its Jacobian, and the upper triangle of d^2 (weights' x').
 
-    The Hessian takes a knot, weights (nx,) and the Jacobian at the knot, which saves a third of the work.
+    The Hessian takes a knot, weights (nx,) and the Jacobian at the knot, which saves a third of the work. With m fixed
+    velocities, `forces` (m,) act along them, and `jump` (nv,) and `impulses` (m,) are those of an impact that stops
+    them. `closing` (2 m,) are the distances of the points along them, and they.
     """
 
     function: Any
     jacobian: Any
     hessian: Any
+    forces: Any
+    jump: Any
+    impulses: Any
+    closing: Any
 
 
 def symbolic_plant(
@@ -87,7 +99,7 @@ def _compared(
         unknown = plant.move(model, vector, values)
         if unknown:
             return Refusal(f"its parameter {unknown} is no symbol here")
-    functions = _functions(plant, model, symbols, ca.DM(equations.actuation))
+    functions = plant_functions(plant, model, symbols)
     probe = random.standard_normal((2, model.nx + model.nu))
     tails = tail + TRIED * random.uniform(0, 1, (2, len(tail))) * np.where(tail == 0, 1.0, tail)
     wanted = []
@@ -124,24 +136,38 @@ def body_forces_of(model: Model) -> Mapped | Refusal:
     return Mapped(ca.Function("body_forces", [q], [ca.densify(columns), ca.densify(ca.jacobian(columns, q))]))
 
 
-def _functions(plant: "SymbolicTree", model: Model, c: Any, actuation: Any) -> PlantFunctions:
+def plant_functions(
+    plant: "SymbolicTree", model: Model, c: Any, held: Sequence[HeldPoints] = (), fixed: Indices | None = None
+) -> PlantFunctions:
+    """Return the functions of knots with symbols `c` (np,) at their end.
+
+    The entries `fixed` (m,) of the relative velocities (3 L,) of the points `held` are zero.
+    """
+    m = 0 if fixed is None else len(fixed)
     nq, n, nx, nu, width, more = model.nq, model.nv, model.nx, model.nu, model.nx + model.nu, c.numel()
-    xu, weights, mu, a = (ca.SX.sym(s, k) for s, k in (("knot", width), ("w", nx), ("mu", n), ("a", n)))
+    xu, weights, mu, a = (ca.SX.sym(s, k) for s, k in (("knot", width), ("w", nx), ("mu", n + m), ("a", n + m)))
     knot = ca.vertcat(xu, c)
     q, v, u = xu[:nq], xu[nq:nx], xu[nx:]
     pace = Pace()
     moving = plant.at(q, v)
     rates = v if nq == n else moving.position_rates
-    driven = actuation @ u
+    driven = ca.DM(model.actuation) @ u
     for force, value in zip(model.body_forces, u.elements()[nu - len(model.body_forces) :], strict=True):
         driven += moving.body_force(force) * value
-    mass, r = moving.mass(), moving.residual(a) - driven
+    mass, r, at_rest = moving.mass(), moving.residual(a[:n]) - driven, moving.residual(ca.SX.zeros(n)) - driven
+    apart = speed = ca.SX(0, 1)
+    if fixed is not None:
+        apart, speed, turning = (rows[fixed] for rows in moving.relative_motion(model, held, rates))
+        J = ca.densify(ca.jacobian(speed, v))
+        mass = ca.blockcat([[mass, -J.T], [-J, ca.SX(ca.DM.zeros(m, m))]])
+        r, at_rest = ca.vertcat(r - J.T @ a[n:], -J @ a[:n] - turning), ca.vertcat(at_rest, -turning)
     pace.go_on()
     factors = ca.ldl(mass)
-    solved = ca.ldl_solve(driven - moving.residual(ca.SX.zeros(n)), *factors)
+    solved = -ca.ldl_solve(at_rest, *factors)
+    stopped = ca.ldl_solve(ca.vertcat(ca.SX.zeros(n), speed), *factors)
     pace.go_on()
     rows = []
-    for i in range(n):
+    for i in range(n + m):
         check_time()
         rows.append(ca.gradient(r[i], knot).T)  # reverse mode: a fifth shorter than with CasADi's default choice
     pace.go_on()
@@ -152,13 +178,14 @@ def _functions(plant: "SymbolicTree", model: Model, c: Any, actuation: Any) -> P
     pace.go_on()
     by_knot = -ca.ldl_solve(slopes(knot, solved), *factors)
     pace.go_on()
-    jacobian = ca.Function("jacobian", [knot], [ca.vertcat(ca.jacobian(rates, knot), by_knot)])
+    jacobian = ca.Function("jacobian", [knot], [ca.vertcat(ca.jacobian(rates, knot), by_knot[:n, :])])
     rows = ca.SX.sym("rows", jacobian.sparsity_out(0))
-    by_q, by_v, by_c = curves(knot, solved, ca.ldl_solve(weights[nq:], *factors))
-    ends = [nq, nx, width, width + n]
-    (_, vq, uq, aq, _), (qc, vc, uc, ac, cc) = (ca.vertsplit(by, [0, *ends, width + n + more]) for by in (by_q, by_c))
+    by_q, by_v, by_c = curves(knot, solved, ca.ldl_solve(ca.vertcat(weights[nq:], ca.SX.zeros(m)), *factors))
+    ends = [nq, nx, width, width + n + m]
+    (_, vq, uq, aq, _), (qc, vc, uc, ac, cc) = (ca.vertsplit(by, [0, *ends, ends[-1] + more]) for by in (by_q, by_c))
     turns = ca.jacobian(ca.gradient(ca.dot(weights[:nq], rates), v), q)  # 0 unless quaternions turn
-    S = ca.vertcat(aq.T @ rows[nq:, :], ca.SX(n + nu, width + more), ac.T @ rows[nq:, :])
+    slopes_of_a = ca.vertcat(rows[nq:, :], by_knot[n:, :])
+    S = ca.vertcat(aq.T @ slopes_of_a, ca.SX(n + nu, width + more), ac.T @ slopes_of_a)
     H = ca.blockcat(
         [
             [by_q[:nq, :], (vq - turns).T, uq.T, qc],
@@ -170,9 +197,13 @@ def _functions(plant: "SymbolicTree", model: Model, c: Any, actuation: Any) -> P
     pace.go_on()
     hessian = -(H + S + S.T)
     return PlantFunctions(
-        ca.Function("plant", [knot], [ca.vertcat(rates, solved)]),
+        ca.Function("plant", [knot], [ca.vertcat(rates, solved[:n])]),
         jacobian,
         ca.Function("hessian", [knot, weights, rows], [ca.triu(hessian)]),
+        *(
+            ca.Function("fixed", [knot], [ca.densify(value)])
+            for value in (solved[n:], stopped[:n], stopped[n:], ca.vertcat(apart, speed))
+        ),
     )
 
 
@@ -389,6 +420,20 @@ class MovingTree:
             rates[link.q + 4 : link.q + 7] = self.v[link.v + 3 : link.v + 6]
         return rates
 
+    def relative_motion(self, model: Model, held: Sequence[HeldPoints], rates: Any) -> list[Any]:
+        """Return the positions, J v and (dJ/dt) v (3 L,) of the points of `held` relative to the second ones.
+
+        They are in the second points' frames. `rates` (nq,) are those of q.
+        """
+        names = {body.index(): label for label, body in labelled(bodies(model.plant)).items()}
+        rows = []
+        for pair in held:
+            (R, p, _), (R_other, p_other, _) = (self.body(names.get(index, "world")) for index in pair.bodies)
+            apart = p + R @ ca.DM(pair.points[0]) - p_other - R_other @ ca.DM(pair.points[1])
+            speed = ca.jtimes(apart, self.q, rates)
+            rows.append([R_other.T @ vector for vector in (apart, speed, ca.jtimes(speed, self.q, rates))])
+        return [ca.vertcat(*column) for column in zip(*rows, strict=True)]
+
     def body_force(self, force: BodyForce) -> Any:
         """Return the generalized force (nv,) of a BodyForce of 1 N, in a tree without coupling."""
         R, p, dofs = self.body(force.body)
@@ -464,13 +509,13 @@ class MovingTree:
 
     @cached_property
     def _in_world(self) -> tuple[list[tuple[Any, Any]], list[list[int]], Any]:
-        """Each link's rotation, origin and moving dofs, and the motion of each dof (6, nv), in world.
+        """Each link's rotation, origin and moving dofs, and the motion of each dof (6, n), in world.
 
         The motion is [angular; linear] about the world's origin.
         """
         places: list[tuple[Any, Any]] = []
         above: list[list[int]] = []
-        S = ca.SX(6, self.nv)
+        S = ca.SX(6, self.all_v.numel())
         for link, (R, p), motion in zip(self.links, self.frames, self.motions, strict=True):
             if link.parent >= 0:
                 R_up, p_up = places[link.parent]
@@ -484,7 +529,7 @@ class MovingTree:
 
     @property
     def S(self) -> Any:
-        """The motion (6, nv) of each dof at unit speed, [angular; linear] in world about the world's origin."""
+        """The motion (6, n) of each dof at unit speed, [angular; linear] in world about the world's origin."""
         return self._in_world[2]
 
     def body(self, name: str) -> tuple[Any, Any, list[int]]:

@@ -1,28 +1,32 @@
-"""Equations of motion, contact forces and impacts of a tree of hinges and slides with points fixed in the world.
+"""Equations of motion, forces and impacts of a tree with points fixed in the world or closed kinematic loops.
 
     [M  -J'] [dv/dt ]   [B u - r(q, v, 0)]        [M  -J'] [v+    ]   [M v-]
     [J   0 ] [forces] = [-(dJ/dt) v      ],       [J   0 ] [impact] = [0   ]
 
-with the points' velocities J v (Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 8 and 11). Drake evaluates
-these equations to check a trajectory. A solver uses the same equations as CasADi expressions, compared with Drake's.
+with J v the points' velocities, in a loop those of a point of one body relative to a point of the other (Featherstone,
+"Rigid Body Dynamics Algorithms", 2008, ch. 8 and 11). The rows of J are in the frame of the second body, because the
+axis of a hinge that closes a loop then has the same entries at all positions. Drake evaluates these equations to check
+a trajectory. A solver uses the same equations as CasADi expressions, compared with Drake's.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
-from pydrake.autodiffutils import InitializeAutoDiff
+from scipy.linalg import qr
 
 from drake_diff._base.arrays import Array, Indices
-from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.values import Refusal
-from drake_diff.mechanics.casadi_tree import SAME_PLANT, SymbolicTree, agrees
-from drake_diff.mechanics.symbol import Symbol, called, symbols
-from drake_diff.mechanics.tree import TreeModel, tree_for, tree_of
-from drake_diff.model.equations import EquationsOfMotion
+from drake_diff.exceptions import ModelError
+from drake_diff.mechanics.casadi_tree import SAME_PLANT, PlantFunctions, SymbolicTree, agrees, plant_functions
+from drake_diff.mechanics.symbol import called
+from drake_diff.mechanics.tree import tree_for, tree_of
+from drake_diff.model.assembly import closed
+from drake_diff.model.equations import check_continuous
+from drake_diff.model.loops import HeldPoints, relative_bias, relative_motion
 from drake_diff.model.model import Model
 from drake_diff.model.step import set_state
 
@@ -34,9 +38,9 @@ TRIED = 3  # number of states at which the equations are compared
 class _Expression:
     """An SX function of a knot, callable with floats, AutoDiffXd or Symbols."""
 
-    def __init__(self, symbol: Any, value: Any):
-        self.function = ca.Function("value", [symbol], [ca.densify(value)])
-        self._jacobian = ca.Function("slopes", [symbol], [ca.densify(ca.jacobian(value, symbol))])
+    def __init__(self, function: Any):
+        self.function, knot = function, ca.SX.sym("knot", function.size1_in(0))
+        self._jacobian = ca.Function("slopes", [knot], [ca.densify(ca.jacobian(function(knot), knot))])
 
     def __call__(self, knot: Any) -> Any:
         return called(self.function, self._jacobian, knot)
@@ -47,14 +51,12 @@ class _Expression:
 
 @dataclass(frozen=True, eq=False)
 class FixedContactPlant:
-    """The equations of motion with the coordinates `rows` of the points fixed; see `fixed_contact_plant`."""
+    """The equations of motion with the entries `rows` of the points' velocities fixed; see `fixed_contact_plant`."""
 
     model: Model
-    places: Callable[[Any], Any]  # x -> (P,) all coordinates of the points
-    speeds: Callable[[Any], Any]  # x -> (P,) their velocities
-    rows: Indices  # (m,) the coordinates that some joint moves
-    equations: EquationsOfMotion
-    tree: TreeModel
+    held: tuple[HeldPoints, ...]  # L pairs of points; those fixed to the world come before those of loops
+    rows: Indices  # (m,) independent entries of the relative velocities (3 L,)
+    functions: PlantFunctions
     may_jump = False
 
     def values(self, knots: Array) -> Array:
@@ -67,14 +69,13 @@ class FixedContactPlant:
 
     def linearize(self, knots: Array) -> tuple[Array, Array]:
         """Return the rates (K, nx) and their Jacobians (K, nx, nx + nu), the latter from CasADi."""
-        return self.values(knots), np.array([self.expressions["rates"].jacobian(knot) for knot in knots])
+        return self.values(knots), np.array([self.functions.jacobian(knot).full() for knot in knots])
 
     def jump_at(self, x: Array) -> tuple[Array, Array]:
         """Return the velocity jump (nv,) of an impact that stops the points, and its impulses (m,), from Drake."""
-        n = self.model.nv
-        J = speed_slopes(self.model, self.speeds, x)[self.rows, n:]
-        set_state(self.model.double, x)
-        return self._solve(J, np.zeros(n), -J @ x[n:])
+        J, _ = slopes_at(self.model, self.held, x)
+        n, J = self.model.nv, J[self.rows]
+        return self._solve(J, np.zeros(n), -J @ x[-n:])
 
     def _solved(self, knot: Array) -> tuple[Array, Array]:
         """Return the rates (nx,) and the contact forces (m,)."""
@@ -82,11 +83,10 @@ class FixedContactPlant:
         if not np.all(np.isfinite(knot)):
             return np.full(model.nx, np.nan), np.full(len(self.rows), np.nan)
         x, u = knot[: model.nx], knot[model.nx :]
-        slopes = speed_slopes(model, self.speeds, x)[self.rows]
-        set_state(model.double, x)
-        force = self.equations.actuation @ u - model.double.inverse_dynamics(np.zeros(n))
-        acceleration, forces = self._solve(slopes[:, n:], force, -slopes[:, :n] @ x[n:])
-        return np.concatenate([x[n:], acceleration]), forces
+        J, bias = slopes_at(model, self.held, x)
+        force = model.actuation @ u - model.double.inverse_dynamics(np.zeros(n))
+        acceleration, forces = self._solve(J[self.rows], force, -bias[self.rows])
+        return np.concatenate([model.double.rates(x[-n:]), acceleration]), forces
 
     def _solve(self, J: Array, top: Array, bottom: Array) -> tuple[Array, Array]:
         """Solve the block equations of the module docstring at the context's state."""
@@ -99,68 +99,99 @@ class FixedContactPlant:
 
     @cached_property
     def expressions(self) -> dict[str, _Expression]:
-        """Functions of a knot: the `rates` (nx,) and the contact `forces` (m,).
+        """The functions of a knot of `PlantFunctions` that other functions use."""
+        names = "forces", "jump", "impulses", "closing"
+        return {name: _Expression(getattr(self.functions, name)) for name in names}
 
-        For an impact that stops the points: the velocity `jump` (nv,) and the `impulses` (m,), for any input.
-        """
-        model, n = self.model, self.model.nv
-        knot = ca.SX.sym("knot", model.nx + model.nu)
-        q, v, u = knot[:n], knot[n : 2 * n], knot[2 * n :]
-        speed = _column(np.asarray(self.speeds(symbols(knot[: 2 * n]))).ravel()[self.rows])
-        J = ca.jacobian(speed, v)
-        moving = SymbolicTree(self.tree).at(q, v)
-        factors = ca.ldl(moving.mass())
-        free = ca.ldl_solve(ca.DM(self.equations.actuation) @ u - moving.residual(ca.SX.zeros(n)), *factors)
-        pushed = ca.ldl_solve(ca.SX(ca.densify(J.T)), *factors)
-        inner = ca.ldl(ca.densify(J @ pushed))
-        forces = ca.ldl_solve(-(ca.jacobian(speed, q) @ v + J @ free), *inner)
-        impulses = -ca.ldl_solve(speed, *inner)
-        values = {"rates": ca.vertcat(v, free + pushed @ forces), "forces": forces}
-        values |= {"jump": pushed @ impulses, "impulses": impulses}
-        return {name: _Expression(knot, value) for name, value in values.items()}
+    def closing(self, x: Any) -> Any:
+        """Return the distances [m] and velocities [m/s] (2 m,) that are zero if the loops are closed in x (nx,)."""
+        return self.expressions["closing"](np.concatenate([np.asarray(x), np.zeros(self.model.nu)]))
 
 
-def speed_slopes(model: Model, speeds: Callable[[Any], Any], x: Array) -> Array:
-    """Return the derivative (P, nx) of the points' velocities with respect to the state."""
-    return gradient_rows(np.asarray(speeds(InitializeAutoDiff(x).ravel())).ravel(), model.nx)
+def slopes_at(model: Model, held: Sequence[HeldPoints], x: Array) -> tuple[Array, Array]:
+    """Return J (3 L, nv) and (dJ/dt) v (3 L,) of the module docstring in the state x (nx,), which is set."""
+    set_state(model.double, x)
+    plant, context = model.plant, model.double.context
+    (J, _), bias = relative_motion(plant, context, held), relative_bias(plant, context, held)
+    seconds = [plant.get_body(pair.bodies[1]) for pair in held]
+    turns = np.array([plant.EvalBodyPoseInWorld(context, body).rotation().matrix().T for body in seconds])
+    J = (turns @ J).reshape(3 * len(held), -1)
+    return J if model.coupling is None else J @ model.coupling.spread, (turns @ bias[..., None]).ravel()
 
 
-def fixed_contact_plant(
-    model: Model, places: Callable[[Any], Any], speeds: Callable[[Any], Any]
-) -> FixedContactPlant | Refusal:
-    """Return the equations with the points at `places`, of velocities `speeds`, fixed in the world, or a Refusal.
+def loop_plant(model: Model) -> FixedContactPlant:
+    """Return the equations of motion of a model with closed loops; raise ModelError if it has no continuous form."""
+    check_continuous(model, loops=True)
+    plant = model.cache("loop plant", lambda: fixed_contact_plant(model, (), ()))
+    if isinstance(plant, Refusal):
+        raise ModelError(f"collocation: {plant}; use method='shooting'")
+    return plant
 
-    Coordinates that no joint moves, such as the y of a planar leg, are omitted. The functions take x in any arithmetic.
+
+def fixed_contact_plant(model: Model, held: Sequence[HeldPoints], asked: Sequence[int]) -> FixedContactPlant | Refusal:
+    """Return the equations with the entries `asked` of the points `held` fixed and all loops closed, or a Refusal.
+
+    Entries that no joint moves, such as the y of a planar leg, are omitted, and so are dependent entries of loops. The
+    latter are chosen at a state with closed loops and must suffice at other such states.
     """
     if model.has_other_parameters:
         return Refusal("parameters are applied that are not the model's own")
-    tree = tree_for(model)
-    if tree is None:
-        result = tree_of(model)
-        return result if isinstance(result, Refusal) else Refusal("its tree differs from Drake's inverse dynamics")
-    if tree.coupling is not None:
-        return Refusal("its mimic joints are reduced")
-    random, here, n = np.random.default_rng(2), model.double.state(), model.nv
-    states = 0.5 * random.standard_normal((TRIED, model.nx))
-    J = np.array([speed_slopes(model, speeds, x) for x in states])[:, :, n:]
+    tree = tree_for(model) or tree_of(model, free=not held)
+    if isinstance(tree, Refusal):
+        return tree
+    if tree.coupling is not None and model.nq != model.nv:
+        return Refusal("it has coupled joints and a floating base")
+    random, here, loops = np.random.default_rng(2), model.double.state(), model.file_facts.held_points
+    states, every = _tried(model, random), [*held, *loops]
+    if states is None:
+        return Refusal("its loops cannot be closed")
+    J = np.array([slopes_at(model, every, x)[0] for x in states])
     size = np.max(np.abs(J), initial=0.0)
-    rows = np.flatnonzero(np.max(np.abs(J), axis=(0, 2)) > NO_WAY * max(size, 1.0))
-    if not len(rows):
+    moving = np.max(np.abs(J), axis=(0, 2)) > NO_WAY * max(size, 1.0)
+    contacts = np.flatnonzero(moving[: 3 * len(held)] & np.isin(np.arange(3 * len(held)), asked))
+    if held and not len(contacts):
         return Refusal("no joint moves any of the points")
-    singular = np.array([np.linalg.svd(J[k][rows], compute_uv=False) for k in range(TRIED)])
-    if len(rows) > n or np.max(singular[:, -1] / singular[:, 0]) < DEPENDENT:
+    closing = 3 * len(held) + np.flatnonzero(moving[3 * len(held) :])
+    choices = [_independent(slopes[closing]) for slopes in J]
+    chosen = closing[max(choices, key=len)]
+    if any(len(_independent(slopes[chosen])) < len(choice) for slopes, choice in zip(J, choices, strict=True)):
+        return Refusal("its loops have other independent constraints in other positions")
+    rows = np.concatenate([contacts, chosen])
+    singular = np.array([np.linalg.svd(slopes[rows], compute_uv=False) for slopes in J])
+    if len(rows) > model.nv or np.max(singular[:, -1] / singular[:, 0]) < DEPENDENT:
         return Refusal(
             f"the {len(rows)} fixed coordinates depend on each other, so that their forces are not unique: "
             "fix fewer axes of some points"
         )
-    plant = FixedContactPlant(model, places, speeds, rows, EquationsOfMotion(model), tree)
+    functions = plant_functions(SymbolicTree(tree), model, ca.SX(0, 1), every, rows)
+    plant = FixedContactPlant(model, tuple(every), rows, functions)
     probe = np.hstack([states, random.standard_normal((TRIED, model.nu))])
-    same = agrees(plant.expressions["rates"].function, probe, plant.values(probe), SAME_PLANT)
+    same = agrees(functions.function, probe, plant.values(probe), SAME_PLANT)
     wanted = np.array([plant.forces_at(knot) for knot in probe])
-    same = same and agrees(plant.expressions["forces"].function, probe, wanted, SAME_PLANT)
+    same = same and agrees(functions.forces, probe, wanted, SAME_PLANT)
     set_state(model.double, here)
     return plant if same else Refusal("its symbolic form differs from Drake's plant")
 
 
-def _column(entries: Array) -> Any:
-    return ca.vertcat(*[entry.sx if isinstance(entry, Symbol) else float(entry) for entry in entries])
+def _tried(model: Model, random: np.random.Generator) -> Array | None:
+    """Return random states (TRIED, nx) with closed loops, or None if the loops cannot be closed."""
+    states = 0.5 * random.standard_normal((TRIED, model.nx))
+    if not model.file_facts.held_points:
+        return states
+    free = np.zeros(model.nq, dtype=bool)
+    q = closed(model, model.default_state[: model.nq], free)
+    if q is None:
+        return None
+    for x in states:
+        near = closed(model, q + x[: model.nq], free)
+        x[: model.nq] = q if near is None else near
+    return states
+
+
+def _independent(J: Array) -> Indices:
+    """Return the largest set of rows of J (r, nv) that are independent, in the order of a QR with pivoting."""
+    if not len(J):
+        return np.zeros(0, dtype=np.intp)
+    _, R, order = qr(J.T, mode="economic", pivoting=True)
+    diagonal = np.abs(np.diag(R))
+    return np.asarray(np.sort(order[: np.count_nonzero(diagonal > DEPENDENT * diagonal[0])]), dtype=np.intp)

@@ -73,7 +73,7 @@ def frame_position(model: Model, frame: str, point: ArrayLike = ORIGIN, relative
         >>> tip([0.0, 0.0])
         array([ 0. ,  0. , -0.5])
     """
-    here, base, p = _frame_index(model, frame), _frame_index(model, relative_to), finite_array("point", point, (3,))
+    here, base, p = frame_index(model, frame), frame_index(model, relative_to), finite_array("point", point, (3,))
 
     def position(x: Any) -> Any:
         R, origin = _pose(model, x, here, base)
@@ -108,7 +108,7 @@ def frame_rotation_error(model: Model, frame: str, R_goal: ArrayLike, relative_t
         >>> error([0.01, 0.0]).round(6)
         array([0.  , 0.01, 0.  ])
     """
-    here, base = _frame_index(model, frame), _frame_index(model, relative_to)
+    here, base = frame_index(model, frame), frame_index(model, relative_to)
     goal = finite_array("R_goal", R_goal, (3, 3))
     off, determinant = float(np.abs(goal.T @ goal - np.eye(3)).max()), np.linalg.det(goal)
     if off > ROTATION_TOLERANCE or determinant < 0:
@@ -153,7 +153,7 @@ def frame_velocity(model: Model, frame: str, point: ArrayLike = ORIGIN) -> OfSta
         >>> tip([0.0, 2.0]).round(6)
         array([-1.,  0.,  0.])
     """
-    here, p = _frame_index(model, frame), finite_array("point", point, (3,))
+    here, p = frame_index(model, frame), finite_array("point", point, (3,))
 
     return recorded(lambda x: _velocities(model, x, here, p)[1], "frame_velocity", frame=frame, point=p.tolist())
 
@@ -177,7 +177,7 @@ def frame_angular_velocity(model: Model, frame: str) -> OfState:
         >>> turning([0.0, 2.0]).round(6)
         array([0., 2., 0.])
     """
-    here = _frame_index(model, frame)
+    here = frame_index(model, frame)
 
     return recorded(lambda x: _velocities(model, x, here, np.zeros(3))[0], "frame_angular_velocity", frame=frame)
 
@@ -206,7 +206,7 @@ def frame_tilt(model: Model, frame: str, axis: ArrayLike = UP) -> OfState:
         >>> tilt([0.01, 0.0]).round(6)
         array([0.01, 0.  ])
     """
-    here, world, a = _frame_index(model, frame), _frame_index(model, "world"), finite_array("axis", axis, (3,))
+    here, world, a = frame_index(model, frame), frame_index(model, "world"), finite_array("axis", axis, (3,))
     if not np.linalg.norm(a) > 0:
         raise InputError("axis", got=a.tolist(), expected="a direction")
     a = a / np.linalg.norm(a)
@@ -389,7 +389,7 @@ def _tree_of(model: Model, depends_on: frozenset[str]) -> ForwardKinematics:
     return kinematics
 
 
-def _frame_index(model: Model, name: str) -> FrameIndex:
+def frame_index(model: Model, name: str) -> FrameIndex:
     plant = model.plant
     frames = [plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())]
     names = [frame.name() for frame in frames]

@@ -4,8 +4,8 @@
 
 They use Drake's mass matrix, force elements (gravity, springs), joint damping and bias, and the forces of the diagram's
 systems. Of these forces, only those of the systems depend on u. Contact, joint limits, PD control and constraints are
-not included: they exist only in the discrete step. With r(q, v, dv/dt, u) the residual of inverse dynamics,
-d(dv/dt) = -M^-1 dr at fixed dv/dt, so AutoDiffXd never factors a matrix.
+not included: they exist only in the discrete step. `mechanics.fixed_contacts` adds closed loops. With r(q, v, dv/dt, u)
+the residual of inverse dynamics, d(dv/dt) = -M^-1 dr at fixed dv/dt, so AutoDiffXd never factors a matrix.
 """
 
 from typing import Any
@@ -31,10 +31,7 @@ class EquationsOfMotion:
     """
 
     def __init__(self, model: Model):
-        if model.pd_targets or any(a.has_controller() for a in actuators(model.plant)):
-            raise ModelError("collocation: PD-controlled actuators have no continuous form; use method='shooting'")
-        if model.num_constraints:
-            raise ModelError("collocation: the model's constraints have no continuous form; use method='shooting'")
+        check_continuous(model)
         self.model = model
         self.actuation = model.actuation
         self.systems = bool(model.inputs.fed)  # forces of systems depend on x and u
@@ -110,6 +107,14 @@ class EquationsOfMotion:
         rest = twin.inverse_dynamics(self._still)
         mass = twin.mass_matrix()
         return np.linalg.solve(mass, self.actuation @ u - rest), mass
+
+
+def check_continuous(model: Model, *, loops: bool = False) -> None:
+    """Raise ModelError for PD control, and for constraints other than `loops`, which have no continuous form."""
+    if model.pd_targets or any(a.has_controller() for a in actuators(model.plant)):
+        raise ModelError("collocation: PD-controlled actuators have no continuous form; use method='shooting'")
+    if model.num_constraints > loops * len(model.file_facts.held_points):
+        raise ModelError("collocation: the model's constraints have no continuous form; use method='shooting'")
 
 
 @TemplateSystem.define("ContinuousSystem_")

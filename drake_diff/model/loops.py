@@ -197,7 +197,7 @@ def _welded_to_the_world(plant: MultibodyPlant, instance: str) -> Any:
     return plant.GetBodyByName(name, index)
 
 
-def relative_motion(plant: MultibodyPlant, context: Any, held: list[HeldPoints]) -> tuple[Array, Array]:
+def relative_motion(plant: MultibodyPlant, context: Any, held: Sequence[HeldPoints]) -> tuple[Array, Array]:
     """Return the Jacobians (L, 3, nv) in v of the differences of L point pairs, and the differences (L, 3) [m].
 
     They are evaluated in the state of `context` and expressed in the world frame.
@@ -213,3 +213,18 @@ def relative_motion(plant: MultibodyPlant, context: Any, held: list[HeldPoints])
             jacobian += sign * moves
             difference += sign * (plant.EvalBodyPoseInWorld(context, body) @ point)
     return jacobians, differences
+
+
+def relative_bias(plant: MultibodyPlant, context: Any, held: Sequence[HeldPoints]) -> Array:
+    """Return the accelerations (L, 3) [m/s^2] of the differences of `relative_motion` at dv/dt = 0."""
+    bias, world = np.zeros((len(held), 3)), plant.world_frame()
+    for pair, entry in zip(held, bias, strict=True):
+        for index, point, sign in zip(pair.bodies, pair.points, (1, -1), strict=True):
+            frame = plant.get_body(index).body_frame()
+            entry += (
+                sign
+                * plant.CalcBiasTranslationalAcceleration(
+                    context, JacobianWrtVariable.kV, frame, point, world, world
+                ).ravel()
+            )
+    return bias

@@ -12,7 +12,6 @@ from drake_diff._base.arrays import Array, Indices
 from drake_diff.certificates.certificate import Certificate, certify_jacobian
 from drake_diff.certificates.directions import LookAt
 from drake_diff.model.contact import penetration
-from drake_diff.model.equations import EquationsOfMotion
 from drake_diff.model.parameters import applied
 from drake_diff.model.step import set_state
 from drake_diff.optimize.checks import Check, check
@@ -20,6 +19,7 @@ from drake_diff.optimize.problem.dynamics import SAME_VALUES, DiscreteMap, probe
 from drake_diff.optimize.problem.obstacles import along_steps, clearances
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import FEASIBILITY_TOLERANCE
+from drake_diff.optimize.replay import loop_check
 from drake_diff.optimize.transcription.between import passed_between_steps
 from drake_diff.optimize.transcription.collocation import SMALLEST_COST, Collocated
 from drake_diff.optimize.transcription.lead import SUBSTEPS
@@ -43,12 +43,15 @@ FIRST_KNOTS, BENDS = 3, 3  # knots of a guess; knots of a result in addition to 
 
 
 def plan_checks(s: Any) -> Iterator[Check]:
-    """Check the knots and intervals of a `Solution`, overlaps of a collocated plan, certificates and user costs."""
+    """Check the knots and intervals of a `Solution`, overlaps and loops of a collocated plan, and its functions."""
     yield from _knot_checks(s)
     if s.transcribed is not None:
         yield from _interval_checks(s, s.transcribed)
         if s.problem.has_model and s.problem.model.contract.contact.collision_pairs:
             yield _overlap_check(s, s.transcribed)
+        if s.problem.has_model and s.problem.model.file_facts.held_points:
+            times, between = s.transcribed.between_knots
+            yield loop_check(s.problem.model, np.append(s.times, times), np.vstack([s.xs, between]))
     elif np.all(np.isfinite(s.xs)):
         between = [c.nearest(*along_steps(s.times, s.xs), c.between) for c in clearances(s.problem.kept)]
         between += passed_between_steps(s.problem, s.times, s.xs, s.us)
@@ -293,8 +296,6 @@ def certify_equations(
     if task is not None and task.varied is not None:
         values, names = task.varied.values, problem.parameters.names
         tail, sizes = task.varied.tried_at(task.coordinates)
-    elif problem.has_model and not problem.parameters.parameters:
-        values = EquationsOfMotion(problem.model).values
     else:
         values = problem.dynamics.values
     named: dict[str, Any] = {

@@ -26,7 +26,8 @@ CLAUSES = {
     "integration": "an accurate integration from {time} misses the next in {name} by {value}, tolerance {tolerance}",
     "jump": "{name} jumps by {value} at {time}: a derivative does not see that",
     "link": "{name} is missed by {value} in {time}, tolerance {tolerance}",
-    "loop": "points of a loop are {value} from each other {where}, tolerance {tolerance}: smaller steps hold it closer",
+    "loop": "points of a loop are {value} from each other {where}, tolerance {tolerance}: smaller steps hold it closer"
+    ", unless the velocities at the start open it",
     "model": "another plant: {where}",
     "motion": "{where}",
     "overlap": "geometries overlap by {value} at {time}, and collocation leaves contact out",

@@ -568,7 +568,7 @@ def motion_checks(
     if model.contract.contact.collision_pairs:
         yield penetration_check(model, motion)
     if model.file_facts.held_points:
-        yield loop_check(model, motion)
+        yield loop_check(model, motion.times, motion.xs)
 
 
 def comparison_checks(plan: ReplayPlan, motion: MeasuredMotion, parts: int, *, same: bool = False) -> Iterator[Check]:
@@ -648,15 +648,15 @@ def penetration_check(model: Model, motion: MeasuredMotion) -> Check:
     return check("penetration", where, motion.penetration[worst], PENETRATION_PART * least, "m")
 
 
-def loop_check(model: Model, motion: MeasuredMotion) -> Check:
-    """Check how far the points of a loop separate, with a tolerance of a hundredth of the mechanism's size.
+def loop_check(model: Model, times: Array, xs: Array) -> Check:
+    """Check how far the points of a loop separate in a motion, up to a hundredth of the mechanism's size.
 
     Drake's constraints yield to forces, in proportion to the square of the time step.
     """
-    gaps = [gap(model, x[: model.nq]) if np.all(np.isfinite(x)) else (np.inf, 1.0) for x in motion.xs]
+    gaps = [gap(model, x[: model.nq]) if np.all(np.isfinite(x)) else (np.inf, 1.0) for x in xs]
     k = int(np.argmax([distance / size for distance, size in gaps]))
     distance, size = gaps[k]
-    return check("loop", f"at {motion.times[k]:.3g} s", distance, OPEN * size, "m")
+    return check("loop", f"at {times[k]:.3g} s", distance, OPEN * size, "m")
 
 
 def energy_check(motion: Rollout) -> Check:

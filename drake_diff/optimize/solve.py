@@ -82,8 +82,9 @@ def solve(  # type: ignore[misc]  # only this signature lists the keywords
         problem: the problem of a model or of plain `Dynamics`, or an `optimize.PhasedProblem`, which requires
             collocation and whose solution is an `optimize.PhasedSolution`; or an `optimize.PathTiming`, for which only
             `max_iterations`, `time_limit` and `progress` apply.
-        method: "collocation" (in continuous time, for models without contact and for plain dynamics), "shooting"
-            (through Drake's own steps, contact included), "ilqr" (the same by Riccati sweeps) or "auto".
+        method: "collocation" (in continuous time, for models without contact, closed loops included, and for plain
+            dynamics), "shooting" (through Drake's own steps, contact included), "ilqr" (the same by Riccati sweeps) or
+            "auto".
         initial_guess: None (a straight line to the goal with inputs near zero, or a `TrackingCost`'s reference), a
             Solution of any method, number of steps and horizon, a pair of Drake trajectories (state, input) as in
             `Solution.trajectory`, one of states or of positions alone, or (xs, us) with shapes (N+1, nx) and (N, nu).
@@ -814,14 +815,15 @@ def choose_method(problem: Problem) -> tuple[str, str]:
         return "shooting", "the controls are not optimized"
     if problem.trajectory_cost is not None:
         return "shooting", "collocation and iLQR take no cost of the whole trajectory"
-    if problem.horizon is not None and smooth and not _touches_at_first(problem):
+    of_loops = bool(problem.model.file_facts.held_points) and _is_possible(problem, Attempt("collocation", ""))
+    if problem.horizon is not None and (smooth or of_loops) and not _touches_at_first(problem):
         return "collocation", "the horizon is " + ("free" if problem.horizon[0] < problem.horizon[1] else "given")
     if problem.couplings and (contract.contact.collision_pairs or not smooth):
         return "shooting", "iLQR takes no couplings of knots, and collocation leaves out what acts on the model"
     if contract.contact.collision_pairs:
         return "ilqr", "the model has geometries that can touch, which collocation leaves out"
     if not smooth:
-        return "ilqr", "the model has constraints or PD control, which collocation leaves out"
+        return "ilqr", "the model has constraints or PD control, which its own steps include"
     if problem.optimizes_parameters:
         return "collocation", f"the model is smooth, with {', '.join(problem.parameters.names[:3])} among its variables"
     return "collocation", "the model is smooth"

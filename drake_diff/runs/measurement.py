@@ -233,7 +233,7 @@ def _metrics_of_the_replay(
     if motion is not None and rests_on_it and np.all(np.isfinite(motion.constraint_violation)):  # else may lose energy
         tolerance = energy_tolerance(motion)
     if motion is not None and solution.problem.has_model and solution.problem.model.file_facts.held_points:
-        loop = loop_check(solution.problem.model, motion)
+        loop = loop_check(solution.problem.model, motion.times, motion.xs)
         yield measured("loop gap", f"largest distance of points that a loop holds together {here}", loop.value, "m")
     definition = f"largest distance of the final state {here} from the plan's"
     yield on_replay("replay end error", definition, lambda m: np.abs(m.xs[-1] - solution.xs[-1]).max(), x)

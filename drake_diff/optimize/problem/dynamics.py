@@ -401,7 +401,7 @@ def plant_dynamics(model: Model, parameters: Any = ()) -> Dynamics:
     """Return a model's equations of motion in continuous time, with its limits of positions, velocities and efforts.
 
     Args:
-        model: a model without PD control and without constraints. Contact is omitted.
+        model: a model without PD control and without constraints other than closed loops. Contact is omitted.
         parameters: the parameters of the dynamics: names of the model's parameters, or a mapping from names to values.
 
     Returns:
@@ -421,8 +421,15 @@ def plant_dynamics(model: Model, parameters: Any = ()) -> Dynamics:
         if parameter.kind in CONTACT_KINDS:
             expected = "a parameter that does not belong to contact, which collocation ignores"
             raise InputError("parameters", got=parameter.name, expected=expected)
+    form: Any
+    if model.file_facts.held_points and not vector.parameters:
+        from drake_diff.mechanics.fixed_contacts import loop_plant  # loads CasADi
+
+        form = loop_plant(model)
+    else:
+        form = PlantKnots(model, vector)
     return Dynamics(
-        PlantKnots(model, vector),
+        form,
         model.nx,
         model.nu,
         parameters=vector,

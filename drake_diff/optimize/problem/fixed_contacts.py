@@ -1,7 +1,6 @@
 """A model with points fixed to the world during a phase, such as a foot in stance or a hand on a handle."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,8 @@ from drake_diff._base.arrays import Array, finite_array, frozen, positive_float
 from drake_diff._base.autodiff import gradient_rows
 from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError, ModelError
-from drake_diff.mechanics.quantities import frame_position, frame_velocity, recorded
+from drake_diff.mechanics.quantities import frame_index, frame_position, frame_velocity, recorded
+from drake_diff.model.loops import HeldPoints
 from drake_diff.model.model import Model
 from drake_diff.optimize.problem.constraint import Constraint, plant_limits
 from drake_diff.optimize.problem.dynamics import Dynamics
@@ -29,7 +29,7 @@ class FixedContacts(Dynamics):
     Between a flight and a stance, `impact` is the reset of a rigid, inelastic impact.
 
     Args:
-        model: A tree of revolute and prismatic joints without contact, PD control and constraints.
+        model: A tree of revolute and prismatic joints without contact, PD control and constraints except closed loops.
         points: The frame, or body, whose origin is fixed; or a mapping from frames to points (3,) [m] in these frames.
         axes: The world coordinates that are fixed, without those that no joint moves, such as y of a planar leg.
 
@@ -59,14 +59,16 @@ class FixedContacts(Dynamics):
         given = {points: (0.0, 0.0, 0.0)} if isinstance(points, str) else dict(points)
         self.axes = "".join(axis for axis in AXES if axis in axes)
         self.points = {name: finite_array(f"point of {name}", point, (3,)) for name, point in given.items()}
-        places = _Stacked([frame_position(model, name, point) for name, point in self.points.items()], self._columns)
-        speeds = _Stacked([frame_velocity(model, name, point) for name, point in self.points.items()], self._columns)
-        plant = fixed_contact_plant(model, places, speeds)
+        self._places = [frame_position(model, name, point) for name, point in self.points.items()]
+        self._speeds = [frame_velocity(model, name, point) for name, point in self.points.items()]
+        every = [f"{name} {axis}" for name in self.points for axis in AXES]
+        asked = [i for i, row in enumerate(every) if row[-1] in axes]
+        plant = fixed_contact_plant(model, [_fixed(model, *item) for item in self.points.items()], asked)
         if isinstance(plant, Refusal):
             raise ModelError(f"fixed contacts: {plant}")
         self.plant = plant
-        every = [f"{name} {axis}" for name in self.points for axis in self.axes]
-        self.rows = tuple(every[i] for i in plant.rows)
+        self._fixed = plant.rows[plant.rows < len(every)]  # the others close loops
+        self.rows = tuple(every[i] for i in self._fixed)
         options: dict[str, Any] = dict(plant_limits(model))
         options |= {"state_names": model.state_names, "input_names": model.input_names}
         super().__init__(plant, model.nx, model.nu, **options)
@@ -75,25 +77,21 @@ class FixedContacts(Dynamics):
     def __repr__(self) -> str:
         return f"FixedContacts of {self.plant.model.name}: {', '.join(self.rows)} fixed"
 
-    @property
-    def _columns(self) -> list[int]:
-        return [AXES.index(axis) for axis in self.axes]
-
     def to_dict(self) -> dict[str, Any]:
         """Return the points and axes, for a record."""
         return {"points": {name: point.tolist() for name, point in self.points.items()}, "axes": self.axes}
 
     def forces(self, x: Any, u: Any) -> Any:
         """Return the forces [N] (m,) on the model at the fixed points, one for each of `rows`, in any arithmetic."""
-        return self.plant.expressions["forces"](np.concatenate([np.asarray(x), np.asarray(u)]))
+        return self.plant.expressions["forces"](np.concatenate([np.asarray(x), np.asarray(u)]))[: len(self.rows)]
 
     def places(self, x: Any) -> Any:
         """Return the fixed coordinates [m] (m,)."""
-        return np.asarray(self.plant.places(x))[self.plant.rows]
+        return np.concatenate([np.asarray(position(x)).ravel() for position in self._places])[self._fixed]
 
     def speeds(self, x: Any) -> Any:
         """Return the velocities [m/s] (m,) of the fixed coordinates."""
-        return np.asarray(self.plant.speeds(x))[self.plant.rows]
+        return np.concatenate([np.asarray(velocity(x)).ravel() for velocity in self._speeds])[self._fixed]
 
     @property
     def impact(self) -> "Impact":
@@ -161,15 +159,10 @@ class FixedContacts(Dynamics):
             yield name, rows["z"], [rows[axis] for axis in "xy" if axis in rows]
 
 
-@dataclass(frozen=True, eq=False)
-class _Stacked:
-    """Selected coordinates of several functions of the state, concatenated."""
-
-    functions: Sequence[Any]
-    columns: list[int]
-
-    def __call__(self, x: Any) -> Any:
-        return np.concatenate([np.asarray(function(x)).ravel()[self.columns] for function in self.functions])
+def _fixed(model: Model, name: str, point: Array) -> HeldPoints:
+    """Return a point of the frame `name` that is fixed to the world."""
+    frame, world = model.plant.get_frame(frame_index(model, name)), model.plant.world_body().index()
+    return HeldPoints(None, (frame.body().index(), world), [frame.GetFixedPoseInBodyFrame() @ point, np.zeros(3)])
 
 
 class Impact:

@@ -156,7 +156,7 @@ def _dynamics(task: OptimalControl) -> PointFunction:
     if isinstance(form, PlantKnots):
         function = symbolic_plant(form.model, dynamics.parameters, None if moved is None else moved.coordinates)
     elif isinstance(form, FixedContactPlant):
-        function = form.expressions["rates"].function
+        function = form.functions
     elif isinstance(form, Pointwise):
         start = dynamics.parameters.values
 

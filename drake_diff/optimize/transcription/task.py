@@ -17,7 +17,7 @@ its values, 2 u_mid - (u_0 + u_1) / 2. Bounds on nodes alone allow an excess of 
 
 import copy
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import comb
 from typing import Any
@@ -284,6 +284,13 @@ class OptimalControl:
         self.problem, self.scheme = problem, SCHEMES[scheme]
         self.is_map = scheme == MAP
         self.dynamics, self.bounds = problem.dynamics, problem.bounds
+        if problem.has_model and problem.model.file_facts.held_points and problem.initial_state_mask.any():
+            form: Any = self.dynamics.form  # a FixedContactPlant
+            free = [problem.initial_state_mask[s].any() for s in np.split(np.arange(problem.nx), [problem.model.nq])]
+            # [m, m/s] equations would have dependent gradients if some positions are given
+            closed = np.repeat(np.where(free, 1e-7, np.inf), len(form.rows))
+            start = Constraint(form.closing, -closed, closed, knots=0, name="closed loops")
+            self.problem = replace(problem, constraints=(*problem.constraints, start))
         self.horizon: tuple[float, float] = problem.horizon or (problem.start_horizon,) * 2  # (lower, upper) [s]
         self.varied: MovedDynamics | None = None
         self.parameter_cost: Pointwise | None = None
