@@ -594,7 +594,7 @@ def _by_ilqr_first(problem: Problem, first: Attempt, given: Any) -> Iterator[tup
 
 
 def _has_soft_goals(problem: Problem) -> bool:
-    """Return whether the problem asks only for small costs of inputs within their limits, which suits iLQR in steps."""
+    """Return whether a problem in steps has only costs, and limits of its states and inputs."""
     hard = problem.constraints or problem.couplings or problem.waypoints or problem.optimizes_parameters
     hard = hard or np.any(np.isfinite(problem.goal)) or any(goal.weight is None for goal in problem.goals)
     return _has_steps(problem) and not hard and problem.optimizes_controls and problem.has_cost

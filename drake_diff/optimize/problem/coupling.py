@@ -299,20 +299,14 @@ class RateLimit(Couples):
         """Return the constraint on a motion of `num_steps` steps of `time_step` [s]."""
         places, limits = self.entries(system)
 
-        def change_of_input(x: Any, u: Any) -> Any:
-            first, other = np.split(u, 2)
-            return (other[places] - first[places]) / time_step
+        weights = (1.0, -2.0, 1.0) if self.of_slopes and not self.of_inputs else (-1.0, 1.0)
+        knots = len(weights)
 
-        def acceleration(x: Any) -> Any:
-            first, other = np.split(x, 2)
-            return (other[places] - first[places]) / time_step
+        def change(values: Any) -> Any:
+            parts = zip(weights, np.split(values, knots), strict=True)
+            return sum(weight * part[places] for weight, part in parts) / time_step ** (knots - 1)
 
-        def change_of_acceleration(x: Any) -> Any:
-            first, other, last = np.split(x, 3)
-            return (last[places] - 2 * other[places] + first[places]) / time_step**2
-
-        function: Any = change_of_input if self.of_inputs else acceleration
-        function, knots = (change_of_acceleration, 3) if self.of_slopes and not self.of_inputs else (function, 2)
+        function: Any = (lambda x, u: change(u)) if self.of_inputs else (lambda x: change(x))
         count = num_steps if self.of_inputs else num_steps + 1
         rows = Constraint(function, -limits, limits, name=self.label)
         return BoundCoupling(rows, np.arange(max(count - knots + 1, 0))[:, None] + np.arange(knots))
