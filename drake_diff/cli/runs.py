@@ -153,8 +153,7 @@ def _solved_into(
     from drake_diff.runs.save import begin, begin_failure, begin_interrupted, keep_plan, plan_kept, write_run
 
     begun: list[Any] = []
-    of_path = isinstance(problem, PathTiming)  # its solution's problem is known at the end
-    stated = None if of_path else problem
+    stated = None if isinstance(problem, PathTiming) else problem  # a path's problem is known at the end
 
     def on_start() -> None:
         begun.append(problem)
@@ -166,7 +165,7 @@ def _solved_into(
 
     try:
         with progress_line("solving") as report:
-            if of_path:
+            if stated is None:
                 on_start()
             else:
                 options["options"] = replace(options.get("options", Options()), on_start=on_start, on_plan=on_plan)

@@ -21,7 +21,7 @@ from drake_diff.legs.inverse_kinematics import PointTarget, Wish, inverse_kinema
 from drake_diff.legs.motion import smooth
 from drake_diff.model.contact import contacts_of_the_step
 from drake_diff.model.model import Model
-from drake_diff.model.repairs import frame_named
+from drake_diff.model.plant import frame_named
 from drake_diff.model.step import advance, set_state
 from drake_diff.motion.policy import TVLQR
 

@@ -345,7 +345,9 @@ def _pair(inspector: Any, ids: Sequence[Any], names: tuple[str, str]) -> PairCon
     """Combine the properties of two geometries as Drake does. See `derivatives.contact.laws`."""
     read = {name: [proximity_property(inspector, i, name) for i in ids] for name in MATERIAL}
     known = {name: (float(a), float(b)) for name, (a, b) in read.items() if a is not None and b is not None}
-    friction, stiffness = (_harmonic(known[name]) if name in known else None for name in ("friction", "stiffness"))
+    friction, stiffness = (
+        harmonic(np.array([known[name]])).item() if name in known else None for name in ("friction", "stiffness")
+    )
     dissipation = None
     if stiffness and "dissipation" in known:
         (k_a, k_b), (d_a, d_b) = known["stiffness"], known["dissipation"]
@@ -359,9 +361,10 @@ def _pair(inspector: Any, ids: Sequence[Any], names: tuple[str, str]) -> PairCon
     )
 
 
-def _harmonic(sides: tuple[float, float]) -> float:
-    a, b = sides
-    return a * b / (a + b) if a + b else 0.0
+def harmonic(sides: Array) -> Array:
+    """Return a b / (a + b) (P,) for sides (P, 2), or 0 where both are 0."""
+    total = sides.sum(axis=1)
+    return np.asarray(sides.prod(axis=1) / np.where(total > 0, total, 1.0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,7 +34,7 @@ from drake_diff.exceptions import InputError, ModelError, ShapeError, UnknownNam
 from drake_diff.mechanics.forward_kinematics import ForwardKinematics, forward_kinematics, product
 from drake_diff.model.contact import body_of, contact_forces
 from drake_diff.model.model import Model
-from drake_diff.model.plant import bodies, labelled
+from drake_diff.model.plant import bodies, frame_named, labelled
 from drake_diff.model.step import advance, set_state
 from drake_diff.model.twin import Twin
 
@@ -390,16 +390,7 @@ def _tree_of(model: Model, depends_on: frozenset[str]) -> ForwardKinematics:
 
 
 def frame_index(model: Model, name: str) -> FrameIndex:
-    plant = model.plant
-    frames = [plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())]
-    names = [frame.name() for frame in frames]
-    known = {n: frame.index() for n, frame in zip(names, frames, strict=True) if names.count(n) == 1}
-    if name in known:
-        return known[name]
-    full = {f"{plant.GetModelInstanceName(f.model_instance())}::{f.name()}": f.index() for f in frames}
-    if name in full:
-        return full[name]
-    raise UnknownNameError("frame", got=name, known=[*known, *(n for n in full if n.split("::")[-1] not in known)])
+    return frame_named(model.plant, "frame", name, of_world=True).index()
 
 
 def _quaternion(R: Any, scalar: Any) -> Any:

@@ -220,11 +220,6 @@ def relative_bias(plant: MultibodyPlant, context: Any, held: Sequence[HeldPoints
     bias, world = np.zeros((len(held), 3)), plant.world_frame()
     for pair, entry in zip(held, bias, strict=True):
         for index, point, sign in zip(pair.bodies, pair.points, (1, -1), strict=True):
-            frame = plant.get_body(index).body_frame()
-            entry += (
-                sign
-                * plant.CalcBiasTranslationalAcceleration(
-                    context, JacobianWrtVariable.kV, frame, point, world, world
-                ).ravel()
-            )
+            asked = JacobianWrtVariable.kV, plant.get_body(index).body_frame(), point, world, world
+            entry += sign * plant.CalcBiasTranslationalAcceleration(context, *asked).ravel()
     return bias

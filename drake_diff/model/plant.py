@@ -10,6 +10,7 @@ from pydrake.geometry import SceneGraph_
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
+    FrameIndex,
     JointActuatorIndex,
     JointIndex,
     ModelInstanceIndex,
@@ -82,6 +83,19 @@ def labelled(elements: list[Any]) -> dict[str, Any]:
 def key_of(element: Any) -> tuple[str, str]:
     """Return the names of an element's model instance and of the element."""
     return str(element.GetParentPlant().GetModelInstanceName(element.model_instance())), str(element.name())
+
+
+def frame_named(plant: Any, subject: str, name: str, *, of_world: bool = False) -> Any:
+    """Return the frame called `name`, or "instance::name"; raise UnknownNameError, which lists the existing frames.
+
+    Frames of the world are included only if `of_world` is set.
+    """
+    frames, world = (plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())), plant.world_body().index()
+    known = labelled([f for f in frames if f.name() and (of_world or f.body().index() != world)])
+    full = {"::".join(key_of(frame)): frame for frame in known.values()}
+    if name not in known and name not in full:
+        raise UnknownNameError(subject, got=name, known=known)
+    return known[name] if name in known else full[name]
 
 
 def note(what: str, names: Collection[str]) -> tuple[str, ...]:

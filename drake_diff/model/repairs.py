@@ -31,7 +31,6 @@ from pydrake.autodiffutils import ExtractValue
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import (
-    FrameIndex,
     PdControllerGains,
     PrismaticJoint,
     PrismaticSpring,
@@ -46,7 +45,18 @@ from drake_diff.exceptions import InputError, ModelError, UnknownNameError
 from drake_diff.model.contact_geometry import collision_geometries, exclude
 from drake_diff.model.file_facts import FileFacts, Mimic
 from drake_diff.model.load_file import DRAKES_REFUSALS
-from drake_diff.model.plant import ARMATURE, actuators, bodies, joint_pose, joints, key_of, labelled, named, note
+from drake_diff.model.plant import (
+    ARMATURE,
+    actuators,
+    bodies,
+    frame_named,
+    joint_pose,
+    joints,
+    key_of,
+    labelled,
+    named,
+    note,
+)
 
 GROUND_FRICTION = 0.5  # for ground=True: the default friction of Drake's SceneGraph
 Actuated = str | tuple[str, ...] | dict[str, float | None] | None
@@ -287,15 +297,6 @@ def weld_link(plant: MultibodyPlant, name: str) -> None:
     except DRAKES_REFUSALS as error:
         expected = "expected weld_base to be a link without a joint to its parent"
         raise ModelError(f"{expected}: {error}") from error
-
-
-def frame_named(plant: MultibodyPlant, subject: str, name: str) -> Any:
-    """Return the frame called `name`, or "instance::name"; raise UnknownNameError, which lists the existing frames."""
-    frames = [plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())]
-    by_name = labelled([f for f in frames if f.name() and f.body().index() != plant.world_body().index()])
-    if name not in by_name:
-        raise UnknownNameError(subject, got=name, known=by_name)
-    return by_name[name]
 
 
 def floating_trees(plant: MultibodyPlant) -> list[list[Any]]:

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 from pydrake.geometry import Box, Cylinder, MeshcatCone, Rgba, Sphere
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
-from pydrake.multibody.tree import FrameIndex
 
 from drake_diff._base.arrays import Array
-from drake_diff.exceptions import UnknownNameError
+from drake_diff.model.plant import frame_named
 from drake_diff.optimize.problem.goals import Goal, Mark
 from drake_diff.optimize.problem.obstacles import Obstacle
 from drake_diff.pages.meshcat import RED, TRAIL, VIOLET
@@ -26,14 +25,9 @@ LARGE = 0.25  # [m] goals with a larger radius are so translucent that the robot
 def drawn_goals(plant: Any, context: Any, goals: Iterable[Goal]) -> tuple[Drawn, ...]:
     """Return the markers of `goals` on the bodies of `plant` or in the world. UnknownNameError for an unknown frame."""
     marks = [(mark, not isinstance(goal, Obstacle)) for goal in goals for mark in goal.marks()]
-    frames: dict[str, Any] = {}
-    for frame in (plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())):
-        frames.setdefault(frame.name(), frame)
     shapes: list[Drawn] = []
     for mark, above in marks:
-        if mark.frame not in frames:
-            raise UnknownNameError("frame", got=mark.frame, known=tuple(frames))
-        frame = frames[mark.frame]
+        frame = frame_named(plant, "frame", mark.frame, of_world=True)
         body, pose = frame.body(), frame.CalcPoseInBodyFrame(context)
         path = "" if plant.IsAnchored(body) else body_path(body)
         if not path:

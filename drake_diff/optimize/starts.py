@@ -14,9 +14,8 @@ from drake_diff.optimize.solution import Solution, Status
 from drake_diff.optimize.transcription.collocation import FOUND, Transcribed, Transcription
 
 MOST_STARTS, FEWEST_STARTS = 12, 5  # if the first few all lead to the plan's cost, the others are not tried
-# Of all starts together, times the steps and the square of the states and inputs, so that they take about as long for
-# robots as for small systems, and of one start. A search that needs more iterations rarely ends at a cheaper motion. No
-# start is made if all of them together would have fewer than the last number.
+# Of all starts together (none if fewer than the last), times the steps and the square of the states and inputs, so that
+# they take about as long for robots as for small systems, and of one start, as longer ones rarely end cheaper.
 MOST_ITERATIONS, MOST_OF_A_START, SIZED_ITERATIONS, FEWEST_ITERATIONS = 600, 100, 4_000_000, 20
 CHEAPER = 0.01  # fraction of the cost: smaller differences may be due to the mesh or the steps
 ENDED_BY_THE_USER = (Outcome.INTERRUPTED, Outcome.TIME_LIMIT)

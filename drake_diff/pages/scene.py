@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 from pydrake.geometry import Rgba
 from pydrake.math import RigidTransform
-from pydrake.multibody.tree import FrameIndex
 
 from drake_diff._base.arrays import Array
-from drake_diff.exceptions import UnknownNameError
 from drake_diff.model.contact import ContactPoint
 from drake_diff.model.model import Model
-from drake_diff.model.plant import bodies
+from drake_diff.model.plant import bodies, frame_named
 from drake_diff.model.step import set_state
 from drake_diff.pages.shapes import Drawn, body_path, shapes_of
 
@@ -185,10 +183,7 @@ def longest_path(poses: Poses, moving: Sequence[Any] = ()) -> Array:
 
 def _path_of(model: Model, poses: Poses, count: int, name: str) -> Array:
     """Return the path (N+1, 3) of the origin of a frame, which is fixed to its body."""
-    known = {f.name(): f for f in (model.plant.get_frame(FrameIndex(i)) for i in range(model.plant.num_frames()))}
-    if name not in known:
-        raise UnknownNameError("frame", got=name, known=tuple(known))
-    body, context = known[name].body(), model.double.context
-    origin = known[name].CalcPoseInBodyFrame(context).translation()
+    frame, context = frame_named(model.plant, "frame", name, of_world=True), model.double.context
+    body, origin = frame.body(), frame.CalcPoseInBodyFrame(context).translation()
     fixed = model.plant.EvalBodyPoseInWorld(context, body)
     return np.array([pose @ origin for pose in poses.get(body_path(body), [fixed] * count)])

@@ -21,8 +21,7 @@ from drake_diff.legs.inverse_kinematics import PointTarget, Wish, inverse_kinema
 from drake_diff.legs.motion import smooth
 from drake_diff.mechanics.quantities import frame_position
 from drake_diff.model.model import Model
-from drake_diff.model.plant import joints
-from drake_diff.model.repairs import frame_named
+from drake_diff.model.plant import frame_named, joints
 from drake_diff.model.step import advance, set_state
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.problem.goals import FrameGoal

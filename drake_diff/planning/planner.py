@@ -409,8 +409,8 @@ def _collocated(robot: Robot, task: Goals, guess: MotionGuess, least: str | None
 def _feasible(robot: Robot, task: Goals, guess: MotionGuess) -> _Attempt:
     """Find any motion to the end of the guess within all limits; the guess itself if it is feasible."""
     problem = _problem(robot, task, guess, guess.xs[-1])
-    limit = BUDGET if robot.standing is None else LONG_BUDGET
-    return _Attempt(guess.name, robot, problem, guess, {"method": "shooting", "time_limit": limit})
+    options = {"method": "shooting", "time_limit": BUDGET if robot.standing is None else LONG_BUDGET}
+    return _Attempt(guess.name, robot, problem, guess, options)
 
 
 def _problem(robot: Robot, task: Goals, guess: MotionGuess, x_goal: Array, **asked: Any) -> Problem:

@@ -36,6 +36,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, Indices, own_array
 from drake_diff._base.compiled import compiled
+from drake_diff.mechanics.description import harmonic
 from drake_diff.model.parameters import ParameterVector, geometries_of
 from drake_diff.model.plant import proximity_property
 from drake_diff.model.twin import Twin
@@ -283,13 +284,7 @@ def combine(sides: Array) -> Material:
     """Combine the materials of the two sides (P, 2, 4) of pairs."""
     mu, k, tau, d = np.moveaxis(sides, -1, 0)
     b = k[:, 1] / k.sum(axis=1)
-    return Material(sides, 2 * _harmonic(mu), _harmonic(k), tau.sum(axis=1), b * d[:, 0] + (1 - b) * d[:, 1], b)
-
-
-def _harmonic(sides: Array) -> Array:
-    """Return a b / (a + b) (P,) for sides (P, 2), or 0 where both are 0."""
-    total = sides.sum(axis=1)
-    return np.asarray(sides.prod(axis=1) / np.where(total > 0, total, 1.0))
+    return Material(sides, 2 * harmonic(mu), harmonic(k), tau.sum(axis=1), b * d[:, 0] + (1 - b) * d[:, 1], b)
 
 
 def material_change(pairs: Any, material: Material, vector: ParameterVector, twin: Twin) -> Material:
