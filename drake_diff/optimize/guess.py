@@ -16,7 +16,10 @@ from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import DrakeDiffError, InputError, ShapeError
 from drake_diff.mechanics.clearance import OfShapes
 from drake_diff.model.assembly import closed
+from drake_diff.model.contact import penetration
 from drake_diff.model.model import Model
+from drake_diff.model.plant import joints
+from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.problem.cost import TimedCost
 from drake_diff.optimize.problem.obstacles import clearances
@@ -316,13 +319,14 @@ def _passive(problem: Problem, xs: Array) -> Array:
 
 
 def _holding(problem: Problem, xs: Array) -> Array:
-    """Return (N, nu) inputs within bounds that best hold the first state for one step, unless all are actuators.
+    """Return (N, nu) inputs within bounds that best hold the first state for one step, or 0 for actuators of joints.
 
     Rotors and thrusters do not steer without thrust: no rotor moves a falling quadrotor sideways. Joint actuators do,
-    and their guess is 0. The guess of a servo is the position of its joint in xs (N+1, nx).
+    except those of a robot that stands on contacts and would fall. The guess of a servo is the position of its joint in
+    xs (N+1, nx).
     """
     model = problem.model if isinstance(problem.system, Model) else None
-    if model is None or model.inputs.plain:
+    if model is None or (model.inputs.plain and not _stands(model, problem.x0)):
         return np.zeros((len(xs) - 1, problem.nu)) if model is None else model.neutral_input(xs[1:])
     bounds, still = problem.bounds, np.concatenate([problem.x0[: model.nq], np.zeros(model.nv)])
     none = np.clip(np.zeros(model.nu), bounds.u_lower, bounds.u_upper)
@@ -334,3 +338,13 @@ def _holding(problem: Problem, xs: Array) -> Array:
     inputs = np.clip(np.linalg.lstsq(by_u, missing, rcond=None)[0], bounds.u_lower, bounds.u_upper)
     held = np.where(np.abs(inputs) > ROUNDED * np.abs(inputs).max(), inputs, none)
     return np.where(model.inputs.commanded, model.neutral_input(xs[1:]), held)
+
+
+def _stands(model: Model, x: Array) -> bool:
+    """Return whether a floating robot with joints touches something in the state x (nx,)."""
+    roots = model.plant.GetFloatingBaseBodies()
+    has_legs = any(joint.parent_body().index() in roots for joint in joints(model.plant))
+    if not (has_legs and model.contract.contact.collision_pairs):
+        return False
+    set_state(model.double, x)
+    return penetration(model) > 0

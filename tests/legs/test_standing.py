@@ -16,6 +16,7 @@ from drake_diff.model.contact import contacts_of_the_step
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion import TVLQR
+from drake_diff.optimize.guess import first_guess
 from drake_diff.planning import plan
 from drake_diff.planning.robot import GROUND, ON_FEET, load_robot, ranges
 
@@ -264,3 +265,20 @@ def test_a_base_that_was_fixed_and_a_least_time_on_feet_are_refused_with_the_rea
     with pytest.raises(ModelError, match=r"no other posture.*the feet would have to move"):
         plan(robot_file("solo12.urdf"), goals={"base_link": [0, 0, 3.0]}, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_standing_robot_is_held_by_the_default_guess():
+    """Without inputs, Solo12 falls, and a search from there ends with the trunk a quarter of a metre off its goal."""
+    robot = load_robot(robot_file("solo12.urdf"), 0)
+    model, x0 = robot.model, robot.standing[1].x
+    effort = dd.QuadraticCost(R=np.eye(model.nu))
+    fallen = np.array(advance(model.double, x0, np.zeros(model.nu)))
+    assert np.max(np.abs(fallen[model.nq :])) > 0.1
+    guess = first_guess(dd.Problem(model, x0=x0, num_steps=20, running_cost=effort), "ilqr", None, 0)
+    assert np.max(np.abs(np.array(advance(model.double, x0, guess.us[0]))[model.nq :])) < 1e-6  # [rad/s, m/s] rounding
+    motion = dd.rollout(model, x0, guess.us)
+    assert np.max(np.abs(motion.xs[-1] - x0)) < 1e-4
+    lifted = x0 + 0.1 * np.eye(model.nx)[6]  # in the air, nothing holds it
+    free = first_guess(dd.Problem(model, x0=lifted, num_steps=20, running_cost=effort), "ilqr", None, 0)
+    assert not np.any(free.us)
