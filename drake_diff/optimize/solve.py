@@ -32,7 +32,7 @@ from drake_diff.optimize.run import Run, closest_to, is_kept_apart, kept_apart
 from drake_diff.optimize.solution import PLANS, Search, Solution, Status, distinct
 from drake_diff.optimize.starts import search_cheaper
 from drake_diff.optimize.transcription.task import MAP, SCHEMES, OptimalControl, default_scheme
-from drake_diff.optimize.verification import LOCAL, advice, limits_of, near, not_in_steps, overlaps
+from drake_diff.optimize.verification import LOCAL, NEAR, advice, limits_of, near, not_in_steps, overlaps
 
 COMPILED = 0.5  # [s] a longer compilation is reported
 DEFAULTS = Options()
@@ -41,7 +41,7 @@ DEFAULT_SOLVERS = {"collocation": "ipopt", "shooting": "ipopt", "ilqr": "riccati
 OTHER_GUESS = "another first guess"
 OTHER_STARTS = {"method": "collocation", "reason": "other first guesses"}
 MOST_VERIFIED = 3  # of the cheaper motions from random guesses
-REFINING = 30  # iterations from a collocated plan to the optimum in discrete steps; well-posed problems take ten
+REFINING = 50  # iterations from a collocated plan to the optimum in steps; many take ten, a Panda at its bounds 45
 NOT_FOUND = (Status.INFEASIBLE, Status.ITERATION_LIMIT, Status.DIVERGED, Status.FAILED)
 BLIND = (Status.NO_GRADIENT, Status.DIVERGED)
 ENDED = (Status.CONVERGED, Status.INTERRUPTED, Status.TIME_LIMIT)
@@ -539,7 +539,8 @@ def _from_other_starts(task: _Task, asked: Attempt, first: Solution) -> Solution
         best = min((best, last), key=_preference)
         if last.status in ENDED and (best is last or not last.success):  # a finer mesh may lead away from a guess
             break
-    note = f"{LOCAL}: {starts}{', not verified' if starts.cheaper and best is first else ''}"
+    name = OTHER_STARTS["reason"] if NEAR in best.notes else LOCAL
+    note = f"{name}: {starts}{', not verified' if starts.cheaper and best is first else ''}"
     best = best.told(options=best.options | {"chain": chain})
     return best.noted(note) if best.success else best
 

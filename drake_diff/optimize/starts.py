@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drake_diff._base.arrays import Array
 from drake_diff._base.clock import noted_interrupts
 from drake_diff.optimize.guess import another_guess
 from drake_diff.optimize.problem.problem import Problem
@@ -43,22 +44,31 @@ class Starts:
 def search_cheaper(plan: Solution, scheme: str, seed: int, limits: Callable[[], Limits], report: Report) -> Starts:
     """Search by collocation in `scheme` from random guesses by `seed` for motions that cost less than a plan.
 
-    The number of starts depends on iterations alone, so that the same seed gives the same result on all machines.
+    The cost of a plan in steps is that of the collocation from it, as the errors of steps can exceed 1 % of a cost. The
+    number of starts depends on iterations alone, so that the same seed gives the same result on all machines.
     """
-    problem, first = plan.problem, _cost(plan)
+    problem = plan.problem
     most = min(MOST_ITERATIONS, SIZED_ITERATIONS // (problem.num_steps * (problem.nx + problem.nu) ** 2))
     most = most if most >= FEWEST_ITERATIONS else 0
     transcription = Transcription(problem, scheme)
-    scale = max(abs(first), problem.least_cost(plan.xs[0], plan.time_step))
     motions: list[Solution] = []
     used, number, alike, ended = 0, 0, True, False
+
+    def search(xs: Array, us: Array, horizon: float | None) -> Transcribed:
+        few = replace(limits(), max_iterations=min(MOST_OF_A_START, most - used, limits().max_iterations))
+        return transcription.solve([transcription.begin(0, (xs, us), horizon=horizon)], limits=few, report=None)
+
     with noted_interrupts() as interrupted:  # the plan is returned whatever ends the search
+        if plan.transcribed is None and most:
+            motion = search(plan.xs, np.vstack([plan.us, plan.us[-1:]]), None)
+            used = len(motion.result.iterations)
+            plan = _solution(problem, scheme, motion, "the plan") if motion.result.outcome in FOUND else plan
+        first = _cost(plan)
+        scale = max(abs(first), problem.least_cost(plan.xs[0], plan.time_step))
         while number < MOST_STARTS and used < most and not (number >= FEWEST_STARTS and alike) and not ended:
             number += 1
             xs, us, *horizon = another_guess(problem, seed, number)
-            guess = transcription.begin(0, (xs, us), horizon=horizon[0] if horizon else None)
-            few = replace(limits(), max_iterations=min(MOST_OF_A_START, most - used, limits().max_iterations))
-            motion = transcription.solve([guess], limits=few, report=None)
+            motion = search(xs, us, horizon[0] if horizon else None)
             used += len(motion.result.iterations)
             if motion.result.outcome in FOUND:
                 motions.append(_solution(problem, scheme, motion, f"random {number} of seed {seed}"))

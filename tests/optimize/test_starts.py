@@ -40,6 +40,18 @@ def test_a_convex_problem_takes_five_starts():
     assert solution.cost == pytest.approx(12.0, rel=1e-6)
 
 
+def test_the_errors_of_long_steps_are_no_cheaper_motion():
+    """A soft goal is solved by iLQR in steps, whose optimum costs 1 % more than that of the convex problem in time."""
+    model = dd.example_model("mass_spring_damper", time_step=0.05)
+    costs = {"running_cost": dd.QuadraticCost(R=[[1e-2]]), "final_cost": lambda x: 100 * (x[0] - 1) ** 2 + x[1] ** 2}
+    problem = dd.Problem(model, x0=[0, 0], num_steps=20, **costs)
+    solution, exact = dd.solve(problem), dd.solve(problem, method="collocation")
+    assert (solution.success, solution.method) == (True, "ilqr")
+    assert solution.cost > 1.005 * exact.cost
+    assert "led to no cheaper motion" in solution.notes[-1]
+    assert "a local optimum: 5 random first guesses" in solution.notes[-1]
+
+
 def test_other_starts_are_never_worse_and_only_without_a_given_guess_or_number(monkeypatch):
     problem = weak_pendulum(40)
     plain = dd.solve(problem, restarts=0)
