@@ -165,11 +165,9 @@ def _solved_into(
 
     try:
         with progress_line("solving") as report:
-            if stated is None:
-                on_start()
-            else:
-                options["options"] = replace(options.get("options", Options()), on_start=on_start, on_plan=on_plan)
-            solution: Any = solve(problem, progress=report, **options)
+            hooks = {"on_start": on_start} if stated is None else {"on_start": on_start, "on_plan": on_plan}
+            hooked = replace(options.pop("options", Options()), **hooks)
+            solution: Any = solve(problem, progress=report, options=hooked, **options)
         if checked:
             with progress_line("replaying the plan in other simulators"):
                 solution = cross_check(solution)

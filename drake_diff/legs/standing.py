@@ -430,11 +430,9 @@ def _between(legs: Legs, start: Rest, end: Rest, duration: float) -> Shift | Ref
     xs = np.array([np.concatenate([q, speed]) for q, speed in zip(qs, v, strict=True)])
     us = []
     for k in range(moving + 1):
-        change = v[k + 1] - v[k]
+        change, soles = v[k + 1] - v[k], legs.on_lowest(qs[k])
         set_state(model.double, xs[k])
-        stance = hold(
-            legs.on_lowest(qs[k]), qs[k], model.double.inverse_dynamics(change / h) + model.double.damping() * change
-        )
+        stance = hold(soles, qs[k], model.double.inverse_dynamics(change / h) + model.double.damping() * change)
         if isinstance(stance, Refusal):
             return Refusal(f"along the motion, {stance.reason}")
         us.append(stance.u)

@@ -155,9 +155,9 @@ def plant_functions(
     for force, value in zip(model.body_forces, u.elements()[nu - len(model.body_forces) :], strict=True):
         driven += moving.body_force(force) * value
     mass, r, at_rest = moving.mass(), moving.residual(a[:n]) - driven, moving.residual(ca.SX.zeros(n)) - driven
-    apart = speed = ca.SX(0, 1)
+    difference = speed = ca.SX(0, 1)
     if fixed is not None:
-        apart, speed, turning = (rows[fixed] for rows in moving.relative_motion(model, held, rates))
+        difference, speed, turning = (rows[fixed] for rows in moving.relative_motion(model, held, rates))
         J = ca.densify(ca.jacobian(speed, v))
         mass = ca.blockcat([[mass, -J.T], [-J, ca.SX(ca.DM.zeros(m, m))]])
         r, at_rest = ca.vertcat(r - J.T @ a[n:], -J @ a[:n] - turning), ca.vertcat(at_rest, -turning)
@@ -202,7 +202,7 @@ def plant_functions(
         ca.Function("hessian", [knot, weights, rows], [ca.triu(hessian)]),
         *(
             ca.Function("fixed", [knot], [ca.densify(value)])
-            for value in (solved[n:], stopped[:n], stopped[n:], ca.vertcat(apart, speed))
+            for value in (solved[n:], stopped[:n], stopped[n:], ca.vertcat(difference, speed))
         ),
     )
 
@@ -429,9 +429,9 @@ class MovingTree:
         rows = []
         for pair in held:
             (R, p, _), (R_other, p_other, _) = (self.body(names.get(index, "world")) for index in pair.bodies)
-            apart = p + R @ ca.DM(pair.points[0]) - p_other - R_other @ ca.DM(pair.points[1])
-            speed = ca.jtimes(apart, self.q, rates)
-            rows.append([R_other.T @ vector for vector in (apart, speed, ca.jtimes(speed, self.q, rates))])
+            difference = p + R @ ca.DM(pair.points[0]) - p_other - R_other @ ca.DM(pair.points[1])
+            speed = ca.jtimes(difference, self.q, rates)
+            rows.append([R_other.T @ vector for vector in (difference, speed, ca.jtimes(speed, self.q, rates))])
         return [ca.vertcat(*column) for column in zip(*rows, strict=True)]
 
     def body_force(self, force: BodyForce) -> Any:

@@ -171,9 +171,13 @@ class PathTiming:
             expected = f"{self.model.velocity_names[i]} that {lower[i]:.6g} to {upper[i]:.6g} allows, from rest to rest"
             raise InputError(SUBJECT, got="a motion against its bounds of speed", expected=expected)
 
-    def solved(self, limits: Limits, say: Callable[[str], None]) -> Solution:
+    def solved(
+        self, limits: Limits, say: Callable[[str], None], on_start: Callable[[], None] | None = None
+    ) -> Solution:
         """Return the verified plan of least time; see `solve`."""
         start = now()
+        if on_start is not None:
+            on_start()
         outcome, iterations, timing = _Search(self).run(limits, start)
         say(f"IPOPT {outcome.value} after {iterations} iterations: {timing.duration:.4g} s")
         knots = self._knots(timing)
@@ -199,9 +203,9 @@ class PathTiming:
 
     def _knots(self, timing: "_Timing") -> Array:
         """Return knots, as places from 0 to N, between which parabolas follow the inputs of a timing."""
-        whole = np.arange(float(len(timing.values)))
+        ends = np.arange(float(len(timing.values)))
         knots = np.union1d(
-            whole, np.interp(self._waypoints / self.num_steps * timing.duration, timing.times(whole), whole)
+            ends, np.interp(self._waypoints / self.num_steps * timing.duration, timing.times(ends), ends)
         )
         for _ in range(HALVINGS):
             every = self.motion(timing.rows(_divided(knots, 4)))[1]
@@ -330,7 +334,7 @@ class _Timing:
 
     @property
     def duration(self) -> float:
-        """The time of the whole motion [s]."""
+        """The duration of the motion [s]."""
         return float(np.sum(self.intervals))
 
     def times(self, places: Array) -> Array:

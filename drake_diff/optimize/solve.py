@@ -145,10 +145,14 @@ def solve(  # type: ignore[misc]  # only this signature lists the keywords
     )
     if isinstance(problem, PathTiming):
         unused = {"method": method != "auto", "initial_guess": initial_guess is not None, "restarts": bool(restarts)}
-        unused |= {"options": options is not None, "callback": callback is not None, "view": view is not False}
+        unused |= {
+            "options": replace(chosen, on_start=None) != DEFAULTS,
+            "callback": callback is not None,
+            "view": view is not False,
+        }
         for name in (name for name, is_given in unused.items() if is_given):
             raise InputError(name, got="a value", expected="no value for a PathTiming")
-        return problem.solved(limits, report.say)
+        return problem.solved(limits, report.say, chosen.on_start)
     arguments: dict[str, Any] = {
         "method": method,
         "max_iterations": limits.max_iterations,
@@ -539,6 +543,8 @@ def _from_other_starts(task: _Task, asked: Attempt, first: Solution) -> Solution
         best = min((best, last), key=_preference)
         if last.status in ENDED and (best is last or not last.success):  # a finer mesh may lead away from a guess
             break
+    if not starts.starts:
+        return first
     name = OTHER_STARTS["reason"] if NEAR in best.notes else LOCAL
     note = f"{name}: {starts}{', not verified' if starts.cheaper and best is first else ''}"
     best = best.told(options=best.options | {"chain": chain})

@@ -49,7 +49,8 @@ def search_cheaper(plan: Solution, scheme: str, seed: int, limits: Callable[[], 
     """
     problem = plan.problem
     most = min(MOST_ITERATIONS, SIZED_ITERATIONS // (problem.num_steps * (problem.nx + problem.nu) ** 2))
-    most = most if most >= FEWEST_ITERATIONS else 0
+    if most < FEWEST_ITERATIONS:
+        return Starts((), 0, 0, False)
     transcription = Transcription(problem, scheme)
     motions: list[Solution] = []
     used, number, alike, ended = 0, 0, True, False
@@ -59,7 +60,7 @@ def search_cheaper(plan: Solution, scheme: str, seed: int, limits: Callable[[], 
         return transcription.solve([transcription.begin(0, (xs, us), horizon=horizon)], limits=few, report=None)
 
     with noted_interrupts() as interrupted:  # the plan is returned whatever ends the search
-        if plan.transcribed is None and most:
+        if plan.transcribed is None:
             motion = search(plan.xs, np.vstack([plan.us, plan.us[-1:]]), None)
             used = len(motion.result.iterations)
             plan = _solution(problem, scheme, motion, "the plan") if motion.result.outcome in FOUND else plan

@@ -104,7 +104,7 @@ def test_the_timing_of_a_path_that_ends_early_leaves_a_record_that_says_so(tmp_p
     def ended(*arguments):
         raise error
 
-    monkeypatch.setattr(dd.optimize.PathTiming, "solved", ended)
+    monkeypatch.setattr("drake_diff.optimize.path_timing._Search.run", ended)
     (tmp_path / "timing.py").write_text(PATH_TIMING)
     monkeypatch.chdir(tmp_path)
     assert exit_of(monkeypatch, "run", tmp_path / "timing.py", "--out", tmp_path / "run") in (cli.INTERNAL, 130)
@@ -113,6 +113,14 @@ def test_the_timing_of_a_path_that_ends_early_leaves_a_record_that_says_so(tmp_p
     assert record.verdict == "incomplete"
     assert "interrupted" in record.sentence or "broken" in record.sentence
     assert exit_of(monkeypatch, "recover", folder) == cli.USAGE
+
+
+def test_an_option_that_the_timing_of_a_path_does_not_take_leaves_no_run(tmp_path, monkeypatch, capsys):
+    (tmp_path / "timing.py").write_text(f"{PATH_TIMING}solve_options = {{'method': 'ilqr'}}\n")
+    monkeypatch.chdir(tmp_path)
+    assert exit_of(monkeypatch, "run", tmp_path / "timing.py", "--out", tmp_path / "run") == cli.USAGE
+    assert "method: expected no value for a PathTiming" in capsys.readouterr().err
+    assert not [*tmp_path.glob("run*")]
 
 
 @pytest.mark.slow
