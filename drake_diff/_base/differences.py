@@ -51,9 +51,9 @@ def sweep_of(f: Many, size: int, steps: Sequence[float], *, minus: Difference = 
     sides = np.stack([h * np.eye(size), -h * np.eye(size)])  # (2, s, n, n)
     values = np.asarray(f(np.vstack([np.zeros((1, size)), sides.reshape(-1, size)])), dtype=float)
     centre = values[0]
-    apart = minus(values[1:], centre)
+    displacements = minus(values[1:], centre)
     rows = len(minus(centre, centre))
-    ahead, behind = apart.reshape(2, len(steps), size, rows).swapaxes(2, 3) / h
+    ahead, behind = displacements.reshape(2, len(steps), size, rows).swapaxes(2, 3) / h
     return Sweep(centre, ahead, -behind)
 
 
