@@ -5,6 +5,7 @@ from collections.abc import Collection
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.multibody.tree import BodyIndex
+from scipy.linalg import null_space
 
 from drake_diff._base.arrays import Array, finite_array
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
@@ -18,6 +19,7 @@ CLOSED = 1e-9  # relative to the distance of the points from the origins of thei
 OPEN = 1e-2  # relative to the same distance; a step from there closes the loop with a jerk
 MOST = 50  # iterations of Newton's method, which needs fewer than ten if the loops can be closed
 LONGEST = 0.5  # [rad or m] step length; longer steps miss the nearby configuration
+DEPENDENT = 1e-6  # relative to the largest singular value; rows that differ by less constrain the same motion
 
 
 def gap(model: Model, q: ArrayLike) -> tuple[float, float]:
@@ -109,17 +111,33 @@ def _closed(model: Model, q: Array, free: NDArray[np.bool_]) -> Array | None:
         distance, size = gap(model, q)
         if distance <= CLOSED * size:
             return q
-        rows, difference = relative_motion(model.plant, model.double.context, model.file_facts.held_points)
-        rows = rows.reshape(-1, rows.shape[-1])
-        if model.coupling is not None:
-            rows = rows @ model.coupling.spread
+        rows, difference = _relative_motion(model)
         change = np.zeros(model.nv)
-        change[free] = -np.linalg.lstsq(rows[:, free], difference.ravel(), rcond=None)[0]
+        change[free] = -np.linalg.lstsq(rows[:, free], difference, rcond=None)[0]
         change /= max(1.0, float(np.abs(change).max()) / LONGEST)
         q = q + np.asarray(model.double.rates(change))
         for start in tangent_space(model).quaternions:
             q[start : start + 4] /= np.linalg.norm(q[start : start + 4])
     return None
+
+
+def loop_velocities(model: Model, q: Array) -> Array:
+    """Return an orthonormal basis (nv, k) of the velocities near configuration q (nq,) that keep the loops closed.
+
+    Raises ModelError if the loops cannot be closed near q.
+    """
+    if not model.file_facts.held_points:
+        return np.eye(model.nv)
+    # A gap, which turns with the bodies, would depend on motions of joints outside of the loops.
+    set_state(model.double, assembled(model, np.concatenate([q, np.zeros(model.nv)])))
+    return np.asarray(null_space(_relative_motion(model)[0], rcond=DEPENDENT))
+
+
+def _relative_motion(model: Model) -> tuple[Array, Array]:
+    """Return the Jacobian (3L, nv) and the values (3L,) [m] of the gaps of the loops in the twin's state."""
+    rows, difference = relative_motion(model.plant, model.double.context, model.file_facts.held_points)
+    rows = rows.reshape(-1, rows.shape[-1])
+    return rows if model.coupling is None else rows @ model.coupling.spread, difference.ravel()
 
 
 def single_coordinates(model: Model) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

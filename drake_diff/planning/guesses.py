@@ -11,23 +11,36 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.math import BsplineBasis
 from pydrake.trajectories import BsplineTrajectory
 
-from drake_diff._base.arrays import Array, Indices, finite_array
+from drake_diff._base.arrays import Array, finite_array
 from drake_diff.comparison.recordings import read_recording, steps_between
 from drake_diff.exceptions import InputError, MissingDependencyError, ModelError, SimulationError, UnknownNameError
 from drake_diff.legs.inverse_kinematics import PointTarget, Wish, inverse_kinematics
 from drake_diff.legs.motion import smooth
 from drake_diff.mechanics.quantities import frame_position
+from drake_diff.model.assembly import closed
 from drake_diff.model.model import Model
-from drake_diff.model.plant import frame_named, joints
-from drake_diff.model.step import advance, set_state
+from drake_diff.model.plant import frame_named
+from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.problem.goals import FrameGoal
 from drake_diff.optimize.problem.obstacles import ClearanceConstraint, Obstacle, clearances
 from drake_diff.optimize.problem.problem import Problem
-from drake_diff.planning.robot import HOLD_SHARE, TOUCHING, Robot, drive, floating, share_to_hold, shares
+from drake_diff.planning.robot import (
+    HOLD_SHARE,
+    TOUCHING,
+    Robot,
+    coordinates_of,
+    drive,
+    efforts_for,
+    floating,
+    places_of_velocities,
+    share_to_hold,
+    shares,
+)
 
 # Postures that reach goals.
 REACHED = 1e-6  # [m]
@@ -185,8 +198,7 @@ def postures(robot: Robot, task: Goals, seed: int) -> list[Array]:
     for index, value in task.joints.items():
         start[index], fixed[index] = value, True
     if not task.frames:
-        space.check("goal", start)
-        return [start]
+        return [_with_closed_loops(space, start, fixed)]
     candidates, nearest, blocked = list[Array](), np.inf, ""
     for i in range(MORE_SEEDS if task.avoid else SEEDS):
         if len(candidates) >= CANDIDATES and i >= SEEDS:
@@ -206,6 +218,18 @@ def postures(robot: Robot, task: Goals, seed: int) -> list[Array]:
             criteria = f"within all limits: the nearest of {SEEDS} postures is {nearest:.3g} m away"
         raise ModelError(f"no posture was found with {', '.join(task.frames)} at its goal, {criteria}")
     return sorted(candidates, key=lambda q: float(np.max(np.abs(q - robot.q))))[:CANDIDATES]
+
+
+def _with_closed_loops(space: Space, q: Array, fixed: NDArray[np.bool_]) -> Array:
+    """Return the posture near q (nq,) with closed loops and unchanged `fixed` (nq,) and perhaps steered joints."""
+    robot, model = space.robot, space.robot.model
+    target = closed(model, q, fixed | coordinates_of(model, robot.steered))
+    target = closed(model, q, fixed) if target is None else target
+    if target is None:
+        names = ", ".join(np.array(model.position_names)[fixed])
+        raise ModelError(f"no posture near the start has closed loops and {names} at the goal")
+    space.check("goal", target)
+    return target
 
 
 def _reach(robot: Robot, task: Goals, first: Array, fixed: Array) -> tuple[Array, float]:
@@ -241,37 +265,37 @@ def _random_posture(space: Space, random: np.random.Generator) -> Array | None:
     for i in range(DRAWS):
         fraction = NEARER ** (i // (DRAWS // 5))  # some robots can only hold nearby postures
         q = robot.q + fraction * random.uniform(-1, 1, len(reach)) * reach
-        q = np.clip(q, robot.lower + margin, robot.upper - margin)
-        if any(robot.overlap(robot.q + s * (q - robot.q)) > TOUCHING for s in (0.25, 0.5, 0.75, 1.0)):
+        target = robot.closed(np.clip(q, robot.lower + margin, robot.upper - margin))
+        if target is None or np.any((target < robot.lower) | (target > robot.upper)):
             continue
-        if space.obstruction(q):
+        passed = PostureLine("", np.array([robot.q, target]), robot).at(np.array([0.25, 0.5, 0.75, 1.0]))
+        if any(robot.overlap(q) > TOUCHING for q in passed) or space.obstruction(target):
             continue
-        load = max(share_to_hold(robot.model, robot.q + s * (q - robot.q)) for s in (0.5, 1.0))
+        load = max(share_to_hold(robot.model, q) for q in passed[[1, 3]])
         if load <= HOLD_SHARE:
-            return q
+            return target
         if load < least:
-            best, least = q, load
+            best, least = target, load
     return best
 
 
 @dataclass(frozen=True, eq=False)
 class PostureLine:
-    """A path of postures: a clamped B-spline with control points (K, nq), from the first to the last control point."""
+    """A path of postures: a clamped B-spline with control points (K, nq), from the first to the last control point.
+
+    Along it, the robot's loops are closed where possible, without a change of the steered joints.
+    """
 
     name: str
     controls: Array
+    robot: Robot
 
     def at(self, s: Array) -> Array:
         """Return the postures (M, nq) at s (M,), from 0 at the start to 1 at the end."""
-        return np.asarray(self._curve().vector_values(s)).T
-
-    def slopes(self, s: Array) -> Array:
-        """Return the derivatives (M, nq) with respect to s."""
-        return np.asarray(self._curve().MakeDerivative().vector_values(s)).T
-
-    def _curve(self) -> BsplineTrajectory:
         count = len(self.controls)
-        return BsplineTrajectory(BsplineBasis(min(count, CUBIC), count), [c[:, None] for c in self.controls])
+        curve = BsplineTrajectory(BsplineBasis(min(count, CUBIC), count), [c[:, None] for c in self.controls])
+        postures = [(q, self.robot.closed(q)) for q in np.asarray(curve.vector_values(s)).T]
+        return np.array([q if near is None else near for q, near in postures])
 
     @property
     def length(self) -> float:
@@ -292,7 +316,7 @@ def lines(space: Space, target: Array, seed: int) -> list[PostureLine]:
     only a search could help and OMPL is not installed.
     """
     robot = space.robot
-    straight = PostureLine("a straight line in joint space", np.array([robot.q, target]))
+    straight = PostureLine("a straight line in joint space", np.array([robot.q, target]), robot)
     if space.is_free(straight.postures):
         return [straight]
     random = np.random.default_rng([seed, 3])
@@ -301,7 +325,7 @@ def lines(space: Space, target: Array, seed: int) -> list[PostureLine]:
     for i in range(BENDS):
         pull = WIDTH * (i + 1) / BENDS * random.uniform(-1, 1, len(target)) * (robot.upper - robot.lower)
         middle = np.clip((robot.q + target) / 2 + pull, robot.lower, robot.upper)
-        line = PostureLine(bent, np.array([robot.q, middle, target]))
+        line = PostureLine(bent, np.array([robot.q, middle, target]), robot)
         if space.is_free(line.postures):
             candidates.append(line)
     if not (can_search or candidates):
@@ -323,9 +347,8 @@ def _search(space: Space, target: Array, seed: int) -> PostureLine | None:
     for count in CONTROLS:
         knots = np.array(BsplineBasis(CUBIC, count).knots())
         even = along[-1] * np.array([np.mean(knots[i + 1 : i + CUBIC]) for i in range(count)])  # for a uniform speed
-        line = PostureLine(
-            "a path found by RRT-Connect", np.array([np.interp(even, along, column) for column in chain.T]).T
-        )
+        controls = np.array([np.interp(even, along, column) for column in chain.T]).T
+        line = PostureLine("a path found by RRT-Connect", controls, space.robot)
         if space.is_free(line.postures):
             return line
     return None
@@ -354,7 +377,7 @@ def _chain(space: Space, target: Array, seed: int) -> Array | None:
     class Lines(base.MotionValidator):  # type: ignore[misc]
         def checkMotion(self, a: Any, b: Any) -> bool:
             ends = np.array([values(a), values(b)])
-            return is_free(PostureLine("", ends).postures)
+            return is_free(PostureLine("", ends, robot).postures)
 
     level = util.getLogLevel()
     util.setLogLevel(util.LOG_NONE)
@@ -428,7 +451,7 @@ def along(robot: Robot, line: PostureLine, *, slower: float = 1.0) -> MotionGues
     if Drake cannot take a step.
     """
     t = np.linspace(0, 1, 101)
-    speeds = np.abs(line.slopes(smooth(t))) * (30 * t**2 * (1 - t) ** 2)[:, None]
+    speeds = np.abs(np.gradient(line.at(smooth(t)), t, axis=0))
     duration = slower * float(np.max(speeds / speed_limits(robot.model), initial=0.0))
     name = line.name if slower == 1 else f"{line.name}, {slower:g} times slower"
     duration = float(np.clip(duration, SHORTEST, LONGEST))
@@ -498,7 +521,7 @@ def _timed(robot: Robot, name: str, postures_at: Callable[[Array], Array], durat
     xs, us = [np.append(robot.q, still)], list[Array]()
     for q in path[1:]:
         way = space.minus(np.append(q, still), np.append(xs[-1][: model.nq], still))[: model.nv]
-        u, x_next = _inputs(model, xs[-1], way / model.time_step)
+        u, x_next = _inputs(model, xs[-1], way / model.time_step, robot.steered)
         us.append(u)
         xs.append(x_next)
     depth = max(robot.overlap(x[: model.nq]) for x in xs[:: max(1, steps // 25)])
@@ -506,37 +529,26 @@ def _timed(robot: Robot, name: str, postures_at: Callable[[Array], Array], durat
     return MotionGuess(name, model, np.array(xs), np.array(us), effort, depth)
 
 
-def _inputs(model: Model, x: Array, wanted: Array) -> tuple[Array, Array]:
-    """Return the inputs (nu,) for a step from x (nx,) to the velocities `wanted` (nv,), and the next state (nx,)."""
-    twin, h, nq = model.double, model.time_step, model.nq
-    set_state(twin, x)
-    change = wanted - x[nq:]
+def _inputs(model: Model, x: Array, wanted: Array, steered: NDArray[np.bool_] | None = None) -> tuple[Array, Array]:
+    """Return the inputs (nu,) for a step from x (nx,) to the velocities `wanted` (nv,), and the next state (nx,).
+
+    The inputs correct only `steered` velocities, all by default.
+    """
+    twin, nq, per_input = model.double, model.nq, model.servo_gains[0]
+    counted = slice(None) if steered is None else steered
     # The step's equation with implicit damping; numerical probing of the step would meet joint limits.
-    needed = twin.inverse_dynamics(change / h) + twin.damping() * change
-    per_input = model.servo_gains[0]
-    by_effort = h * np.linalg.solve(twin.mass_matrix() + h * np.diag(twin.damping()), model.actuation)
-    efforts = np.linalg.lstsq(model.actuation, needed, rcond=None)[0]
-    effect, u = by_effort * per_input, model.commands(x, wanted, efforts)
+    efforts = efforts_for(model, x, wanted - x[nq:])
+    effect, u = drive(model, x[:nq]) * per_input, model.commands(x, wanted, efforts)
     for i in range(CORRECTIONS + 1):
         x_next = np.array(advance(twin, x, u))
-        off = wanted - x_next[nq:]
+        off = (wanted - x_next[nq:])[counted]
         if i == CORRECTIONS or np.max(np.abs(off), initial=0.0) < EXACT:
             break
         if i == 1:  # the equation lacks the plant's controllers and the rotation of body-fixed thrusters
             probes = [np.array(advance(twin, x, u + d))[nq:] - x_next[nq:] for d in np.diag(1 / per_input)]
             effect = np.array(probes).T * per_input
-        u = u + np.linalg.lstsq(effect, off, rcond=None)[0]
+        u = u + np.linalg.lstsq(effect[counted], off, rcond=None)[0]
     return np.asarray(u), x_next
-
-
-def _positions(model: Model) -> Indices:
-    """Return the index in q (nv,) of the coordinate of each joint velocity."""
-    indices = np.arange(model.nv)
-    for joint in joints(model.plant):
-        q, v = model.places(joint)
-        if len(q) == len(v) == 1:
-            indices[v[0]] = q[0]
-    return indices
 
 
 def by_controller(
@@ -553,7 +565,7 @@ def by_controller(
         effect = drive(model, robot.q)
         joint_v = np.argmax(np.abs(effect), axis=0)  # the velocity on which an input acts most
         gain = model.time_step / effect[joint_v, np.arange(model.nu)]
-        joint_q = _positions(model)[joint_v]
+        joint_q = places_of_velocities(model)[joint_v]
         for k in range(steps):
             s = np.array(min(1.0, 1.25 * (k + 1) / steps))
             aim = robot.q[joint_q] + reach * smooth(s) * (target[joint_q] - robot.q[joint_q])

@@ -43,7 +43,16 @@ from drake_diff.planning.guesses import (
     postures,
     read_goals,
 )
-from drake_diff.planning.robot import TOUCHING, Robot, floating, load_robot, of_joints
+from drake_diff.planning.robot import (
+    TOUCHING,
+    Robot,
+    coordinates_of,
+    floating,
+    independent,
+    load_robot,
+    of_joints,
+    places_of_velocities,
+)
 from drake_diff.runs.directory import check_place, is_taken, name_of, written_whole
 from drake_diff.runs.measurement import measure
 from drake_diff.runs.plan_record import PlanRecord
@@ -305,7 +314,7 @@ def _attempts(robot: Robot, task: Goals, least: str | None, seed: int) -> Iterat
     Space.around(robot, task.avoid).check("start", robot.q)
     if robot.model.body_forces:
         yield from _of_flying(robot, task, seed)
-    elif robot.is_fully_driven:
+    elif robot.steered is not None:
         yield from _of_driven(robot, task, least, seed)
     elif task.is_free:
         yield from _of_reachable(robot, task, seed)
@@ -416,6 +425,12 @@ def _feasible(robot: Robot, task: Goals, guess: MotionGuess) -> _Attempt:
 def _problem(robot: Robot, task: Goals, guess: MotionGuess, x_goal: Array, **asked: Any) -> Problem:
     tolerance = {} if robot.standing is None else {"tolerance": FRAME_TOLERANCE}
     goals = [FrameGoal(name, position=position, **tolerance) for name, position in task.frames.items()]
+    if robot.steered is not None and guess.model.file_facts.held_points:
+        named = coordinates_of(guess.model, None)
+        named[list(task.joints)] = True
+        counted = independent(guess.model, x_goal[: guess.model.nq], list(task.joints))
+        counted &= robot.steered | named[places_of_velocities(guess.model)]
+        x_goal = np.where(np.concatenate([coordinates_of(guess.model, counted), counted]), x_goal, np.nan)
     asked = {"num_steps": guess.num_steps, **asked}
     return Problem(
         guess.model, x0=guess.xs[0], x_goal=x_goal, goals=[*goals, *task.avoid], bounds=_bounds(guess.model), **asked

@@ -4,21 +4,22 @@ Missing parts are added, each with a sentence: motors, thrusters of floating bod
 """
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import qr
 
-from drake_diff._base.arrays import Array
+from drake_diff._base.arrays import Array, Indices
 from drake_diff._base.values import Refusal
 from drake_diff.derivatives.analytic import analytic_of
 from drake_diff.exceptions import DrakeDiffError, ModelError, ModelWarning, SimulationError
 from drake_diff.legs.feet import Legs
 from drake_diff.legs.standing import Rest, stand
-from drake_diff.model.assembly import assembled
+from drake_diff.model.assembly import assembled, closed, loop_velocities
 from drake_diff.model.contact import overlaps
 from drake_diff.model.inputs import BodyForce
 from drake_diff.model.model import Model, load_model
@@ -38,6 +39,8 @@ TOUCHING = 1e-4  # [m] tolerance of overlap
 HOLD_SHARE = 0.63  # of the effort limits: maximum effort for holding a start
 SEEN = 16  # postures in which a pair of shapes must overlap to count as always overlapping
 ROOM, BESIDE = 0.1, 6  # [rad or m] simultaneous motion of all joints from a start, in this number of random directions
+OUTSIDE = 1e-9  # largest change of a unit velocity by closing the loops if it is not in a loop
+DRIVEN_FIRST = 1e3  # factor by which a velocity without a motor must move more to be independent in its place
 ATTEMPTS, FINER = 60, 1000  # start candidates: sampled at growing distance from the file's, and near the best candidate
 DEPTH = 0.01  # [m] overlap with the same weight as the full motor effort
 # Thrusters of floating bodies without actuators.
@@ -69,7 +72,8 @@ class Robot:
     model with collision shapes for checking overlaps, or None if overlaps are not checked. `always` are the pairs of
     shapes that overlap in every posture, which are ignored. If `model` has contact, `apart` is the model without it
     in its steps, for motions without contact. `standing` describes how the robot stands on its feet, if it does.
-    Otherwise, floating bases are welded.
+    Otherwise, floating bases are welded. `steered` (nv,) are the velocities that a motion of a fully driven robot
+    chooses; it is None for other robots.
     """
 
     model: Model
@@ -78,10 +82,14 @@ class Robot:
     lower: Array
     upper: Array
     repairs: tuple[str, ...]
-    is_fully_driven: bool
+    steered: NDArray[np.bool_] | None
     always: frozenset[Pair] = frozenset()
     standing: tuple[Legs, Rest] | None = None
     apart: Model | None = None
+
+    def closed(self, q: Array) -> Array | None:
+        """Return posture q (nq,) with closed loops and unchanged coordinates of the steered joints, or None."""
+        return closed(self.model, q, coordinates_of(self.model, self.steered))
 
     def overlap(self, q: Array) -> float:
         """Return the deepest overlap [m] of shapes in posture q (nq,), or 0 if overlaps are not checked."""
@@ -262,7 +270,7 @@ def _standing(read: _Draft, seed: int) -> Robot | Refusal:
     if besides:
         pairs = _few(map(" and ".join, sorted(besides)))
         draft.repairs.append(f"{pairs} overlap in the initial posture, which the search ignores")
-    return Robot(model, shapes, q, lower, upper, tuple(draft.repairs), False, besides, stance)
+    return Robot(model, shapes, q, lower, upper, tuple(draft.repairs), None, besides, stance)
 
 
 def _placed(draft: _Draft, random: np.random.Generator) -> Robot:
@@ -272,19 +280,19 @@ def _placed(draft: _Draft, random: np.random.Generator) -> Robot:
     first = inside(model, lower, upper)
     touches, flies = bool(model.contract.contact.collision_pairs), bool(model.body_forces)
     apart = draft.read(contact=False) if touches else model
-    driven = is_fully_driven(apart)
+    if model.file_facts.held_points:
+        first = assembled(model, np.concatenate([first, np.zeros(model.nv)]))[: model.nq]
+    chosen = steered(apart, first)
+    driven = chosen is not None
     shapes, holds = model if touches else None, apart if driven else None
+    joint_q = coordinates_of(apart, chosen)
     if flies and shapes is not None:
         first = lifted(shapes, first)
     try:
-        if model.file_facts.held_points:  # other postures would open the loops
-            first = assembled(model, np.concatenate([first, np.zeros(model.nv)]))[: model.nq]
-            posture = StartPosture(first, 0.0, 0.0, pairs_always([first], shapes))
-        else:
-            posture = start(shapes, holds, first, lower, upper, random)
+        posture = start(shapes, holds, first, lower, upper, random, joint_q)
     except SimulationError as error:
         repairs.append(f"its overlap cannot be checked: {error}")
-        shapes, posture = None, start(None, holds, first, lower, upper, random)
+        shapes, posture = None, start(None, holds, first, lower, upper, random, joint_q)
     weak = _too_weak(apart, posture) if driven and posture.load > 1 else ()
     if weak and len(weak) < model.nv:
         draft.fix(weak, f"the motors of {_few(weak)} cannot hold the weight in any posture tried")
@@ -299,7 +307,7 @@ def _placed(draft: _Draft, random: np.random.Generator) -> Robot:
     if np.any(np.abs(posture.q - model.default_state[: model.nq]) > 1e-9):
         repairs.append("the start is moved to a posture within joint limits, without overlap, that the motors can hold")
     other = apart if model is not apart else None
-    return Robot(model, shapes, posture.q, lower, upper, tuple(repairs), driven, posture.always, apart=other)
+    return Robot(model, shapes, posture.q, lower, upper, tuple(repairs), chosen, posture.always, apart=other)
 
 
 def _too_weak(model: Model, posture: StartPosture) -> tuple[str, ...]:
@@ -326,39 +334,87 @@ def _few(names: Iterable[str]) -> str:
 
 def drive(model: Model, q: Array) -> Array:
     """Return the velocity change (nv, nu) per effort in a step from posture q (nq,), from the step's equation."""
+    ways = loop_velocities(model, q)
     set_state(model.double, np.concatenate([q, np.zeros(model.nv)]))
     h = model.time_step
     mass = model.double.mass_matrix() + h * np.diag(model.double.damping())
-    return np.asarray(h * np.linalg.solve(mass, model.actuation))
+    return np.asarray(h * ways @ np.linalg.solve(ways.T @ mass @ ways, ways.T @ model.actuation))
 
 
-def is_fully_driven(model: Model) -> bool:
-    """Return whether the inputs can produce any velocity, so that every smooth joint motion is possible."""
-    if model.nq != model.nv or model.nu < model.nv:
-        return False
-    size = np.linalg.svd(model.actuation, compute_uv=False)
-    return bool(size[-1] > SMALLEST_DRIVE * size[0])
+def steered(model: Model, q: Array) -> NDArray[np.bool_] | None:
+    """Return the velocities (nv,) that a motion chooses in posture q (nq,), or None if the inputs cannot produce them.
+
+    These are all velocities or, with loops, those that determine the others, first those with a motor. Joints of loops
+    without a motor, as in adaptive grippers, are not chosen.
+    """
+    ways, chosen = loop_velocities(model, q), independent(model, q)
+    if model.file_facts.held_points:
+        outside = np.linalg.norm(ways @ ways.T - np.eye(model.nv), axis=1) < OUTSIDE
+        chosen &= outside | np.any(model.actuation != 0, axis=1)
+    if model.nq != model.nv or model.nu < np.sum(chosen):
+        return None
+    # The forces along velocities in which only one of the chosen is not 0, and the others are as small as possible.
+    size = np.linalg.svd((ways @ np.linalg.pinv(ways[chosen])).T @ model.actuation, compute_uv=False)
+    return chosen if size[-1] > SMALLEST_DRIVE * size[0] else None
+
+
+def independent(model: Model, q: Array, preferred: Collection[int] = ()) -> NDArray[np.bool_]:
+    """Return the velocities (nv,) that determine all others in posture q (nq,) by the loops; all without loops.
+
+    The first choice are the velocities of the coordinates `preferred`, by index in q, and then those with a motor.
+    """
+    ways, mask = loop_velocities(model, q), np.zeros(model.nv, dtype=bool)
+    weights = np.where(np.any(model.actuation != 0, axis=1), DRIVEN_FIRST, 1.0)
+    weights[np.isin(places_of_velocities(model), list(preferred))] = DRIVEN_FIRST**2
+    _, order = qr((ways * weights[:, None]).T, mode="r", pivoting=True)
+    mask[order[: ways.shape[1]]] = True
+    return mask
+
+
+def coordinates_of(model: Model, velocities: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+    """Return whether each coordinate (nq,) belongs to one of the `velocities` (nv,)."""
+    mask = np.zeros(model.nq, dtype=bool)
+    mask[places_of_velocities(model)[np.zeros(model.nv, dtype=bool) if velocities is None else velocities]] = True
+    return mask
+
+
+def places_of_velocities(model: Model) -> Indices:
+    """Return the index in q (nv,) of the coordinate of each joint velocity."""
+    indices = np.arange(model.nv)
+    for joint in joints(model.plant):
+        q, v = model.places(joint)
+        if len(q) == len(v) == 1:
+            indices[v[0]] = q[0]
+    return indices
 
 
 def start(
-    shapes: Model | None, driven: Model | None, first: Array, lower: Array, upper: Array, random: np.random.Generator
+    shapes: Model | None,
+    driven: Model | None,
+    first: Array,
+    lower: Array,
+    upper: Array,
+    random: np.random.Generator,
+    kept: NDArray[np.bool_],
 ) -> StartPosture:
     """Return the posture `first` (nq,) or a better one: without overlap, and within the motors' effort of `driven`.
 
     If possible, it has free space in all directions, in which the searches continue.
-    `lower` and `upper` (nq,) are the ranges of all coordinates; poses of floating bodies do not change.
+    `lower` and `upper` (nq,) are the ranges of all coordinates; poses of floating bodies do not change. If there are
+    loops, they are closed by all coordinates except the `kept` (nq,).
     """
     model = shapes or driven
     if model is None:
         return StartPosture(first, 0.0, 0.0, frozenset())
     is_joint, margin = of_joints(model), INSIDE * (upper - lower)
 
-    def drawn(middle: Array, width: Array, moved: NDArray[np.bool_]) -> Array:
+    def drawn(middle: Array, width: Array, moved: NDArray[np.bool_]) -> Array | None:
         q = np.clip(middle + width * random.uniform(-1, 1, len(first)), lower + margin, upper - margin)
-        return np.where(is_joint & moved, q, middle)
+        return _closed_within(model, np.where(is_joint & moved, q, middle), kept, lower, upper)
 
     every, whole = np.ones(len(first), dtype=bool), upper - lower
-    always = pairs_always([first, *(drawn(first, whole, every) for _ in range(SEEN - 1))], shapes)
+    seen = [first, *(drawn(first, whole, every) for _ in range(SEEN - 1))]
+    always = pairs_always([q for q in seen if q is not None], shapes)
 
     def measured(q: Array) -> StartPosture:
         load = 0.0 if driven is None else share_to_hold(driven, q)
@@ -367,8 +423,9 @@ def start(
         return StartPosture(q, overlap, load, always)
 
     def has_room(q: Array) -> bool:
-        beside = [q + np.where(is_joint, random.choice([-ROOM, ROOM], len(q)), 0.0) for _ in range(BESIDE)]
-        return shapes is None or all(deepest(shapes, other, always) <= TOUCHING for other in beside)
+        ways = [np.where(is_joint, random.choice([-ROOM, ROOM], len(q)), 0.0) for _ in range(BESIDE)]
+        beside = [closed(model, q + way, kept) for way in ways]
+        return shapes is None or all(q is not None and deepest(shapes, q, always) <= TOUCHING for q in beside)
 
     best, tight = measured(first), None
     for i in range(ATTEMPTS + FINER):
@@ -381,12 +438,19 @@ def start(
         if i < ATTEMPTS:
             fraction = (i + 1) / ATTEMPTS
             q = np.where(is_joint, first + fraction * (random.uniform(lower + margin, upper - margin) - first), first)
+            near = _closed_within(model, q, kept, lower, upper)
         else:
             few = random.random(len(first)) < max(0.1, 3 / len(first))
-            q = drawn(best.q, whole * 0.5 ** random.uniform(0, 6), few)
-        candidate = measured(q)
+            near = drawn(best.q, whole * 0.5 ** random.uniform(0, 6), few)
+        candidate = best if near is None else measured(near)
         best = candidate if _badness(candidate) < _badness(best) else best
     return best
+
+
+def _closed_within(model: Model, q: Array, kept: NDArray[np.bool_], lower: Array, upper: Array) -> Array | None:
+    """Return posture q (nq,) with closed loops and unchanged `kept` (nq,) coordinates, or None beyond joint limits."""
+    near, is_joint = closed(model, q, kept), of_joints(model)
+    return near if near is not None and np.all(((lower <= near) & (near <= upper))[is_joint]) else None
 
 
 def _badness(candidate: StartPosture) -> float:
@@ -418,9 +482,18 @@ def share_to_hold(model: Model, q: Array) -> float:
 
 def shares_to_hold(model: Model, q: Array) -> Array:
     """Return the share of each effort limit (nu,) that is needed to hold posture q (nq,)."""
-    set_state(model.double, np.concatenate([q, np.zeros(model.nv)]))
-    needed = model.double.inverse_dynamics(np.zeros(model.nv))
-    return shares(model, np.linalg.lstsq(model.actuation, needed, rcond=None)[0])
+    return shares(model, efforts_for(model, np.concatenate([q, np.zeros(model.nv)]), np.zeros(model.nv)))
+
+
+def efforts_for(model: Model, x: Array, change: Array) -> Array:
+    """Return the efforts (nu,) of a step from x (nx,) that changes the velocities by `change` (nv,), with closed loops.
+
+    They follow from the equation of the step with implicit damping.
+    """
+    ways = loop_velocities(model, x[: model.nq])
+    set_state(model.double, x)
+    needed = model.double.inverse_dynamics(change / model.time_step) + model.double.damping() * change
+    return np.asarray(np.linalg.lstsq(ways.T @ model.actuation, ways.T @ needed, rcond=None)[0])
 
 
 def shares(model: Model, efforts: Array) -> Array:

@@ -62,7 +62,7 @@ def test_a_line_is_bent_around_a_disk_that_the_straight_one_meets(arm):
     ball = dd.SphereObstacle(center, 0.08)
     target = np.array([1.0, 0.0])
     space = Space.around(robot, [ball])
-    straight = PostureLine("", np.array([robot.q, target]))
+    straight = PostureLine("", np.array([robot.q, target]), robot)
     assert np.min(distance(straight.postures, center)) < 0.0
     assert not space.is_free(straight.postures)
     found = lines(space, target, 0)

@@ -59,7 +59,7 @@ def test_a_textbook_arm_is_mended_planned_for_and_verified(arm, tmp_path):
 def test_the_inputs_of_a_smooth_guess_make_that_motion(arm):
     """Inputs from the Newton-Euler recursion, stepped by Drake, give the guess to rounding after 30 to 100 steps."""
     robot = load_robot(arm, 0)
-    guess = along(robot, PostureLine("line", np.array([robot.q, [0.7, -0.4]])))
+    guess = along(robot, PostureLine("line", np.array([robot.q, [0.7, -0.4]]), robot))
     motion = dd.rollout(guess.model, guess.xs[0], guess.us)
     assert motion.xs == pytest.approx(guess.xs, abs=1e-9)
     assert guess.xs[-1] == pytest.approx([0.7, -0.4, 0.0, 0.0], abs=1e-12)
