@@ -37,6 +37,7 @@ from drake_diff.planning.robot import (
     drive,
     efforts_for,
     floating,
+    independent,
     places_of_velocities,
     share_to_hold,
     shares,
@@ -549,6 +550,23 @@ def _inputs(model: Model, x: Array, wanted: Array, steered: NDArray[np.bool_] | 
             effect = np.array(probes).T * per_input
         u = u + np.linalg.lstsq(effect[counted], off, rcond=None)[0]
     return np.asarray(u), x_next
+
+
+def settled(robot: Robot) -> Robot:
+    """Return the robot with the joints of its loops that no motor steers where springs and limits bring them at rest.
+
+    Raises SimulationError if Drake cannot take a step.
+    """
+    if not has_passive_loops(robot):
+        return robot
+    model, still = robot.model, robot.q
+    rest = _timed(robot, "", lambda s: np.tile(still, (len(s), 1)), STEPS[1] * model.time_step)
+    return replace(robot, q=rest.xs[-1][: model.nq])
+
+
+def has_passive_loops(robot: Robot) -> bool:
+    """Return whether springs, gravity and limits, and not motors, determine a joint of the robot's loops."""
+    return robot.steered is not None and bool(np.any(independent(robot.model, robot.q) & ~robot.steered))
 
 
 def by_controller(

@@ -39,9 +39,11 @@ from drake_diff.planning.guesses import (
     check_frames_move,
     flight,
     flown,
+    has_passive_loops,
     lines,
     postures,
     read_goals,
+    settled,
 )
 from drake_diff.planning.robot import (
     TOUCHING,
@@ -359,11 +361,13 @@ def _of_driven(robot: Robot, task: Goals, least: str | None, seed: int) -> Itera
     """Yield attempts of a fully driven robot, for each posture at the goals, the best guess first."""
     if least:
         _check_that_limits_bound_time(robot.model)
+    robot = settled(robot)
+    collocates = not (robot.model.inputs.commanded.any() or has_passive_loops(robot))
     space = Space.around(robot, task.avoid)
     for target in postures(robot, task, seed):
         guesses = _guesses(space, target, seed)
         for guess in guesses[:2]:
-            if least or (robot.model.nv <= SMALL and not robot.model.inputs.commanded.any()):
+            if least or (robot.model.nv <= SMALL and collocates):
                 yield _collocated(robot, task, guess, least)
             if not least:
                 yield _feasible(robot, task, guess)

@@ -163,7 +163,10 @@ def test_controls_without_actuators_are_refused(load):
 
 
 def test_a_tolerance_is_of_a_state_itself_and_of_its_way(load):
-    """A wheel's 1,000 rad do not affect a pole's tolerance. A state that does not travel has 1 % of its own range."""
+    """A wheel's 1,000 rad do not affect a pole's tolerance. A state that does not travel has 1 % of its own range.
+
+    The cart is a point, so that the bob, 0.5 m from the pole's joint, gives the slide its length.
+    """
     xs = np.linspace([0.0, 0.0, 0.0, 0.0], [1.0, np.pi, 0.2, 1000.0], 11)
     xs[5, 2] = 3.0
     problem = cart_pole(load, goal_tolerance={"slide_x": 0.002})
@@ -173,8 +176,8 @@ def test_a_tolerance_is_of_a_state_itself_and_of_its_way(load):
     for limit in (math.inf, 1e30):  # values that files use for no limit
         bounds = dd.Bounds(x_lower=4 * [-limit], x_upper=4 * [limit])
         problem = cart_pole(load, bounds=bounds, x_goal=[1.0, 0, 0, 0])
-        still = problem.state_scales(np.outer([0, 1], [1.0, 0, 0, 0]))  # least scales: 0.01 rad, 1e-6 of 1 m
-        assert still == pytest.approx([1, 0.01, *np.array([1e-6, 0.01]) / problem.start_horizon], rel=1e-9)
+        still = problem.state_scales(np.outer([0, 1], [1.0, 0, 0, 0]))  # least scales: 0.01 rad, 0.01 of 0.5 m
+        assert still == pytest.approx([1, 0.01, *np.array([0.005, 0.01]) / problem.start_horizon], rel=1e-9)
 
 
 @each_row(

@@ -584,7 +584,7 @@ def vectors_of(model: Model) -> list[tuple[Indices, Indices, float, bool]]:
     """Return each joint's places of translation or rotation and of its rate, its size, and whether it rotates.
 
     The entries of each are one quantity, whose moving entries depend on the axes. The natural size is a radian, or the
-    radius of gyration [m] of the body that the joint moves.
+    radius of gyration [m] of the body that the joint moves, or of the largest one if that body has no mass.
     """
     vectors, units = list[tuple[Indices, Indices, float, bool]](), [c.unit for c in model.contract.positions]
     rates = [c.unit for c in model.contract.velocities]
@@ -594,9 +594,14 @@ def vectors_of(model: Model) -> list[tuple[Indices, Indices, float, bool]]:
             places = [i for i in q if (units[i] != "m") == turns]
             moving = [model.nq + i for i in v if (rates[i] != "m/s") == turns]
             if places and moving:
-                size = 1.0 if turns else radius_of_gyration(joint.child_body())
+                size = 1.0 if turns else _moved_size(model, joint)
                 vectors.append((np.array(places), np.array(moving), size, turns))
     return vectors
+
+
+def _moved_size(model: Model, joint: Any) -> float:
+    moved = [model.plant.get_body(i) for i in model.plant.GetBodiesKinematicallyAffectedBy([joint.index()])]
+    return radius_of_gyration(joint.child_body()) or max(map(radius_of_gyration, moved), default=0.0)
 
 
 def probe_within(b: Bounds) -> Array:

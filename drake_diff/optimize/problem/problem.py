@@ -477,10 +477,11 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         """Return the scale (nx,) of each state's tolerances, in its unit, from its range along xs (M, nx).
 
         A joint of several directions has the range of the one that moves most. A position that need not travel has at
-        least STAYS of its bounds, an angle at most STAYS of a radian. The velocity of such a position has STAYS of its
-        limits, or of the position's bounds over the horizon. Bounds such as 1e30 are ignored, see WIDEST. A state at
-        rest has 1e-6 of the largest of its magnitude, required values, a radian and the body's radius of gyration, and
-        its velocity has this over the horizon. If all these are 0, the scale is 1e-6 of the bound.
+        least STAYS of its bounds, an angle at most STAYS of a radian, and a length without bounds STAYS of the body's
+        radius of gyration. The velocity of such a position has STAYS of its limits, or of the position's bounds over
+        the horizon. Bounds such as 1e30 are ignored, see WIDEST. A state at rest has 1e-6 of the largest of its
+        magnitude, required values, a radian and the body's radius of gyration, and its velocity has this over the
+        horizon. If all these are 0, the scale is 1e-6 of the bound.
         """
         asked = np.vstack([xs, self.x0, *self.waypoints.values(), self.goal])
         scales, sizes = np.ptp(xs, axis=0), np.max(np.nan_to_num(np.abs(asked), posinf=0.0), axis=0)
@@ -492,7 +493,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
         for q, v, size, turns in self._vectors:
             for places in (q, v):
                 scales[places], least[places] = np.max(scales[places]), np.max(least[places])
-            room[q] = min(np.max(room[q]) or size, size) if turns else np.max(room[q])
+            room[q] = min(np.max(room[q]) or size, size) if turns else np.max(room[q]) or size
             limits = np.where(width[v] / WIDEST <= sizes[v], np.minimum(width[v], FASTER * sizes[v]), 0.0)
             room[v] = np.max(limits) or room[q[0]] / self.start_horizon
             least[v] = np.maximum(least[v], least[q[0]] / self.start_horizon)
