@@ -63,6 +63,8 @@ OF_SPEED, OF_EFFORT, OF_PULL = 0.6, 0.9, 0.8  # share of speed limits, of effort
 SHORTEST, LONGEST = 0.6, 6.0  # [s] limits of a motion's duration
 STEPS = (30, 100)  # minimum and maximum number of steps of a plan
 PEAK = 1.875  # the maximum slope of the smooth profile from 0 to 1
+PROBED = 1e-3  # [rad/s or m/s] size of a change by which the effect of an input is measured
+SETTLED = 1e-3  # [rad or m] largest motion in a step of a joint at rest
 CORRECTIONS, EXACT = 3, 1e-11  # corrections of an input; tolerance [rad/s or m/s]
 PULL, DAMP = 30.0, 9.0  # [1/s^2] and [1/s] gains of a controller
 # Flights: maximum [m/s], [rad/s]; ranges [m], [rad] and height [m] of a random goal; number of random goals.
@@ -546,22 +548,30 @@ def _inputs(model: Model, x: Array, wanted: Array, steered: NDArray[np.bool_] | 
         if i == CORRECTIONS or np.max(np.abs(off), initial=0.0) < EXACT:
             break
         if i == 1:  # the equation lacks the plant's controllers and the rotation of body-fixed thrusters
-            probes = [np.array(advance(twin, x, u + d))[nq:] - x_next[nq:] for d in np.diag(1 / per_input)]
-            effect = np.array(probes).T * per_input
+            reach = np.max(np.abs(effect), axis=0)
+            sizes = np.divide(PROBED, reach, out=1 / per_input, where=reach > 0)
+            probes = [np.array(advance(twin, x, u + d))[nq:] - x_next[nq:] for d in np.diag(sizes)]
+            effect = np.array(probes).T / sizes
         u = u + np.linalg.lstsq(effect[counted], off, rcond=None)[0]
     return np.asarray(u), x_next
 
 
-def settled(robot: Robot) -> Robot:
-    """Return the robot with the joints of its loops that no motor steers where springs and limits bring them at rest.
+def settled(robot: Robot) -> Robot | None:
+    """Return the robot with the joints of its loops that no motor steers where springs and limits bring them.
 
-    Raises SimulationError if Drake cannot take a step.
+    Returns None if they do not stay there or if Drake cannot take a step.
     """
     if not has_passive_loops(robot):
         return robot
     model, still = robot.model, robot.q
-    rest = _timed(robot, "", lambda s: np.tile(still, (len(s), 1)), STEPS[1] * model.time_step)
-    return replace(robot, q=rest.xs[-1][: model.nq])
+    try:
+        rest = _timed(robot, "", lambda s: np.tile(still, (len(s), 1)), STEPS[1] * model.time_step).xs[-1]
+    except (ModelError, SimulationError):
+        return None
+    q, chosen = rest[: model.nq], coordinates_of(model, robot.steered)
+    is_still = np.all(np.abs(rest[model.nq :]) * model.time_step < SETTLED)
+    inside = np.all(((robot.lower <= q) & (q <= robot.upper))[chosen])
+    return replace(robot, q=q) if is_still and inside else None
 
 
 def has_passive_loops(robot: Robot) -> bool:

@@ -316,8 +316,8 @@ def _attempts(robot: Robot, task: Goals, least: str | None, seed: int) -> Iterat
     Space.around(robot, task.avoid).check("start", robot.q)
     if robot.model.body_forces:
         yield from _of_flying(robot, task, seed)
-    elif robot.steered is not None:
-        yield from _of_driven(robot, task, least, seed)
+    elif robot.steered is not None and (rested := settled(robot)) is not None:
+        yield from _of_driven(rested, task, least, seed)
     elif task.is_free:
         yield from _of_reachable(robot, task, seed)
     else:
@@ -361,7 +361,6 @@ def _of_driven(robot: Robot, task: Goals, least: str | None, seed: int) -> Itera
     """Yield attempts of a fully driven robot, for each posture at the goals, the best guess first."""
     if least:
         _check_that_limits_bound_time(robot.model)
-    robot = settled(robot)
     collocates = not (robot.model.inputs.commanded.any() or has_passive_loops(robot))
     space = Space.around(robot, task.avoid)
     for target in postures(robot, task, seed):

@@ -280,8 +280,8 @@ def _placed(draft: _Draft, random: np.random.Generator) -> Robot:
     first = inside(model, lower, upper)
     touches, flies = bool(model.contract.contact.collision_pairs), bool(model.body_forces)
     apart = draft.read(contact=False) if touches else model
-    if model.file_facts.held_points:
-        first = assembled(model, np.concatenate([first, np.zeros(model.nv)]))[: model.nq]
+    kept = closed(model, first, coordinates_of(model, np.any(model.actuation != 0, axis=1)))
+    first = assembled(model, np.append(first, np.zeros(model.nv)))[: model.nq] if kept is None else kept
     chosen = steered(apart, first)
     driven = chosen is not None
     shapes, holds = model if touches else None, apart if driven else None
@@ -349,8 +349,10 @@ def steered(model: Model, q: Array) -> NDArray[np.bool_] | None:
     """
     ways, chosen = loop_velocities(model, q), independent(model, q)
     if model.file_facts.held_points:
-        outside = np.linalg.norm(ways @ ways.T - np.eye(model.nv), axis=1) < OUTSIDE
-        chosen &= outside | np.any(model.actuation != 0, axis=1)
+        in_loops = np.linalg.norm(ways @ ways.T - np.eye(model.nv), axis=1) > OUTSIDE
+        for _, v in map(model.places, joints(model.plant)):  # a rod between two balls also spins freely
+            in_loops[v] = np.any(in_loops[v])
+        chosen &= ~in_loops | np.any(model.actuation != 0, axis=1)
     if model.nq != model.nv or model.nu < np.sum(chosen):
         return None
     # The forces along velocities in which only one of the chosen is not 0, and the others are as small as possible.
