@@ -337,24 +337,17 @@ class SimulatedMotion(ContinuousMotion):
 
     def work(self, xs: Array, us: Array) -> Array:
         """Return the work (N+1, 3) [J] of inputs, damping and contact along xs (N+1, nx), by the trapezoidal rule."""
-        driven = np.clip(us, -self.limits, self.limits) @ self.model.actuation.T
-        driven = np.stack([driven, driven])  # at the start and at the end of each step
-        if self.model.inputs.fed:
-            for k, u in enumerate(us):
+        driven = np.stack([np.clip(us, -self.limits, self.limits) @ self.model.actuation.T] * 2)  # at both ends
+        work, nq = np.zeros((len(xs), 3)), self.model.nq
+        for end in range(2):
+            vs = xs[end : len(us) + end, nq:]
+            for k, u in enumerate(us if self.model.inputs.fed else ()):
                 self.twin.set_input(u)
-                for end in range(2):
-                    set_state(self.twin, xs[k + end])
-                    driven[end, k] += self.twin.systems_force()
-        vs = xs[:, self.model.nq :]
-        powers = [np.sum(vs[end : len(us) + end] * driven[end], axis=1) for end in range(2)]
-        damped = np.sum(vs * vs * self.damping, axis=1)
-        rates = np.column_stack([powers[0] + powers[1], damped[:-1] + damped[1:], np.zeros(len(us))])
-        return np.vstack([np.zeros(3), np.cumsum(self.time_step / 2 * rates, axis=0)])
-
-
-def motion_for_replays(model: Model, sizes: Any) -> ContinuousMotion:
-    """Return the motion of a model to the accuracy of replays, by Drake's `Simulator` if this supports the model."""
-    return SimulatedMotion(model, sizes) if SimulatedMotion.supports(model) else ContinuousMotion(model, sizes=sizes)
+                set_state(self.twin, xs[k + end])
+                driven[end, k] += self.twin.systems_force()
+            work[1:, 0] += np.sum(vs * driven[end], axis=1)
+            work[1:, 1] += np.sum(vs * vs * self.damping, axis=1)
+        return np.asarray(self.time_step / 2 * np.cumsum(work, axis=0))
 
 
 def replayed(

@@ -14,7 +14,6 @@ too long for another, so that a foot passes through the ground. A plan that fail
 tried at h/8, which decides. A plan in continuous time with contact must hold in another integration.
 """
 
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -33,7 +32,7 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
 from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
-from drake_diff.motion.continuous import motion_for_replays, replayed
+from drake_diff.motion.continuous import ContinuousMotion, SimulatedMotion, replayed
 from drake_diff.motion.intervals import DrakeSteps, intervals_of, roll
 from drake_diff.motion.policy import TVLQR
 from drake_diff.motion.rollout import CONTINUOUS, Policy, Rollout, rollout
@@ -211,7 +210,7 @@ def held(xs: Array, us: Array) -> Callable[[int], tuple[Array, Array]]:
     return sample
 
 
-def replays(plan: ReplayPlan, *, sufficient: str | None = None) -> tuple[Replay, ...]:
+def replays(plan: ReplayPlan, *, sufficient: str = "") -> tuple[Replay, ...]:
     """Replay `plan` in the variants of the plant, open loop and, if there are inputs, under TVLQR.
 
     With `sufficient` open loop, variants in which the plan holds open loop are not replayed under TVLQR. The verdict
@@ -220,10 +219,10 @@ def replays(plan: ReplayPlan, *, sufficient: str | None = None) -> tuple[Replay,
     model, parts = plan.problem.model, 2
     if plan.problem.motion == CONTINUOUS:
         return tuple(plan.follower().in_model(ANOTHER_INTEGRATION, lambda: model, sufficient=sufficient))
-    rows = plan.follower().in_steps(sufficient)
+    by_steps = [plan.follower().in_steps(sufficient)]
     if not model.can_rebuild:  # a user's diagram has no variants
-        return tuple(rows)
-    by_steps = [rows, plan.follower(parts).in_steps(sufficient)]
+        return tuple(by_steps[0])
+    by_steps.append(plan.follower(parts).in_steps(sufficient))
     if plan.continuous:
         most = finest_parts(plan)
         while parts < most and not all(any(r.holds for r in tried) for tried in by_steps[-2:]):
@@ -289,7 +288,7 @@ class FollowedPlant(NamedTuple):
     """A plant in which a plan is replayed: a function that moves it, and the model whose contact is like the plant's.
 
     The plant takes `pieces` steps for each step of the controller. `time_step` [s] is the model's by default. `wider`
-    is a factor on tolerances. `known` are the plan's replays in this plant so far, by their controllers.
+    is a factor on tolerances.
     """
 
     variant: str
@@ -298,7 +297,6 @@ class FollowedPlant(NamedTuple):
     pieces: int = 1
     time_step: float | None = None
     wider: float = 1.0
-    known: dict[str, Replay] | None = None
 
 
 class PlanFollower:
@@ -314,7 +312,7 @@ class PlanFollower:
         self.xs, self.us = plan.sample(parts)
         self.controls = (OPEN_LOOP, FEEDBACK) if plan.problem.model.nu else (OPEN_LOOP,)
         self.pieces, self.leads_elsewhere = pieces, parts > 1 and not plan.continuous
-        self.known = defaultdict[str, dict[str, Replay]](dict)  # by their variants
+        self.known = dict[tuple[str, str], Replay]()  # by variant and controller
 
     @cached_property
     def model(self) -> Model:
@@ -357,7 +355,8 @@ class PlanFollower:
         us = [np.tile(u, (max(1, self.pieces), 1)) for u in self.us]
         with self.plan.applied_to(self.plant) as plant:
             steps = DrakeSteps(plant, self.plan.vector)
-            states = partial(roll, steps) if self.pieces else motion_for_replays(plant, self.plan.scale).states
+            kind = SimulatedMotion if SimulatedMotion.supports(plant) else ContinuousMotion
+            states = partial(roll, steps) if self.pieces else kind(plant, sizes=self.plan.scale).states
             return [states(x, held_us)[-1] for x, held_us in zip(self.xs, us, strict=False)]
 
     def law(self, control: str = FEEDBACK, pieces: int = 1) -> Policy:
@@ -397,13 +396,11 @@ class PlanFollower:
                 slew[entries] = np.minimum(slew[entries], limits * period)
         return slew
 
-    def in_steps(self, sufficient: str | None = None) -> list[Replay]:
+    def in_steps(self, sufficient: str = "") -> list[Replay]:
         """Run `replays` in the controller's own steps."""
         return self.in_model(f"in steps of {self.period:.4g} s", lambda: self.model, sufficient=sufficient)
 
-    def in_model(
-        self, variant: str, make: Callable[[], Model], pieces: int = 1, sufficient: str | None = None
-    ) -> list[Replay]:
+    def in_model(self, variant: str, make: Callable[[], Model], pieces: int = 1, sufficient: str = "") -> list[Replay]:
         """Run `replays` in the steps of the model from `make`. An error in `make` returns missing replays."""
         try:
             model = make()
@@ -420,10 +417,9 @@ class PlanFollower:
                     motion = _rolled(self.plan.problem, set_model, self.xs[0], law, count)
             return motion, [energy_check(motion)] * with_energy
 
-        plant = FollowedPlant(variant, model, move, pieces, known=self.known[variant])
-        return self.replays(plant, sufficient=sufficient)
+        return self.replays(FollowedPlant(variant, model, move, pieces), sufficient=sufficient)
 
-    def in_continuous_time(self, *, sufficient: str | None = None) -> list[Replay]:
+    def in_continuous_time(self, *, sufficient: str = "") -> list[Replay]:
         """Run `replays` in the continuous time that Drake's steps approximate, or in short steps if that fails."""
 
         def move(control: str) -> tuple[MeasuredMotion, list[Check]]:
@@ -432,9 +428,7 @@ class PlanFollower:
                 motion = replayed(set_model, x0, law, count, TOLERANCE, EVALUATIONS, self.plan.scale)
             return motion, [energy_check(motion)]
 
-        known = self.known[IN_CONTINUOUS_TIME]
-        plant = FollowedPlant(IN_CONTINUOUS_TIME, self.model, move, time_step=0.0, known=known)
-        rows = self.replays(plant, sufficient=sufficient)
+        rows = self.replays(FollowedPlant(IN_CONTINUOUS_TIME, self.model, move, time_step=0.0), sufficient=sufficient)
         refused = [row for row in rows if row.motion is None]
         others = {GAINS_ALONE, FEEDBACK}.intersection(row.control for row in rows)
         if not refused or all(any(r.holds for r in rows if r.control in (OPEN_LOOP, other)) for other in others):
@@ -444,7 +438,7 @@ class PlanFollower:
         short = by.in_model(name, lambda: by.plant, by.pieces, sufficient)
         return short if any(row.motion is not None for row in short) else rows
 
-    def replays(self, plant: FollowedPlant, *, sufficient: str | None = None) -> list[Replay]:
+    def replays(self, plant: FollowedPlant, *, sufficient: str = "") -> list[Replay]:
         """Replay under each controller, and by gains without offsets if finer steps lead elsewhere and fail open loop.
 
         With a `sufficient` controller, the others are only used if the plan does not hold under it. If that is TVLQR,
@@ -453,7 +447,7 @@ class PlanFollower:
         rows = list[Replay]()
         for control in self.controls[::-1] if sufficient == FEEDBACK else self.controls:
             rows.append(self.replay(plant, control))
-            if sufficient is not None and rows[-1].holds:
+            if sufficient and rows[-1].holds:
                 break
         if self.leads_elsewhere and sufficient != FEEDBACK and len(rows) > 1 and not rows[0].holds:
             rows.append(self.replay(plant, GAINS_ALONE))
@@ -461,14 +455,14 @@ class PlanFollower:
 
     def replay(self, plant: FollowedPlant, control: str) -> Replay:
         """Return the replay of the plan in a plant under one controller, which may be known."""
-        known = {} if plant.known is None else plant.known
-        if control not in known:
-            known[control] = self._replay(plant, control)
-        return known[control]
+        key = plant.variant, control
+        if key not in self.known:
+            self.known[key] = self._replay(plant, control)
+        return self.known[key]
 
     def _replay(self, plant: FollowedPlant, control: str) -> Replay:
         """Replay the plan in a plant under one controller."""
-        plan, (variant, model, move, pieces, time_step, wider, _) = self.plan, plant
+        plan, (variant, model, move, pieces, time_step, wider) = self.plan, plant
         every = pieces * self.parts
         try:
             motion, checks = move(control)
