@@ -88,7 +88,7 @@ CHOICES = {
     "mimic": (None, "reduce", "fix"),
     "inputs": (None, "position", "effort"),
 }
-CONTINUOUS_PLANT = object()  # the time step of `Model.continuous`
+CONTINUOUS_PLANT = object()  # a time step for `Model.changed`: the plant is continuous, for Drake's `Simulator` alone
 OTHERS_KEPT = 128  # maximum number of cached variants of a model; a certificate for the time step needs 91
 NAMES_SHOWN = 12  # in repr, enough for the whole state of a robot arm
 
@@ -367,11 +367,6 @@ class Model(ShowsItsRepr):
                     self._others.pop(next(iter(self._others)))
                 return self._others.setdefault(key, made)  # another thread may have added it first
         return self._others[key]
-
-    @property
-    def continuous(self) -> Model:
-        """The same model with a continuous plant, for Drake's `Simulator`; raises as `changed`."""
-        return self.changed(time_step=CONTINUOUS_PLANT)
 
     @property
     def can_rebuild(self) -> bool:

@@ -20,7 +20,7 @@ from drake_diff._base.arrays import Array, finite_array, frozen
 from drake_diff._base.clock import check_time
 from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.model.contact import ContactPoint, body_of
-from drake_diff.model.model import Model
+from drake_diff.model.model import CONTINUOUS_PLANT, Model
 from drake_diff.model.plant import actuators
 from drake_diff.model.step import set_state
 from drake_diff.motion import compliance
@@ -293,28 +293,24 @@ class SimulatedMotion(ContinuousMotion):
 
     def __init__(self, model: Model, sizes: Any = 1.0):
         super().__init__(model, sizes=sizes)
-        self.plant = model.continuous.double
+        self.plant = model.changed(time_step=CONTINUOUS_PLANT).double
         self.simulator = Simulator(self.plant.diagram, self.plant.root_context)
         ResetIntegratorFromFlags(self.simulator, "runge_kutta3", self.time_step)
         integrator = self.simulator.get_mutable_integrator()
         per_size = np.sqrt(np.mean(1 / np.square(np.broadcast_to(sizes, model.nx))))
         integrator.set_target_accuracy(ACCURACY / max(1.0, per_size))  # Drake's errors have the states' units
-        integrator.request_initial_step_size_target(self.time_step)
         integrator.set_requested_minimum_step_size(SHORTEST_PART * self.time_step)
-        integrator.set_throw_on_minimum_step_size_violation(True)
-        self.simulator.Initialize()
 
     @staticmethod
     def supports(model: Model) -> bool:
         """Return whether Drake's continuous plant has all forces of the model, and the model's own parameters."""
-        touches = bool(model.contract.contact.collision_pairs)
-        plain = model.can_rebuild and model.coupling is None and not model.has_other_parameters
-        return plain and not touches and not model.double.forces
+        others = model.contract.contact.collision_pairs or model.double.forces or model.coupling is not None
+        return model.can_rebuild and not model.has_other_parameters and not others
 
     def intervals(
         self, x0: Array, choose: Chooser, count: int, tolerance: float = ACCURACY, deadline: float = np.inf
     ) -> Iterator[tuple[Array, list[Step]]]:
-        plant, x = self.plant, x0
+        plant, x = self.plant, x0[: self.model.nx]
         most = np.where(self.model.inputs.actuator >= 0, self.limits, np.inf)
         plant.set_state(x)
         for k in range(count):
@@ -357,7 +353,7 @@ def replayed(
     count: int,
     tolerance: float = TOLERANCE,
     evaluations: int | None = None,
-    sizes: Array | None = None,
+    sizes: Any = 1.0,
 ) -> Rollout:
     """Return the motion over `count` of the model's steps under us (N, nu) or a policy; raise as `ContinuousMotion`.
 
@@ -371,14 +367,12 @@ def replayed(
     us, states, contacts = np.empty((count, nu)), np.zeros((count + 1, nx + 3)), []
     states[0, :nx] = x0
     if tolerance > TOLERANCE and SimulatedMotion.supports(model):
-        motion: ContinuousMotion = SimulatedMotion(model, 1.0 if sizes is None else sizes)
-        width = nx
-    else:
-        all_sizes = 1.0 if sizes is None else np.append(sizes, np.ones(3))  # 1 J for the work states
-        motion, width = ContinuousMotion(model, works=True, sizes=all_sizes), nx + 3
+        motion: ContinuousMotion = SimulatedMotion(model, sizes)
+    else:  # the sizes of the work states are 1 J
+        motion = ContinuousMotion(model, works=True, sizes=np.append(np.broadcast_to(sizes, nx), np.ones(3)))
     motion.most = evaluations or motion.most
-    for k, (u, steps) in enumerate(motion.intervals(states[0, :width], choose, count, tolerance)):
-        us[k], states[k + 1, :width] = u, steps[-1].ahead
+    for k, (u, steps) in enumerate(motion.intervals(states[0], choose, count, tolerance)):
+        us[k], states[k + 1, : len(steps[-1].ahead)] = u, steps[-1].ahead
         contacts.append(deepest_contacts(motion, steps))
     if isinstance(motion, SimulatedMotion):
         states[:, nx:] = motion.work(states[:, :nx], us)

@@ -82,7 +82,6 @@ class Run:
     searched: Problem | None = None  # the problem to solve, if it differs from `problem`
     closest: bool = False  # whether any motion near the guess suffices, an optimum or not
     convert: Callable[[Solution], Solution | None] | None = None  # see `solve._in_steps`
-    failed: Sequence[Solution] = ()  # plans in these steps that were not verified
     start: float = field(default_factory=now)
     started: float = field(default_factory=time.monotonic)
     certified: dict[bytes, Certificate] = field(default_factory=dict)  # keyed by state, input and parameters
@@ -484,11 +483,6 @@ class Run:
             outcome = Outcome.SOLVED if result.outcome in acceptable else result.outcome
             result = dataclasses.replace(result, outcome=outcome, note=NEAR)
         self._reach(3, draft, result)
-        again = next((plan for plan in self.failed if draft.repeats(plan)), None)  # none for phases
-        if again is not None and result.outcome is Outcome.SOLVED:
-            notes = (*again.notes, "the motion of an attempt before, whose replays decide")
-            more = {"iterations": result.iterations, "solver_message": result.message, "notes": notes}
-            return draft.told(status=again.status, message=again.message, **more)
         if isinstance(draft, PhasedSolution):
             phases = tuple(judged(phase, result) for phase in draft.phases)
             fields: dict[str, Any] = {

@@ -29,7 +29,6 @@ from drake_diff.optimize.replay import OPEN_LOOP, Replay, ReplayPlan, held, judg
 from drake_diff.optimize.transcription.between import Excess, violation_between_nodes
 from drake_diff.optimize.transcription.collocation import Collocated, collocated
 
-REPEATED = 1e-4  # a five hundredth of the strictest tolerance of a state in another plant
 SAME_COST = 1e-2  # largest relative difference in cost between searches that reach one optimum on different meshes
 SAME_MOTION = 5e-2  # largest RMS difference over the knots, as a fraction of each state's range
 NO_INPUT = PiecewisePolynomial(np.zeros((0, 1)))  # of a system without inputs
@@ -566,15 +565,6 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         if self.replay is None or not motions or motions[0] is None:
             return float("inf")
         return _largest(np.abs(motions[0].xs[-1] - self.xs[-1]))
-
-    def repeats(self, other: "Solution") -> bool:
-        """Return whether both are in steps with the same states, inputs and parameters, to REPEATED of their sizes."""
-        if self.scheme != "step" or other.scheme != "step":
-            return False
-        values, known = self.step_vector.values, other.step_vector.values
-        scales = self.plan.scale, self.problem.input_scales(self.us), np.abs(known)
-        pairs = zip((self.xs, self.us, values), (other.xs, other.us, known), scales, strict=True)
-        return all(bool(np.all(np.abs(a - b) <= REPEATED * scale)) for a, b, scale in pairs)
 
     @property
     def _num_intervals(self) -> int:

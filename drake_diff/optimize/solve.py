@@ -292,7 +292,6 @@ class _Task:
     start: float = field(default_factory=now)
     collocated: list[Solution] = field(default_factory=list)  # plans that pass their own checks, unverified
     converted: list[Solution] = field(default_factory=list)  # solutions in steps from collocated plans
-    failed: list[Solution] = field(default_factory=list)  # plans in steps that were not verified
 
     @property
     def is_late(self) -> bool:
@@ -338,7 +337,6 @@ class _Task:
             *(problem, method, scheme, solver, limits, attempt.options, options, self.report, searched),
             closest=attempt.closest,
             convert=convert,
-            failed=self.failed,
         )
 
         def make() -> Solution:
@@ -348,10 +346,7 @@ class _Task:
                 search = partial(run.sweep, guesses, given=given is not None, stages=stages)
             else:
                 search = partial(run.shoot, guesses, given=given is not None)
-            solution = run.within_time(search, guesses, self.begin)
-            if solution.status is Status.CONVERGED_NOT_VERIFIED and method != "collocation":
-                self.failed.append(solution)
-            return solution
+            return run.within_time(search, guesses, self.begin)
 
         return make
 

@@ -116,8 +116,7 @@ def _holding(s: Solution, plants: list[list[PlantTrial]]) -> str:
     parts = [f"{messages.under(feedback)} {messages.joined(where)}" for feedback, where in by_feedback.items()]
     text = f"holds {'; '.join(parts)}" if parts else ""
     if s.transcribed is not None and s.deciding_replays:
-        first = s.deciding_replays[0].variant
-        coarsest = [_trial(r) for r in s.deciding_replays if r.variant == first]
+        coarsest = [_trial(r) for r in s.deciding_replays if r.variant == s.deciding_replays[0].variant]
         text += "" if any(trial.holds for trial in coarsest) else f"; not {coarsest[0].plant}"
     return text
 
@@ -163,9 +162,8 @@ def near(plan: Solution, motion: Solution) -> Solution:
 
 def not_in_steps(plan: Solution, refined: Solution) -> Solution:
     """Return a collocated plan that no motion in the model's own steps repeats, and the steps in which it holds."""
-    holding = (
-        f"this plan holds {messages.under(t.feedback)} {t.plant}" for t in map(_trial, plan.deciding_replays) if t.holds
-    )
+    rows = map(_trial, plan.deciding_replays)
+    holding = (f"this plan holds {messages.under(t.feedback)} {t.plant}" for t in rows if t.holds)
     where = next(holding, "this plan holds in no steps that were tried")
     step = messages.in_milliseconds(plan.time_step)
     text = f"in continuous time alone: no plan in steps of {step} was verified; {where}"

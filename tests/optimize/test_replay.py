@@ -14,7 +14,6 @@ from drake_diff.model.parameters import select
 from drake_diff.motion import LQR
 from drake_diff.optimize import Options
 from drake_diff.optimize.checks import check
-from drake_diff.optimize.program import Limits, Report
 from drake_diff.optimize.replay import (
     FEEDBACK,
     FEEDBACK_TOLERANCE,
@@ -32,7 +31,6 @@ from drake_diff.optimize.replay import (
     replays,
 )
 from drake_diff.optimize.solution import Status
-from drake_diff.optimize.solve import Attempt, _Task
 
 pytestmark = pytest.mark.solve
 
@@ -330,14 +328,6 @@ def test_a_solve_whose_replay_fails_is_no_success(load):
     assert solution.status is Status.CONVERGED_NOT_VERIFIED
     assert solution.message.startswith("not verified: at 100 ms under TVLQR, hinge_q ends ")
     assert len(solution.message) <= 160
-    task = _Task(problem, Limits(50, np.inf, 1e-8), 0, Report(None, None, None), None)
-    for off, is_known in ((0.0, True), (1e-3, False)):
-        task.failed[:] = [dataclasses.replace(solution, xs=solution.xs + off * solution.plan.scale)]
-        again = task.prepare(Attempt("ilqr", "again"), solution)()
-        assert again.status is solution.status
-        assert again.message == solution.message
-        assert ("deciding_replays" in vars(again)) != is_known
-        assert task.failed[-1] is again
 
 
 def cart_pole_swing_up():
