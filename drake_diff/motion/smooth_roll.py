@@ -28,25 +28,25 @@ class SmoothRoll:
 
     def __call__(
         self, x0: Array, old: Array, gaps: Array, wanted: Array, gains: Array, bounds: tuple[Array, ...]
-    ) -> tuple[Array, Array] | None:
+    ) -> tuple[Array, Array, int]:
         """Return (xs (N+1, nx), us (N, nu)), with us = wanted + gains (xs - old) within bounds, and with gaps (N, nx).
 
         Each gap is subtracted from the end of its step. `gains` are (N, nu, nx), `bounds` those of `SaturationBounds`.
-        Returns None if a joint reaches its limit or a value is not finite.
+        Also returns the number of the first steps in which no joint reaches its limit and all values are finite.
         """
         (count, nu), nx = wanted.shape, len(x0)
-        xs, us = np.empty((count + 1, nx)), np.empty((count, nu))
+        xs, us = np.full((count + 1, nx), np.nan), np.empty((count, nu))
         xs[0] = x0
         stepped(count)
         old, gaps, wanted, gains = (np.array(array, float, order="C") for array in (old, gaps, wanted, gains))
         limits = tree_kernel.SaturationBounds(*(np.array(array, float, order="C") for array in bounds))
-        is_solved = tree_kernel.roll(self.tree, self.forces, limits, old, gaps, wanted, gains, xs, us)
-        if not is_solved or not np.isfinite(xs).all():
-            return None
+        tree_kernel.roll(self.tree, self.forces, limits, old, gaps, wanted, gains, xs, us)
         ends, n = xs[1:] + gaps, nx // 2
-        ahead = xs[:-1, :n] + 2 * self.smooth.time_step * ends[:, n:]
-        lower, upper = self.smooth.limits
-        return None if ((ahead <= lower) | (ahead >= upper)).any() else (xs, us)
+        with np.errstate(all="ignore"):
+            ahead = xs[:-1, :n] + 2 * self.smooth.time_step * ends[:, n:]
+            lower, upper = self.smooth.limits
+            wrong = ~(np.isfinite(xs[1:]).all(axis=1) & ((ahead > lower) & (ahead < upper)).all(axis=1))
+        return xs, us, int(np.argmax(wrong)) if wrong.any() else count
 
 
 def smooth_roll_of(model: Model) -> SmoothRoll | None:

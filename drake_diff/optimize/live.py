@@ -165,7 +165,7 @@ class LiveSearch:
 
 def _shown(solution: Solution) -> Rollout | None:
     """Return the motion that decides the verdict, else the open-loop motion, without starting the replays."""
-    judged = solution.judged_replay if "replays" in vars(solution) else None
+    judged = solution.judged_replay if "deciding_replays" in vars(solution) else None
     return solution.replay if judged is None or judged.motion is None else judged.motion
 
 

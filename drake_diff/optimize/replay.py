@@ -24,6 +24,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.values import ShowsItsRepr
+from drake_diff.derivatives.step import linearize
 from drake_diff.exceptions import GradientError, InputError, ModelError, SimulationError
 from drake_diff.model.assembly import OPEN, gap
 from drake_diff.model.contact import deepest_overlap, thinnest_geometry
@@ -31,7 +32,7 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
 from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
-from drake_diff.motion.continuous import ContinuousMotion, replayed
+from drake_diff.motion.continuous import ContinuousMotion, SimulatedMotion, replayed
 from drake_diff.motion.intervals import DrakeSteps, intervals_of, roll
 from drake_diff.motion.policy import TVLQR
 from drake_diff.motion.rollout import CONTINUOUS, Policy, Rollout, rollout
@@ -151,12 +152,13 @@ class ReplayPlan:
         total = self.problem.objective(xs[::every], us[::every], self.time_step * every / parts)
         return total + self.problem.cost_of_parameters(self.vector.values)
 
-    def cost_tolerance(self, fraction: float) -> float:
-        """Return the change of the cost if each state and input is off by this `fraction` of its range all along."""
+    @cached_property
+    def cost_tolerance(self) -> float:
+        """The change of the cost if each state and input is off by STATE_TOLERANCE of its range all along."""
         xs, us = self.sample(1)
         cost, total = self.cost_of(xs, us, 1), 0.0
         for values, scale in ((xs, self.scale), (us, np.ptp(us, axis=0))):
-            for direction in np.diag(fraction * scale):
+            for direction in np.diag(STATE_TOLERANCE * scale):
                 moved = (xs + direction, us) if values is xs else (xs, us + direction)
                 total += abs(self.cost_of(moved[0], moved[1], 1) - cost)
         return total
@@ -208,33 +210,38 @@ def held(xs: Array, us: Array) -> Callable[[int], tuple[Array, Array]]:
     return sample
 
 
-def replays(plan: ReplayPlan) -> tuple[Replay, ...]:
-    """Replay `plan` in the variants of the plant, open loop and, if there are inputs, under TVLQR."""
+def replays(plan: ReplayPlan, *, sufficient: str = "") -> tuple[Replay, ...]:
+    """Replay `plan` in the variants of the plant, open loop and, if there are inputs, under TVLQR.
+
+    With `sufficient` open loop, variants in which the plan holds open loop are not replayed under TVLQR. The verdict
+    is the same. Later calls repeat no replay.
+    """
     model, parts = plan.problem.model, 2
     if plan.problem.motion == CONTINUOUS:
-        return tuple(plan.follower().in_model(ANOTHER_INTEGRATION, lambda: model))
-    rows = plan.follower().in_steps()
+        return tuple(plan.follower().in_model(ANOTHER_INTEGRATION, lambda: model, sufficient=sufficient))
+    by_steps = [plan.follower().in_steps(sufficient)]
     if not model.can_rebuild:  # a user's diagram has no variants
-        return tuple(rows)
-    rows += plan.follower(parts).in_steps()
+        return tuple(by_steps[0])
+    by_steps.append(plan.follower(parts).in_steps(sufficient))
     if plan.continuous:
         most = finest_parts(plan)
-        while parts < most and not (any(r.holds for r in rows[-2:]) and any(r.holds for r in rows[-4:-2])):
-            if parts >= FINE and _fails_in_the_limit(rows):
+        while parts < most and not all(any(r.holds for r in tried) for tried in by_steps[-2:]):
+            last = plan.follower(parts // 2), plan.follower(parts)
+            if parts >= FINE and _fails_in_the_limit([r for follower in last for r in follower.in_steps()]):
                 break
             parts *= 2
-            rows += plan.follower(parts).in_steps()
-        return tuple(rows)
-    rows += plan.follower(FINE).in_steps()
+            by_steps.append(plan.follower(parts).in_steps(sufficient))
+        return tuple(r for tried in by_steps for r in tried)
+    rows = by_steps[0] + by_steps[1] + plan.follower(FINE).in_steps(sufficient)
     contact = model.contract.contact
     if not contact.collision_pairs:
-        return (*rows, *plan.follower_in_continuous_time.in_continuous_time())
+        return (*rows, *plan.follower_in_continuous_time.in_continuous_time(sufficient=sufficient))
     other = OTHER_APPROXIMATION[contact.approximation]
-    name = f"with {other} contact"
-    tried = plan.follower().in_model(name, lambda: model.with_contact(other))
+    name, follower = f"with {other} contact", plan.follower()
+    tried = follower.in_model(name, lambda: model.with_contact(other), sufficient=sufficient)
     if not any(r.holds for r in tried):
         name = f"{name} in steps of {plan.time_step / FINE:.4g} s"
-        tried += plan.follower().in_model(name, lambda: plan.model_at(FINE).with_contact(other), FINE)
+        tried += follower.in_model(name, lambda: plan.model_at(FINE).with_contact(other), FINE, sufficient)
     return (*rows, *tried)
 
 
@@ -305,6 +312,7 @@ class PlanFollower:
         self.xs, self.us = plan.sample(parts)
         self.controls = (OPEN_LOOP, FEEDBACK) if plan.problem.model.nu else (OPEN_LOOP,)
         self.pieces, self.leads_elsewhere = pieces, parts > 1 and not plan.continuous
+        self.known = dict[tuple[str, str], Replay]()  # by variant and controller
 
     @cached_property
     def model(self) -> Model:
@@ -333,18 +341,22 @@ class PlanFollower:
 
     @cached_property
     def _regulator(self) -> TVLQR:
-        defects, space = None, tangent_space(self.model)
-        if self.leads_elsewhere:
-            defects = [space.minus(end, x) for end, x in zip(self._ends(), self.xs[1:], strict=True)]
+        known, space = dict[str, Any](), tangent_space(self.model)
+        ends = np.array(self._ends()) if self.leads_elsewhere else self.xs[1:]
         with self.plan.applied_to(self.model) as model:
-            return regulator(self.plan, model, self.xs, self.us, defects)
+            if self.leads_elsewhere:
+                known["defects"] = [space.minus(end, x) for end, x in zip(ends, self.xs[1:], strict=True)]
+                if self.pieces == 1:  # Drake's steps are not repeated
+                    known["jacobians"] = np.concatenate(linearize(model, self.xs, self.us, x_next=ends)[:2], axis=2)
+            return regulator(self.plan, model, self.xs, self.us, **known)
 
     def _ends(self) -> list[Array]:
         """Return the ends of the controller's steps from the plan's states."""
         us = [np.tile(u, (max(1, self.pieces), 1)) for u in self.us]
         with self.plan.applied_to(self.plant) as plant:
             steps = DrakeSteps(plant, self.plan.vector)
-            states = partial(roll, steps) if self.pieces else ContinuousMotion(plant, sizes=self.plan.scale).states
+            kind = SimulatedMotion if SimulatedMotion.supports(plant) else ContinuousMotion
+            states = partial(roll, steps) if self.pieces else kind(plant, sizes=self.plan.scale).states
             return [states(x, held_us)[-1] for x, held_us in zip(self.xs, us, strict=False)]
 
     def law(self, control: str = FEEDBACK, pieces: int = 1) -> Policy:
@@ -384,11 +396,11 @@ class PlanFollower:
                 slew[entries] = np.minimum(slew[entries], limits * period)
         return slew
 
-    def in_steps(self) -> list[Replay]:
-        """Replay under each controller in the controller's own steps."""
-        return self.in_model(f"in steps of {self.period:.4g} s", lambda: self.model)
+    def in_steps(self, sufficient: str = "") -> list[Replay]:
+        """Run `replays` in the controller's own steps."""
+        return self.in_model(f"in steps of {self.period:.4g} s", lambda: self.model, sufficient=sufficient)
 
-    def in_model(self, variant: str, make: Callable[[], Model], pieces: int = 1, enough: bool = False) -> list[Replay]:
+    def in_model(self, variant: str, make: Callable[[], Model], pieces: int = 1, sufficient: str = "") -> list[Replay]:
         """Run `replays` in the steps of the model from `make`. An error in `make` returns missing replays."""
         try:
             model = make()
@@ -405,9 +417,9 @@ class PlanFollower:
                     motion = _rolled(self.plan.problem, set_model, self.xs[0], law, count)
             return motion, [energy_check(motion)] * with_energy
 
-        return self.replays(FollowedPlant(variant, model, move, pieces), enough=enough)
+        return self.replays(FollowedPlant(variant, model, move, pieces), sufficient=sufficient)
 
-    def in_continuous_time(self, *, enough: bool = False) -> list[Replay]:
+    def in_continuous_time(self, *, sufficient: str = "") -> list[Replay]:
         """Run `replays` in the continuous time that Drake's steps approximate, or in short steps if that fails."""
 
         def move(control: str) -> tuple[MeasuredMotion, list[Check]]:
@@ -416,31 +428,39 @@ class PlanFollower:
                 motion = replayed(set_model, x0, law, count, TOLERANCE, EVALUATIONS, self.plan.scale)
             return motion, [energy_check(motion)]
 
-        rows = self.replays(FollowedPlant(IN_CONTINUOUS_TIME, self.model, move, time_step=0.0), enough=enough)
+        rows = self.replays(FollowedPlant(IN_CONTINUOUS_TIME, self.model, move, time_step=0.0), sufficient=sufficient)
         refused = [row for row in rows if row.motion is None]
         others = {GAINS_ALONE, FEEDBACK}.intersection(row.control for row in rows)
         if not refused or all(any(r.holds for r in rows if r.control in (OPEN_LOOP, other)) for other in others):
             return rows
         by = self.plan.follower(self.parts, max(1, FINEST // self.parts))
         name = f"in steps of {by.period / by.pieces:.4g} s in place of continuous time: {refused[0].failures[0]}"
-        short = by.in_model(name, lambda: by.plant, by.pieces, enough)
+        short = by.in_model(name, lambda: by.plant, by.pieces, sufficient)
         return short if any(row.motion is not None for row in short) else rows
 
-    def replays(self, plant: FollowedPlant, *, enough: bool = False) -> list[Replay]:
+    def replays(self, plant: FollowedPlant, *, sufficient: str = "") -> list[Replay]:
         """Replay under each controller, and by gains without offsets if finer steps lead elsewhere and fail open loop.
 
-        With `enough`, replay under TVLQR, and open loop only if TVLQR fails.
+        With a `sufficient` controller, the others are only used if the plan does not hold under it. If that is TVLQR,
+        gains without offsets are not used.
         """
         rows = list[Replay]()
-        for control in self.controls[::-1] if enough else self.controls:
+        for control in self.controls[::-1] if sufficient == FEEDBACK else self.controls:
             rows.append(self.replay(plant, control))
-            if enough and rows[-1].holds:
+            if sufficient and rows[-1].holds:
                 break
-        if self.leads_elsewhere and not enough and len(rows) > 1 and not rows[0].holds:
+        if self.leads_elsewhere and sufficient != FEEDBACK and len(rows) > 1 and not rows[0].holds:
             rows.append(self.replay(plant, GAINS_ALONE))
         return rows
 
     def replay(self, plant: FollowedPlant, control: str) -> Replay:
+        """Return the replay of the plan in a plant under one controller, which may be known."""
+        key = plant.variant, control
+        if key not in self.known:
+            self.known[key] = self._replay(plant, control)
+        return self.known[key]
+
+    def _replay(self, plant: FollowedPlant, control: str) -> Replay:
         """Replay the plan in a plant under one controller."""
         plan, (variant, model, move, pieces, time_step, wider) = self.plan, plant
         every = pieces * self.parts
@@ -511,14 +531,13 @@ def _rolled(problem: Problem, model: Model, x0: Array, inputs: Array | Policy, c
 # Feedback.
 
 
-def regulator(plan: ReplayPlan, model: Model, xs: Array, us: Array, defects: Sequence[Array] | None = None) -> TVLQR:
-    """Return TVLQR on `model` about the plan's xs (N+1, nx) and us (N, nu). See `TVLQR` for `defects`."""
+def regulator(plan: ReplayPlan, model: Model, xs: Array, us: Array, **known: Any) -> TVLQR:
+    """Return TVLQR on `model` about the plan's xs (N+1, nx) and us (N, nu). `known` are arguments of `TVLQR`."""
     Q, R, final = regulator_weights(plan, us)
     ratio = model.time_step / plan.time_step  # finer steps add more terms to a running cost
-    jacobians = None
     if plan.problem.motion == CONTINUOUS:
-        jacobians = intervals_of(model, select(model, ()), CONTINUOUS).jacobians(xs, us)
-    return TVLQR(model, xs, us, ratio * Q, ratio * R, final, jacobians=jacobians, defects=defects)
+        known["jacobians"] = intervals_of(model, select(model, ()), CONTINUOUS).jacobians(xs, us)
+    return TVLQR(model, xs, us, ratio * Q, ratio * R, final, **known)
 
 
 def regulator_weights(plan: ReplayPlan, us: Array) -> tuple[Array, Array, Array]:
@@ -593,7 +612,7 @@ def comparison_checks(plan: ReplayPlan, motion: MeasuredMotion, parts: int, *, s
         difference = abs(plan.cost_of(motion.xs, motion.us, parts) - plan.cost)
         tolerance = fraction * abs(plan.cost)
         if not difference <= tolerance:  # this tolerance usually suffices
-            tolerance += problem.least_cost(wanted[0], plan.time_step) if same else plan.cost_tolerance(STATE_TOLERANCE)
+            tolerance += problem.least_cost(wanted[0], plan.time_step) if same else plan.cost_tolerance
     yield check("replayed cost", "the whole motion", difference, tolerance)
 
 

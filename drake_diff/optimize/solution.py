@@ -172,9 +172,10 @@ class Solution(PicklesItsFields, ShowsItsRepr):
             *(str(c) for c in self.plan_checks.failing),
             f"{len(self.iterations)} iterations in {self.wall_time:.2g} s; certificates: {certified}",
         ]
-        if "replays" in vars(self) and self.replays:  # replays take time, so that printing does not start them
-            lines.append(f"replays: {sum(r.holds for r in self.replays)} of {len(self.replays)} hold")
-            lines += [str(r) for r in self.replays if not r.holds]
+        known = vars(self).get("replays", vars(self).get("deciding_replays", ()))
+        if known:  # replays take time, so that printing does not start them
+            lines.append(f"replays: {sum(r.holds for r in known)} of {len(known)} hold")
+            lines += [str(r) for r in known if not r.holds]
         lines += [f"cross-checked {row}" for row in self.cross_checks]
         return "\n  ".join(lines)
 
@@ -214,7 +215,7 @@ class Solution(PicklesItsFields, ShowsItsRepr):
 
         This property replays the plan. `success` tells whether the plan holds under that feedback.
         """
-        rows = self.following or [c for r in self.replays[:1] for c in r.checks]
+        rows = self.following or [c for r in self.deciding_replays[:1] for c in r.checks]
         open_loop = [c.passes for c in rows if c.feedback is None]
         return None if open_loop and all(open_loop) else "TVLQR"
 
@@ -540,6 +541,11 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         have no variants, and the tuple is empty.
         """
         return replays(self.plan) if self.problem.has_model else ()
+
+    @cached_property
+    def deciding_replays(self) -> tuple[Replay, ...]:
+        """The replays that decide success: under TVLQR only in variants in which the plan does not hold open loop."""
+        return replays(self.plan, sufficient=OPEN_LOOP) if self.problem.has_model else ()
 
     @property
     def judged_replay(self) -> Replay | None:

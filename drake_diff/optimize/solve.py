@@ -438,8 +438,11 @@ def _in_steps(task: _Task, asked: Attempt, plan: Solution, chain: list[dict[str,
     if not (plan.success and plan.transcribed is not None and _has_steps(task.problem)):
         return plan
     for attempt in _to_steps(task.problem, asked)[1 if task.converted and "refinements" not in plan.options else 0 :]:
-        if task.converted and task.converted[-1].status in ENDED:
+        last = task.converted[-1] if task.converted else None
+        if last is not None and last.status in ENDED:
             break
+        if last is not None and last.method == "ilqr" and last.status in PLANS and not attempt.closest:
+            continue  # another method would find the same optimum
         if attempt.method == "shooting" or _is_possible(task.problem, attempt):
             _convert(task, attempt, plan, chain)
     if not task.converted:
@@ -453,8 +456,9 @@ def _to_steps(problem: Problem, asked: Attempt) -> tuple[Attempt, ...]:
     nearest = "the motion in the model's own steps that is nearest to the collocated plan"
     shooting = replace(asked.by("shooting", reason), max_iterations=REFINING)
     by_ilqr = replace(asked.by("ilqr", f"{reason}, by iLQR"), max_iterations=REFINING)
-    last = replace(shooting, reason=nearest, closest=True, max_iterations=5 * REFINING)
-    return (by_ilqr, shooting, last) if _has_soft_goals(problem) else (shooting, by_ilqr, last)
+    first, second = (by_ilqr, shooting) if _has_soft_goals(problem) else (shooting, by_ilqr)
+    last = replace(first, reason=nearest, closest=True, max_iterations=5 * REFINING)
+    return first, second, last
 
 
 def _has_steps(problem: Problem) -> bool:

@@ -65,9 +65,8 @@ def trials(s: Solution) -> list[list[PlantTrial]]:
     following = [PlantTrial(plant, f, [c for c in s.following if c.feedback == f]) for f in feedbacks]
     plants = [following] if following else []
     if s.problem.has_model:
-        variants = deciding(s.plan, s.replays)
-        for v in variants:
-            rows = [r for r in s.replays if r.variant == v]
+        for v in deciding(s.plan, s.deciding_replays):
+            rows = [r for r in s.deciding_replays if r.variant == v]
             plants.append([_trial(r) for r in rows if r.control != GAINS_ALONE])
             if any(r.control == GAINS_ALONE for r in rows):  # open loop, or under both other controllers
                 plants.append([_trial(r) for r in rows if r.control != FEEDBACK])
@@ -116,8 +115,8 @@ def _holding(s: Solution, plants: list[list[PlantTrial]]) -> str:
             by_feedback.setdefault(trial.feedback, []).append(trial.plant)
     parts = [f"{messages.under(feedback)} {messages.joined(where)}" for feedback, where in by_feedback.items()]
     text = f"holds {'; '.join(parts)}" if parts else ""
-    if s.transcribed is not None and s.replays:
-        coarsest = [_trial(r) for r in s.replays if r.variant == s.replays[0].variant]
+    if s.transcribed is not None and s.deciding_replays:
+        coarsest = [_trial(r) for r in s.deciding_replays if r.variant == s.deciding_replays[0].variant]
         text += "" if any(trial.holds for trial in coarsest) else f"; not {coarsest[0].plant}"
     return text
 
@@ -163,7 +162,8 @@ def near(plan: Solution, motion: Solution) -> Solution:
 
 def not_in_steps(plan: Solution, refined: Solution) -> Solution:
     """Return a collocated plan that no motion in the model's own steps repeats, and the steps in which it holds."""
-    holding = (f"this plan holds {messages.under(t.feedback)} {t.plant}" for t in map(_trial, plan.replays) if t.holds)
+    rows = map(_trial, plan.deciding_replays)
+    holding = (f"this plan holds {messages.under(t.feedback)} {t.plant}" for t in rows if t.holds)
     where = next(holding, "this plan holds in no steps that were tried")
     step = messages.in_milliseconds(plan.time_step)
     text = f"in continuous time alone: no plan in steps of {step} was verified; {where}"

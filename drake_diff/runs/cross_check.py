@@ -75,7 +75,7 @@ def cross_check(solution: Solution, engines: Sequence[str] = SIMULATORS) -> Solu
         got = f"{type(solution).__name__} of plain dynamics" if type(solution) is Solution else type(solution)
         raise InputError("solution", got=got, expected="the Solution of a problem with a model")
     follower = follower_of(solution.plan, solution.replays if solution.transcribed is not None else ())
-    rows = follower.in_continuous_time(enough=True)
+    rows = follower.in_continuous_time(sufficient=FEEDBACK)
     rows += [row for name in engines for row in _in_simulator(follower, name)]
     return solution.told(cross_checks=tuple(rows), options=solution.options | {"cross_check": list(engines)})
 
@@ -138,7 +138,7 @@ def replays_in(follower: PlanFollower, engine: Engine) -> list[Replay]:
             return _Moved(np.asarray(h * np.arange(count + 1)), xs, us, _overlaps(set_model, xs)), checks
 
     variant = f"in {engine.name} {engine.version} in steps of {h:.4g} s"
-    return follower.replays(FollowedPlant(variant, follower.model, move, pieces, h, WIDER), enough=True)
+    return follower.replays(FollowedPlant(variant, follower.model, move, pieces, h, WIDER), sufficient=FEEDBACK)
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,8 +45,9 @@ def test_it_moves_as_drake_does(file, time_step, seed):
     us = random.standard_normal((12, model.nu))
     roll = smooth_roll_of(model)
     assert isinstance(roll, SmoothRoll)
-    xs, used = roll(x0, old, gaps, us, gains, bounds)
+    xs, used, count = roll(x0, old, gaps, us, gains, bounds)
     expected = dd.rollout(model, x0, us).xs
+    assert count == 12
     np.testing.assert_array_equal(used, us)
     np.testing.assert_allclose(xs, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
@@ -56,7 +57,7 @@ def test_feedback_gaps_and_bounds_are_those_that_drakes_step_gets():
     x0, old, gaps, gains, _ = stays(model)
     gaps, gains = (0.01 * random.standard_normal(part.shape) for part in (gaps, gains))
     wanted, limit = random.standard_normal((12, model.nu)), np.ones(model.nu)
-    xs, us = smooth_roll_of(model)(x0, old, gaps, wanted, gains, (-0.9 * limit, 0.9 * limit, -limit, limit))
+    xs, us, _ = smooth_roll_of(model)(x0, old, gaps, wanted, gains, (-0.9 * limit, 0.9 * limit, -limit, limit))
     x = x0
     for k in range(12):
         u = wanted[k] + gains[k] @ (x - old[k])
@@ -73,8 +74,11 @@ def test_what_it_leaves_out_it_does_not_move(write_urdf):
     at_limit = x0.copy()
     at_limit[2] = model.position_limits[1][2] - 1e-4
     at_limit[model.nq + 2] = 1.0
-    assert roll(at_limit, old, gaps, us, gains, bounds) is None
-    assert roll(x0, old, gaps, np.full_like(us, np.nan), gains, bounds) is None
+    assert roll(at_limit, old, gaps, us, gains, bounds)[2] == 0
+    us[3:] = np.nan
+    xs, _, count = roll(x0, old, gaps, us, gains, bounds)
+    assert count == 3
+    np.testing.assert_allclose(xs[:4], dd.rollout(model, x0, us[:3]).xs, rtol=0, atol=1e-11 * np.abs(xs[:4]).max())
     touching = dd.load_model(robot_file("ur5_robot.urdf"), time_step=0.01, base="weld", actuators="all")
     floating = dd.example_model("quadrotor", time_step=0.01)
     for other in (touching, floating):

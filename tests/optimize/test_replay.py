@@ -87,6 +87,23 @@ def test_feedback_holds_what_open_loop_loses(load):
     assert not broken_variants(plan, found)
 
 
+@each_row("offset, holds", [(0.0, {True}), (0.5, {True, False})])
+def test_the_deciding_replays_are_under_feedback_where_open_loop_fails(load, offset, holds):
+    """A pendulum that rests hangs on open loop, and one that balances does not stay up in finer steps."""
+    model = load("pendulum.urdf", time_step=0.02)
+    up = np.pi if offset else 0.0
+    balance = LQR(model, [up, 0], [0], Q=np.eye(2), R=[[1.0]])
+    us = dd.rollout(model, [up - offset, 0], policy=balance, num_steps=100).us
+    plan = plan_of(dd.Problem(model, x0=[up - offset, 0], num_steps=100, x_goal=[up, 0]), us)
+    brief = replays(plan, sufficient=OPEN_LOOP)
+    found = replays(plan)
+    assert {r.holds for r in brief if r.control == OPEN_LOOP} == holds
+    for row in found:  # the same objects, so that no replay was repeated
+        first = by_name(found, row.variant, OPEN_LOOP)
+        assert (row in brief) == (row is first or not first.holds)
+    assert broken_variants(plan, brief) == broken_variants(plan, found) == []
+
+
 def test_the_plants_own_step_gives_the_plan_back(write_urdf):
     plan = plan_of(block(write_urdf, final_cost=lambda x: x[0]), np.linspace(-1, 1, COUNT)[:, None])
     for control in ("open loop", "TVLQR"):

@@ -398,7 +398,7 @@ class _Search:
     def _roll(self, policy: AffinePolicy, size: float) -> Motion:
         """Simulate from x_0 with feedback, where each gap shrinks to 1 - `size` times itself."""
         old, nx = self.motion, self.motion.xs.shape[1]
-        xs, us = np.empty_like(old.xs), np.empty_like(old.us)
+        xs, us, begun = np.empty_like(old.xs), np.empty_like(old.us), 0
         gaps = (1 - size) * old.gaps
         xs[0] = self._inside_start(old.xs[0] + size * policy.start[:nx])
         c = np.clip(old.c + size * policy.start[nx:], *self.design.limits)
@@ -407,19 +407,20 @@ class _Search:
             wanted = wanted + policy.feedback[:, :, nx:] @ (c - old.c)
         if self.tried_by is not None:
             bounds = *self.inner, self.problem.bounds.u_lower, self.problem.bounds.u_upper
-            rollout = self.tried_by(xs[0], old.xs, gaps, wanted, policy.feedback, bounds)
-            if rollout is not None:  # None at a joint limit or if not finite: Drake's step reports it
-                return Motion(*rollout, gaps, c)
+            xs, us, begun = self.tried_by(xs[0], old.xs, gaps, wanted, policy.feedback, bounds)
         with self.problem.intervals(self.design.at(c)) as intervals:
-            for k, feedback in enumerate(policy.feedback[:, :, :nx]):
+            for k in range(begun, len(us)):  # at a joint limit or if not finite, Drake's step goes on
+                feedback = policy.feedback[k, :, :nx]
                 us[k] = self._inside(wanted[k] + feedback.dot(xs[k] - old.xs[k]))
                 xs[k + 1] = intervals.end(xs[k], us[k]) - gaps[k]
         return Motion(xs, us, gaps, c)
 
     def _objective(self, motion: Motion) -> float:
+        from drake_diff.optimize.knots import costs_of  # loads CasADi
+
         values = self.design.values(motion.c)
-        cost = self.problem.objective(motion.xs, motion.us, self.design.time_step(values))
-        return cost + self.problem.cost_of_parameters(self.design.own(values))
+        costs = costs_of(self.problem, *self.motion.point, self.design.time_step(values))
+        return float(np.sum(costs.values(*motion.point))) + self.problem.cost_of_parameters(self.design.own(values))
 
     def _take_in(self, xs: Array, us: Array, c: Array) -> Motion:
         """Return the guess with inputs within bounds, the problem's initial state, and its gaps."""

@@ -4,6 +4,7 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -156,7 +157,7 @@ class Constraint:
         """The name of the constraint, by default the function's own name."""
         return self.name or str(getattr(self.function, "__qualname__", type(self.function).__name__))
 
-    @property
+    @cached_property
     def takes_input(self) -> bool:
         """Whether the function has an argument u."""
         return arguments_of(self.function) > 1
