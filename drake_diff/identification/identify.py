@@ -119,7 +119,7 @@ def identify(
     given, files = read_given(model, recordings)
     columns = columns_of(given)
     pieces = read_pieces(model, given, held_out, columns)
-    tree = tree_for_identification(model)
+    tree = tree_for_identification(model, servos=True)
     why = str(tree) if isinstance(tree, Refusal) else what_acts(model, pieces)
     if motion == "continuous" and isinstance(tree, Refusal):
         raise ModelError(f"{model.name}: motion in continuous time is not supported: {why}")

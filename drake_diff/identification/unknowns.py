@@ -26,11 +26,12 @@ from drake_diff.model.parameters import (
     second_moment,
     to_log_cholesky,
 )
-from drake_diff.model.plant import bodies, joints, labelled, radius_of_gyration, rotors
+from drake_diff.model.plant import actuators, bodies, joints, labelled, radius_of_gyration, rotors
 
 MASS, CENTER, INERTIA = "mass", "center_of_mass", "inertia"
 COULOMB, STRENGTH, BIAS = "coulomb_friction", "strength", "bias"
 DELAY, LIMIT = "input_delay", "limit"  # [s] of all inputs; of one input
+GAINS = ("kp", "kd")
 OF_JOINTS = {  # quantities with one number per joint, and their names in `tree.Numbers`
     "damping": "damping",
     COULOMB: "coulomb",
@@ -40,7 +41,7 @@ OF_JOINTS = {  # quantities with one number per joint, and their names in `tree.
 }
 OF_TREE = (
     MASS, CENTER, INERTIA, "damping", "offset", "spring_stiffness", "spring_rest_angle", "spring_rest_length",
-    "gear_ratio", "rotor_inertia", "gravity", COULOMB, STRENGTH,
+    "gear_ratio", "rotor_inertia", "gravity", COULOMB, STRENGTH, *GAINS,
 )  # fmt: skip
 OF_ALL = (MASS, CENTER, INERTIA, "damping", "spring_stiffness", "rotor_inertia")
 FAR = 3.0  # prior standard deviation of a quantity's change, in units of its own size
@@ -388,6 +389,9 @@ def set_numbers(model: Model, tree: Tree, unknowns: Unknowns, values: Any) -> Nu
             arrays["gravity"][:] = value
         elif quantity in (STRENGTH, LIMIT):
             arrays[quantity][model.input_names.index(label)] = value
+        elif quantity in GAINS:
+            motor = list(labelled(actuators(model.plant))).index(label)
+            arrays[quantity][int(np.flatnonzero(model.inputs.actuator == motor)[0])] = value
     if any(name.rsplit(".", 1)[1] in ("gear_ratio", "rotor_inertia") for name in given):
         _set_rotors(model, by_joint, given, arrays["reflected"])
     return Numbers(**arrays)
