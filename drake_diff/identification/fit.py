@@ -14,6 +14,7 @@ it is one standard deviation if a quantity differs from the file's by three time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from scipy.optimize import lsq_linear
 
 from drake_diff._base.arrays import Array
 from drake_diff.exceptions import ModelError, SimulationError
-from drake_diff.identification.motion import DiscreteMotion, Law, TreeMotion
+from drake_diff.identification.motion import DiscreteMotion, Law, Slopes, TreeMotion
 from drake_diff.identification.recordings import LEAST, Excerpt
 from drake_diff.identification.sensors import Sensors
 from drake_diff.identification.unknowns import BIAS, Unknowns
@@ -136,6 +137,15 @@ class Reduced:
     def finite(self) -> bool:
         """Whether all entries are finite and below TOO_LARGE."""
         return bool(np.all(np.abs(np.column_stack([self.R, self.b])) < TOO_LARGE))
+
+
+class _Parts(NamedTuple):
+    """What the elimination of first states fills, branch by branch."""
+
+    blocks: list[Array]  # per piece: R of the first states (2 nv, 2 nv + np + 1)
+    rows: list[list[Array]]  # per piece: rows (k, np + 1) in the unknowns alone
+    nodes: list[tuple[Array, Array]]  # per segment, as in `Reduced`
+    residuals: list[Array]  # per piece, as in `Reduced`
 
 
 class Fit:
@@ -268,60 +278,86 @@ class Fit:
     @np.errstate(over="ignore", invalid="ignore")  # the motion may overflow
     def reduce(self, point: "FittedMotion", reach: float = 1.0) -> Reduced:
         """Linearize, close the gaps to first order, and eliminate the first states; `reach` enlarges their region."""
-        z, starts, xs, residuals, gaps = point.z, point.starts, point.xs, point.residuals, point.gaps
-        s, nt, nz = point.segments, self.space.size, len(z)
-        A, C = self.law.slopes(z, xs, s.hs, s.us)
+        z, xs, s, nt, nz = point.z, point.xs, point.segments, self.space.size, len(point.z)
+        rates = None
         if self.unknowns.delay is not None:
             flat = xs[:, 1:].reshape(-1, xs.shape[2]), s.us.reshape(-1, s.us.shape[2])
             rates = self._continuous.rates(self.unknowns.values(z), *flat).reshape(xs[:, 1:].shape)
-            C[..., self.unknowns.delay] = rates * s.by_delay[..., None]
-        K, M, nx = A.shape[:3]
-        along = np.zeros((K, M + 1, nx, nt + nz))
-        along[:, 0, :, :nt] = self.space.derivative_of_plus(starts)
+            rates *= s.by_delay[..., None]
+        parts = _Parts(
+            blocks=[np.zeros((nt, nt + nz + 1)) for _ in s.pieces],
+            rows=[[np.zeros((0, nz + 1))] for _ in s.pieces],
+            nodes=[(np.zeros((nt, nt + nz)), np.zeros(nt)) for _ in s.first],
+            residuals=[np.full((len(piece.times), len(self.noise)), np.nan) for piece in s.pieces],
+        )
+        for branch in self.law.slopes(z, xs, s.hs, s.us, together=self.sensors.count > 0):
+            self._eliminate(point, branch, rates, reach, parts)
+        each = [_triangle(np.vstack(rows)) for rows in parts.rows]
+        R = _triangle(np.vstack([rows[: nz + 1] for rows in each]))
+        now = sum(float(np.nansum(r**2)) for r in parts.residuals)
+        own = [(block[:, :nt], block[:, nt:-1], block[:, -1]) for block in parts.blocks]
+        Rs = [rows[:nz, :nz] for rows in each]
+        return Reduced(now, R[:nz, :nz], R[:nz, -1], float(R[nz, -1] ** 2), own, parts.nodes, parts.residuals, Rs)
+
+    def _eliminate(
+        self, point: "FittedMotion", branch: Slopes, rates: Array | None, reach: float, parts: "_Parts"
+    ) -> None:
+        """Close the gaps of an independent branch, and eliminate its first states in each piece."""
+        z, xs, gaps, s = point.z, point.xs, point.gaps, point.segments
+        states, tangent, delay, nz, nt = branch.states, branch.tangent, self.unknowns.delay, len(z), self.space.size
+        seen_in = np.concatenate([tangent, np.arange(nt, len(self.noise))])  # entries of a sample
+        biases = [(column, entry) for column, entry in self._bias_columns() if entry in seen_in]
+        more = [column for column, _ in biases] + ([] if delay is None else [delay])
+        columns = np.union1d(branch.columns, np.array(more, dtype=np.intp)).astype(np.intp)
+        (K, M, nx, _), n = branch.by_x.shape, len(tangent)
+        along = np.zeros((K, M + 1, nx, n + len(columns)))
+        along[:, 0, :, :n] = self.space.derivative_of_plus(point.starts)[:, states[:, None], tangent]
+        own = n + np.searchsorted(columns, branch.columns)
         for m in range(M):
-            along[:, m + 1] = A[:, m] @ along[:, m]
-            along[:, m + 1, :, nt:] += C[:, m]
-        blocks, rows_z, nodes, by_piece, rest = [], [np.zeros((0, nz + 1))], [], [], 0.0
+            along[:, m + 1] = branch.by_x[:, m] @ along[:, m]
+            along[:, m + 1][..., own] += branch.by_z[:, m]
+            if rates is not None:
+                along[:, m + 1, :, n + int(np.searchsorted(columns, delay))] += rates[:, m, states]
         read = self._read_slopes(z, s, xs) if self.sensors.count else []
-        for p, piece in enumerate(s.pieces):
-            D, e = np.eye(nt, nt + nz), np.zeros(nt)
-            rows, linearized = [], np.full((len(piece.times), len(self.noise)), np.nan)
+        entries = seen_in[: n + self.sensors.count]
+        noise, scale = self.noise[entries], self.gap_scale[tangent]
+        for p in range(len(s.pieces)):
+            D, e, rows = np.eye(n, n + len(columns)), np.zeros(n), []
             for k in np.flatnonzero(s.of_piece == p):
-                nodes.append((D, e))
-                states = xs[k, s.at[k]]
-                moved = self.space.derivative_of_minus(states) @ along[k, s.at[k]]
+                parts.nodes[k][0][np.ix_(tangent, [*tangent, *(nt + columns)])] = D
+                parts.nodes[k][1][tangent] = e
+                moved = self._minus(xs[k, s.at[k]], branch) @ along[k, s.at[k]]
                 if read:
                     by_x, by_z = read[k]
                     of_outputs = by_x @ moved
-                    of_outputs[..., nt:] += by_z
+                    of_outputs[..., n:] += by_z[..., columns]
                     moved = np.concatenate([moved, of_outputs], axis=1)
-                J = moved[..., :nt] @ D
-                J[..., nt:] += moved[..., nt:]
-                r = residuals[k] - (moved[..., :nt] @ e) / self.noise
-                for column, entry in self._bias_columns():
-                    J[:, entry, nt + column] += 1.0
-                J /= self.noise[:, None]
+                J = moved[..., :n] @ D
+                J[..., n:] += moved[..., n:]
+                r = point.residuals[k][:, entries] - (moved[..., :n] @ e) / noise
+                for column, entry in biases:
+                    J[:, np.flatnonzero(entries == entry)[0], n + np.searchsorted(columns, column)] += 1.0
+                J /= noise[:, None]
                 seen = np.isfinite(r)
                 rows.append(np.column_stack([J[seen], r[seen]]))
-                linearized[s.samples[k]] = r
-                end = self.space.derivative_of_minus(xs[k, s.counts[k]]) @ along[k, s.counts[k]]
-                e = end[:, :nt] @ e + gaps[k]
-                D = end[:, :nt] @ D
-                D[:, nt:] += end[:, nt:]
-            by_piece.append(linearized)
-            ridge = np.zeros((nt, nt + nz + 1))
-            ridge[:, :nt] = NO_PRIOR * np.eye(nt)
+                parts.residuals[p][np.ix_(s.samples[k], entries)] = r
+                end = self._minus(xs[k, s.counts[k]], branch) @ along[k, s.counts[k]]
+                e = end[:, :n] @ e + gaps[k, tangent]
+                D = end[:, :n] @ D
+                D[:, n:] += end[:, n:]
+            ridge = np.zeros((n, n + len(columns) + 1))
+            ridge[:, :n] = NO_PRIOR * np.eye(n)
             if self.law.kinks:
-                ridge[nt // 2 :, nt // 2 : nt] = np.diag(1 / (reach * NEAR * self.gap_scale[nt // 2 :]))
+                ridge[n // 2 :, n // 2 : n] = np.diag(1 / (reach * NEAR * scale[n // 2 :]))
             R = _triangle(np.vstack([*rows, ridge]))
-            blocks.append((R[:nt, :nt], R[:nt, nt:-1], R[:nt, -1]))
-            rows_z.append(R[nt : nt + nz, nt:])
-            rest += float(R[nt + nz, -1] ** 2)
-        R = _triangle(np.vstack(rows_z))
-        rest += float(R[nz, -1] ** 2)
-        now = sum(float(np.nansum(r**2)) for r in by_piece)
-        Rs = [rows[:, :nz] for rows in rows_z[1:]]
-        return Reduced(now, R[:nz, :nz], R[:nz, -1], rest, blocks, nodes, by_piece, Rs)
+            parts.blocks[p][np.ix_(tangent, [*tangent, *(nt + columns), -1])] = R[:n]
+            free = np.zeros((len(columns) + 1, nz + 1))
+            free[:, [*columns, -1]] = R[n:, n:]
+            parts.rows[p].append(free)
+
+    def _minus(self, x: Array, branch: Slopes) -> Array:
+        """Return the derivatives (..., 2 nv, nx) of a branch's tangent vector by its states."""
+        return np.asarray(self.space.derivative_of_minus(x)[..., branch.tangent[:, None], branch.states])
 
     def step_of(self, z: Array, reduced: Reduced) -> Array:
         """Return the step dz (np,) of the linearized problem, limited to the bounds and to LARGEST."""

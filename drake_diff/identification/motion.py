@@ -23,7 +23,7 @@ from drake_diff.derivatives.contact.laws import QUANTITIES
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
 from drake_diff.exceptions import GradientError, InputError
 from drake_diff.identification.recordings import Excerpt
-from drake_diff.identification.tree import ORDER_8, Grip, Method, Tree, TreeDynamics
+from drake_diff.identification.tree import ORDER_8, Branch, Grip, Method, Tree, TreeDynamics, branches_of, whole
 from drake_diff.identification.unknowns import (
     BIAS,
     COULOMB,
@@ -179,6 +179,17 @@ def _jump(dynamics: TreeDynamics, phase: SlidingPhase) -> Array:
     return jump
 
 
+@dataclass(frozen=True, eq=False)
+class Slopes:
+    """The derivatives of steps of some states with respect to themselves and to the unknowns that move them."""
+
+    states: Indices  # (nx,) among all states
+    tangent: Indices  # (2 nv,) among the entries of a tangent vector
+    columns: Indices  # (np,) among all unknowns
+    by_x: Array  # (K, M, nx, nx)
+    by_z: Array  # (K, M, nx, np)
+
+
 LONGEST = 0.02  # [s] longest step in continuous time
 CHUNK = 256  # number of steps that are differentiated in one call
 FINITE_DIFFERENCE, DIFFERENCE = "finite_difference", 1e-5  # relative difference of a parameter
@@ -249,17 +260,28 @@ class TreeMotion:
     def _step(self, dynamics: TreeDynamics, x: Array, h: Array, u: Array) -> Array:
         return step_with_friction(dynamics, x, h, u)[0] if self.dry else dynamics.step(x, h, u)
 
-    def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
-        """Return the derivatives of each step with respect to the state (K, M, nx, nx) and to z (K, M, nx, np)."""
-        dynamics, by, nx = self.dynamics(self.unknowns.values(z)), self.by(z), xs.shape[2]
-        x, h, u = xs[:, :-1].reshape(-1, nx), hs.reshape(-1), us.reshape(hs.size, -1)
-        total = np.zeros((hs.size, nx, nx + by.shape[1]))
+    @cached_property
+    def branches(self) -> tuple[Branch, ...]:
+        """The independent branches of the tree."""
+        return branches_of(self.tree)
+
+    def slopes(self, z: Array, xs: Array, hs: Array, us: Array, *, together: bool = False) -> list["Slopes"]:
+        """Return the derivatives of each step of each independent branch, or of the whole tree."""
+        dynamics, by = self.dynamics(self.unknowns.values(z)), self.by(z)
+        return [self._slopes(b, dynamics, by, xs, hs, us) for b in ((whole(self.tree),) if together else self.branches)]
+
+    def _slopes(self, branch: Branch, dynamics: TreeDynamics, by: Array, xs: Array, hs: Array, us: Array) -> "Slopes":
+        by, dynamics, nx = by[branch.flat], branch.restrict(dynamics), len(branch.states)
+        columns = np.flatnonzero(np.any(by != 0, axis=0))
+        x = xs[:, :-1, branch.states].reshape(-1, nx)
+        h, u = hs.reshape(-1), us[..., branch.inputs].reshape(hs.size, -1)
+        total = np.zeros((hs.size, nx, nx + len(columns)))
         total[:, :, :nx] = np.eye(nx)
         steps = np.flatnonzero(h > 0)
         for rows in np.split(steps, range(CHUNK, len(steps), CHUNK)):
-            total[rows] = self._jacobians(dynamics, x[rows], h[rows], u[rows], by)
+            total[rows] = self._jacobians(dynamics, x[rows], h[rows], u[rows], by[:, columns])
         total = total.reshape(*hs.shape, nx, -1)
-        return total[..., :nx], total[..., nx:]
+        return Slopes(branch.states, branch.tangent, columns, total[..., :nx], total[..., nx:])
 
     def _jacobians(self, dynamics: TreeDynamics, x: Array, h: Array, u: Array, by: Array) -> Array:
         return friction_jacobians(dynamics, x, h, u, by) if self.dry else dynamics.step_jacobians(x, h, u, by)
@@ -310,8 +332,8 @@ class EulerMotion(TreeMotion):
 
     def _jacobians(self, dynamics: TreeDynamics, x: Array, h: Array, u: Array, by: Array) -> Array:
         a, by_state = dynamics.acceleration_jacobians(x, u, by)
-        x_next = euler_step(self.tree.coordinates, self.longest, x, a)
-        return euler_jacobian(self.tree.coordinates, self.longest, x, x_next, by_state)
+        coordinates = dynamics.tree.coordinates
+        return euler_jacobian(coordinates, self.longest, x, euler_step(coordinates, self.longest, x, a), by_state)
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,8 +369,8 @@ class DiscreteMotion:
                 xs[k, count + 1 :] = xs[k, count]
         return xs
 
-    def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
-        """Return the derivatives of each step with respect to the state (K, M, nx, nx) and to z (K, M, nx, np)."""
+    def slopes(self, z: Array, xs: Array, hs: Array, us: Array, *, together: bool = True) -> list[Slopes]:
+        """Return the derivatives of each step; the states are always `together`, as contact may couple them."""
         vector, by_z = self.vector.at(self.unknowns.values(z)[self.own]), self.unknowns.by_z(z)[self.own]
         K, M, nx = *hs.shape, xs.shape[2]
         by_x, by = np.tile(np.eye(nx), (K, M, 1, 1)), np.zeros((K, M, nx, len(z)))
@@ -368,7 +390,8 @@ class DiscreteMotion:
                 by_values[..., s] = _differences(vector, p, s, starts, inputs)
         by_x[taken] = np.array([step.A for step in steps])
         by[taken] = by_values @ by_z
-        return by_x, by
+        tangent = np.arange(2 * self.model.nv)
+        return [Slopes(np.arange(nx), tangent, np.arange(len(z)), by_x, by)]
 
     def _derivatives(self, model: Model, vector: ParameterVector, xs: Array, us: Array) -> Sequence[StepDerivatives]:
         """Differentiate the steps from xs (N, nx) under us (N, nu), also with respect to the vector's parameters."""

@@ -34,6 +34,7 @@ REST = 1e-9  # [rad/s, m/s] below which a joint is at rest
 SHIFT = 0.437  # size of a central difference of numbers, which is exact for quadratic polynomials
 OF_JOINTS = ("reflected", "damping", "stiffness", "rest", "coulomb")
 OF_SERVOS = ("kp", "kd", "strength", "limit")
+PER_LINK = ("kind", "axis", "frame", "back", "mass", "center", "inertia", "size")
 Mask = NDArray[np.bool_]
 Method = tuple[Array, Array]  # of Runge-Kutta type: stages (m, m) and weights (m,)
 ORDER_8: Method = (np.array(DOP853.A[: len(DOP853.B), : len(DOP853.B)]), np.array(DOP853.B))
@@ -366,6 +367,72 @@ class TreeDynamics:
         tree, still = self.tree, np.zeros((len(x), self.tree.n))
         mass = self.inverse_dynamics(tree.joint_positions(x[:, : x.shape[1] - self.nv]), still, still)[1]
         return np.asarray(tree.spread.T @ (mass + np.diag(self.numbers.reflected)) @ tree.spread)
+
+
+@dataclass(frozen=True, eq=False)
+class Branch:
+    """A part of a tree that moves independently of the others, as a leg on a fixed base."""
+
+    tree: Tree
+    states: Indices  # (nx,) its entries in a state of the whole tree
+    tangent: Indices  # (2 nv,) its entries in a tangent vector
+    inputs: Indices  # (nu,)
+    numbers: Mapping[str, Indices]  # the places of its numbers in `flat` of the whole tree
+
+    @property
+    def flat(self) -> Indices:
+        """The places (count,) of all its numbers."""
+        return np.concatenate([np.ravel(places) for places in self.numbers.values()])
+
+    def restrict(self, dynamics: TreeDynamics) -> TreeDynamics:
+        """Return the dynamics of this part of a whole tree."""
+        flat, v = dynamics.numbers.flat, self.tangent[: len(self.tangent) // 2]
+        numbers = Numbers(**{name: flat[places] for name, places in self.numbers.items()})
+        dry = tuple(int(i) for i in np.flatnonzero(np.isin(v, dynamics.dry)))
+        return replace(dynamics, tree=self.tree, numbers=numbers, dry=dry)
+
+
+def whole(tree: Tree) -> Branch:
+    """Return the branch that is the whole tree."""
+    nx, nv, names = tree.coordinates.nq + tree.coordinates.nv, tree.coordinates.nv, vars(tree.numbers)
+    places = {name: tree.numbers.places(name) for name in names}
+    return Branch(tree, np.arange(nx), np.arange(2 * nv), np.arange(tree.actuation.shape[1]), places)
+
+
+def branches_of(tree: Tree) -> tuple[Branch, ...]:
+    """Return the independent branches of a tree; one if it has free bodies or mimic joints, which may couple them."""
+    if tree.coupling is not None or tree.coordinates.free or not tree.links:
+        return (whole(tree),)
+    roots = list(range(len(tree.links)))
+    for i, link in enumerate(tree.links):
+        roots[i] = i if link.parent < 0 else roots[link.parent]
+    branches, t, nq = [], tree.compiled.tables, tree.coordinates.nq
+    for root in np.unique(roots):
+        links = np.flatnonzero(np.array(roots) == root)
+        count, v = np.arange(len(links)), t.first[links]
+        inputs = np.flatnonzero(np.any(tree.actuation[v] != 0, axis=0))
+        parent = np.where(t.parent[links] < 0, -1, np.searchsorted(links, t.parent[links]))
+        tables = t._replace(
+            **{name: _array(getattr(t, name)[links]) for name in PER_LINK},
+            **dict.fromkeys(("link_parent", "parent"), parent),
+            **dict.fromkeys(("joint", "q_start", "v_start", "first"), count),
+        )
+        rows = {"inertial": links, "offset": links, "gravity": np.arange(3)}
+        rows |= dict.fromkeys(OF_JOINTS, v) | dict.fromkeys(OF_SERVOS, inputs)
+        numbers = {name: tree.numbers.places(name)[rows[name]] for name in vars(tree.numbers)}
+        some = replace(
+            tree,
+            links=tuple(tree.links[i] for i in links),
+            compiled=CompiledTree(tables, {tree.links[i].joint.body: k for k, i in enumerate(links)}, len(links)),
+            coordinates=Coordinates((), tuple((k, k) for k in range(len(links)))),
+            positions=count,
+            damping=tree.damping[v],
+            actuation=tree.actuation[np.ix_(v, inputs)],
+            servo=np.where(tree.servo[v] < 0, -1, np.searchsorted(inputs, tree.servo[v])),
+        )
+        states, tangent = np.concatenate([tree.positions[v], nq + v]), np.concatenate([v, nq + v])
+        branches.append(Branch(some, states, tangent, inputs, numbers))
+    return tuple(branches)
 
 
 def _array(values: Any) -> Any:
