@@ -11,7 +11,8 @@ A QR factorization of each piece eliminates its d_first. The second term matters
 it is one standard deviation if a quantity differs from the file's by three times its own size.
 """
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -34,6 +35,10 @@ GROWTH = 1e6  # growth of a perturbation beyond which a piece's end does not det
 LARGEST = 1.0  # the largest change of an unknown in one step, in widths / FAR
 SETTLED = 1e-5  # predicted decrease of |r|^2, in units of the noise, below which the fit has converged
 PROMISED = 1e-2  # the same where derivatives predict too much, as at kinks: a tenth of a standard deviation
+FAR_ABOVE = (
+    9.0  # mean square of residuals, in units of the noise, above which PROMISED counts in units of the residuals
+)
+SMOOTHED, ROUGH = 0.1, 1.0  # the same with servos and smooth friction; with approximate derivatives
 CLOSED = 1e-3  # largest gaps of a converged fit, in units of the noise
 HALVINGS = 8
 FARTHER = 3.0  # growth of the trust region after an accepted full step, for motions with kinks
@@ -58,7 +63,9 @@ class Segments:
     by_delay: Array  # (K, M) derivatives of the step lengths with respect to a delay of inputs
 
 
-def steps_between(law: Law, piece: Excerpt, k: int, delay: float | None) -> tuple[Array, Array, Array]:
+def steps_between(
+    law: Law, piece: Excerpt, k: int, delay: float | None, switches: tuple[Array, Array]
+) -> tuple[Array, Array, Array]:
     """Return step lengths (m,) [s] and inputs (m, nu) from sample k to the next, and d length / d delay (m,).
 
     With a delay, steps also end where an input changes. The first input also acts before its time. An input that
@@ -68,9 +75,9 @@ def steps_between(law: Law, piece: Excerpt, k: int, delay: float | None) -> tupl
     if delay is None:
         lengths = np.array(law.cut(b - a))
         return lengths, np.repeat(piece.us[k : k + 1], len(lengths), axis=0), np.zeros(len(lengths))
-    begin, inputs = piece.switches
+    begin, inputs = switches
     late = begin + delay
-    inner = np.flatnonzero((late >= a) & (late < b))
+    inner = np.arange(*np.searchsorted(late, [a, b]))
     ends = np.concatenate([[a], late[inner], [b]])
     before = max(int(inner[0]) - 1 if len(inner) else int(np.searchsorted(late, a, side="right")) - 1, 0)
     held = [before, *inner]
@@ -90,7 +97,7 @@ def cut_segments(law: Law, pieces: Sequence[Excerpt], nu: int, delay: float | No
     """Cut pieces into segments; a boundary sample belongs to the later segment, the last sample to the last one."""
     of_piece, first, hs, us, samples, offsets, by_delay = [], [], [], [], [], [], []
     for p, piece in enumerate(pieces):
-        n = len(piece.times)
+        n, switches = len(piece.times), piece.switches
         bounds = [0]
         while bounds[-1] < n - 1:
             k = bounds[-1]
@@ -99,7 +106,8 @@ def cut_segments(law: Law, pieces: Sequence[Excerpt], nu: int, delay: float | No
         if len(bounds) > 2 and bounds[-1] - bounds[-2] < SEGMENT_SAMPLES:
             bounds.pop(-2)
         for a, b in pairwise(bounds):
-            lengths, inputs, changes = zip(*(steps_between(law, piece, k, delay) for k in range(a, b)), strict=True)
+            parts = (steps_between(law, piece, k, delay, switches) for k in range(a, b))
+            lengths, inputs, changes = zip(*parts, strict=True)
             of_piece.append(p)
             first.append(a)
             hs.append(np.concatenate(lengths))
@@ -139,6 +147,25 @@ class Reduced:
         return bool(np.all(np.abs(np.column_stack([self.R, self.b])) < TOO_LARGE))
 
 
+@dataclass(frozen=True)
+class Watch:
+    """The time after which a fit ends, and where its progress is reported."""
+
+    end: float = np.inf  # [s] of `time.monotonic`
+    limit: float = np.inf  # [s]
+    report: Callable[[str], None] | None = None
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the time has ended."""
+        return time.monotonic() > self.end
+
+    def say(self, line: str) -> None:
+        """Report a line of progress."""
+        if self.report is not None:
+            self.report(line)
+
+
 class _Parts(NamedTuple):
     """What the elimination of first states fills, branch by branch."""
 
@@ -161,17 +188,26 @@ class Fit:
         *,
         sensors: Sensors | None = None,
         fixed: bool = False,
+        watch: Watch = Watch(),  # noqa: B008
     ):
         self.sensors = Sensors(None, (), ()) if sensors is None else sensors
+        self.watch = watch
         self.fixed = fixed  # whether the unknowns are fixed, and only first states are estimated
         self.model, self.law, self.unknowns, self.noise = model, law, unknowns, noise
         self.space = tangent_space(model)
-        self.segments = cut_segments(law, pieces, model.nu, None if unknowns.delay is None else 0.0)
+        delay = None if unknowns.delay is None else 0.0
+        self.segments = cut_segments(law, pieces, model.nu, delay)
+        self._cut = delay, self.segments  # the latest cut, and its delay
         self.gap_scale = np.empty(self.space.size)
         nv, period = model.nv, max(float(np.median(np.diff(pieces[0].times))), 1e-3)
         from_positions = np.where(np.isfinite(noise[:nv]), noise[:nv], 1.0) / (5 * period)
         self.gap_scale[:nv] = np.where(np.isfinite(noise[:nv]), noise[:nv], 1.0)
         self.gap_scale[nv:] = np.where(np.isfinite(noise[nv : 2 * nv]), noise[nv : 2 * nv], from_positions)
+
+    @property
+    def has_servos(self) -> bool:
+        """Whether any input is a commanded position."""
+        return isinstance(self.law, TreeMotion) and self.law.has_servos
 
     @property
     def count(self) -> int:
@@ -185,9 +221,10 @@ class Fit:
 
     def cut(self, values: Array) -> Segments:
         """Return the segments for these values; a delay of inputs changes their steps."""
-        if self.unknowns.delay is None:
-            return self.segments
-        return cut_segments(self.law, self.segments.pieces, self.model.nu, float(values[self.unknowns.delay]))
+        delay = None if self.unknowns.delay is None else float(values[self.unknowns.delay])
+        if delay != self._cut[0]:
+            self._cut = delay, cut_segments(self.law, self.segments.pieces, self.model.nu, delay)
+        return self._cut[1]
 
     def _measured(self, p: int) -> Array:
         piece = self.segments.pieces[p]
@@ -391,7 +428,7 @@ class Fit:
     def by(self, law: Law) -> "Fit":
         """Return the same fit with another law, whose segments have the same length."""
         arguments = self.model, law, self.unknowns, self.segments.pieces, self.noise
-        return Fit(*arguments, sensors=self.sensors, fixed=self.fixed)
+        return Fit(*arguments, sensors=self.sensors, fixed=self.fixed, watch=self.watch)
 
     def solve(self, z: Array, starts: Array, most: int) -> "Solved":
         """Solve from z and the segment starts in at most `most` steps. Raises SimulationError if no motion exists."""
@@ -405,10 +442,15 @@ class Fit:
             dz, promised = self._promised(here, reduced)
             now = reduced.now + self._pull(here.z)
             settled = PROMISED if self.law.kinks else SETTLED * (1 + SETTLED * now)
+            if isinstance(self.law, TreeMotion) and self.law.has_servos:
+                settled = ROUGH if self.law.frozen else SMOOTHED
+            if now > FAR_ABOVE * self.count:
+                settled = max(settled, PROMISED * now / self.count)
             if promised <= settled and here.gap <= CLOSED:
                 return Solved(here.z, here.starts, reduced, True, steps, "")
-            if steps == most:
+            if steps == most or self.watch.is_late:
                 break
+            self.watch.say(f"step {steps + 1}: residuals of {np.sqrt(now / self.count):.4g} times the noise")
             less = here.value - now + promised
             if here.gap > 0:
                 merit = max(merit, 2 * max(-less, 0.0) / here.gap + 1.0)
@@ -421,7 +463,8 @@ class Fit:
                 return Solved(here.z, here.starts, reduced, ended, steps, "" if ended else STUCK)
             reach = reach * FARTHER if fraction == 1.0 else max(reach / FARTHER, 1.0)
             here = ahead
-        return Solved(here.z, here.starts, reduced, False, most, f"it reached the limit of {most} steps")
+        limit = f"{most} steps" if steps == most else f"{self.watch.limit:g} s"
+        return Solved(here.z, here.starts, reduced, False, steps, f"it reached the limit of {limit}")
 
     def _promised(self, here: "FittedMotion", reduced: Reduced) -> tuple[Array, float]:
         """Return the step dz (np,), and its predicted decrease of |r|^2."""

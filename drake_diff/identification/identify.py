@@ -1,23 +1,26 @@
 """Estimation of a model's parameters, with intervals, from recordings of its motion."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+import time
+from itertools import pairwise
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
-from drake_diff._base.arrays import Array, frozen, positive_int
+from drake_diff._base.arrays import Array, frozen, positive_float, positive_int
 from drake_diff._base.values import Refusal
 from drake_diff.certificates.truth import overlaps_along
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.identification.fit import Fit, Solved, growth_cuts
+from drake_diff.identification.fit import Fit, Solved, Watch, growth_cuts
 from drake_diff.identification.impacts import fit_through_impacts
 from drake_diff.identification.judge import (
     COLOURED,
     FALSE_ALARM,
+    UNSEEN,
     Known,
     colour_of,
     covariance_of,
@@ -29,7 +32,7 @@ from drake_diff.identification.judge import (
     score_of,
 )
 from drake_diff.identification.messages import unidentifiable
-from drake_diff.identification.motion import Law, TreeMotion, discrete_motion
+from drake_diff.identification.motion import DiscreteMotion, Law, TreeMotion, discrete_motion, servo_motion
 from drake_diff.identification.recordings import (
     Excerpt,
     columns_of,
@@ -41,8 +44,8 @@ from drake_diff.identification.recordings import (
 )
 from drake_diff.identification.results import Followed, Identification, Request, identification
 from drake_diff.identification.sensors import Sensors, choose_sensors
-from drake_diff.identification.tree import tree_for_identification
-from drake_diff.identification.unknowns import Unknowns, choose_unknowns
+from drake_diff.identification.tree import Tree, tree_for_identification
+from drake_diff.identification.unknowns import FAR, Unknowns, choose_unknowns, physical_ranges
 from drake_diff.model.model import Model
 from drake_diff.model.tangent import tangent_space
 
@@ -50,9 +53,11 @@ MOTIONS = ("auto", "continuous", "steps", "impacts")
 TOUCH = "bodies touch"
 SHORTEST = 1e-4  # [s] least length of a Runge-Kutta step
 STEP_ERROR = 1e-3  # in units of the noise: largest change over a segment by steps of half the length
+WINDOW = 0.5  # [s] length of a piece of a motion with servos
+SERVO_ERROR = 1e-2  # the same with servos, whose errors decay within a window
 ROUNDS = 5  # maximum number of rounds of noise estimation
 DELAYS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0)  # in sample periods: initial guesses of a delay
-SAME_NOISE = 0.01
+SAME_NOISE, SAME_WITH_SERVOS = 0.01, 0.03  # relative
 
 
 def identify(
@@ -67,6 +72,8 @@ def identify(
     priors: Mapping[str, tuple[Any, Any]] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     sensors: Mapping[str, tuple[str, Sequence[float]]] | None = None,
+    time_limit: float | None = None,
+    callback: Callable[[str], None] | None = None,
 ) -> Identification:
     """Estimate parameters of a model from recordings of its motion, with intervals.
 
@@ -93,6 +100,8 @@ def identify(
         bounds: Lower and upper bound of parameters, by name.
         sensors: The mounts of recorded sensors that are not at the frame of a body: by label, the body and x, y, z
             [m], or x, y, z [m], roll, pitch, yaw [rad], in the body's frame.
+        time_limit: Time after which the fit ends, in seconds; the held-out samples are predicted afterwards.
+        callback: Called with a line of progress before each step of the fit.
 
     Returns:
         `.values`, `.intervals` (95 %), `.unidentifiable`, `.explained` with its `.reason`, and a `.sentence`.
@@ -114,6 +123,8 @@ def identify(
         0.2
     """
     positive_int("max_iterations", max_iterations)
+    limit = np.inf if time_limit is None else positive_float("time_limit [s]", time_limit)
+    watch = Watch(time.monotonic() + limit, limit, callback)
     if motion not in MOTIONS:
         raise UnknownNameError("motion", got=motion, known=MOTIONS)
     given, files = read_given(model, recordings)
@@ -128,17 +139,22 @@ def identify(
     if columns and own_tree is None:
         raise ModelError(f"{model.name}: sensors need motion in continuous time, but {why or 'steps are fitted'}")
     outputs = choose_sensors(model, own_tree, columns, sensors)
-    unknowns = choose_unknowns(model, own_tree, parameters, priors, bounds, columns)
+    ranges = None if own_tree is None else physical_ranges(model, own_tree, _largest(own_tree, pieces))
+    unknowns = choose_unknowns(model, own_tree, parameters, priors, bounds, columns, ranges)
     stated = given_noise(model, noise, columns)
     scatter = noise_by_differences(model, pieces)
-    problem = Problem(model, unknowns, pieces, stated, scatter, outputs)
+    problem = Problem(model, unknowns, pieces, stated, scatter, outputs, watch=watch)
     if motion == "impacts":
         if priors or bounds:
             raise InputError("priors and bounds", got="given", expected='no priors and no bounds with motion="impacts"')
         result = fit_through_impacts(model, pieces, parameters, problem.first_noise)
     else:
         law: Law = (
-            discrete_motion(model, unknowns, pieces) if own_tree is None else TreeMotion(model, own_tree, unknowns)
+            discrete_motion(model, unknowns, pieces)
+            if own_tree is None
+            else servo_motion(model, own_tree, unknowns)
+            if np.any(own_tree.commanded)
+            else TreeMotion(model, own_tree, unknowns)
         )
         fit, solved = problem.solve(law, max_iterations)
         result = problem.judged(fit, solved, why if motion == "auto" else "")
@@ -157,6 +173,21 @@ def identify(
         dict(sensors or {}),
     )
     return replace(result, asked=asked)
+
+
+def _largest(tree: Tree, pieces: Sequence[Excerpt]) -> Array:
+    """Return the largest input (nu,) in the recordings; for a servo, the largest distance from the commanded position.
+
+    Positions that were not measured do not count.
+    """
+    joints = np.flatnonzero(tree.servo >= 0)
+    largest = [np.zeros(tree.actuation.shape[1])]
+    for piece in pieces:
+        far = np.abs(piece.us)
+        q = tree.joint_positions(piece.ys[:-1, : tree.coordinates.nq])[:, tree.positions[joints]]
+        far[:, tree.servo[joints]] = np.nan_to_num(np.abs(piece.us[:, tree.servo[joints]] - q))
+        largest.append(np.max(far, axis=0))
+    return np.max(largest, axis=0)
 
 
 def what_acts(model: Model, pieces: Sequence[Excerpt]) -> str:
@@ -184,6 +215,7 @@ class Problem:
     scatter: Array  # (2 nv + m,) the noise estimated from neighbouring samples
     sensors: Sensors | None = None
     jumps: bool = False  # whether the motion has jumps, as at impacts
+    watch: Watch = field(default_factory=Watch)
 
     @property
     def entries(self) -> tuple[str, ...]:
@@ -191,7 +223,8 @@ class Problem:
         return (*tangent_space(self.model).names, *(() if self.sensors is None else self.sensors.columns))
 
     def fit(self, law: Law, pieces: Sequence[Excerpt], noise: Array, *, fixed: bool = False) -> Fit:
-        return Fit(self.model, law, self.unknowns, pieces, noise, sensors=self.sensors, fixed=fixed)
+        watch = Watch() if fixed else self.watch
+        return Fit(self.model, law, self.unknowns, pieces, noise, sensors=self.sensors, fixed=fixed, watch=watch)
 
     def guess(self, fit: Fit) -> Array:
         s = fit.segments
@@ -209,23 +242,62 @@ class Problem:
     def prepared(self, law: Law) -> tuple[Fit, Array]:
         """Return a fit with short enough integration steps and pieces, and a guess of the starts of its segments."""
         z, noise = self.unknowns.z_first, self.first_noise
-        fit = self.fit(law, self.fitted, noise)
+        fit = self.fit(law, self.windows(law, self.fitted), noise)
         starts = self.guess(fit)
+        if isinstance(law, TreeMotion) and law.has_servos and (point := fit.at(z, starts)) is not None:
+            size = np.sqrt(np.nanmean(np.concatenate(point.residuals) ** 2, axis=0))
+            noise = np.where(np.isfinite(self.stated), noise, noise * np.fmax(size, 1.0))
+            fit = self.fit(law, fit.segments.pieces, noise)
         while not self.follows(fit, z, starts):
             fit = self.shortened(fit, fit.segments.pieces, noise)
         fit = self.fit(fit.law, growth_cuts(fit, z, starts), noise)
         return fit, self.guess(fit)
 
+    def windows(self, law: Law, pieces: Sequence[Excerpt]) -> list[Excerpt]:
+        """Cut pieces of a servo's motion into windows, each with its own first state, as errors of the model add up."""
+        if not (isinstance(law, TreeMotion) and law.has_servos):
+            return list(pieces)
+        cut = []
+        for piece in pieces:
+            count = max(1, round((piece.times[-1] - piece.times[0]) / WINDOW))
+            ends = np.searchsorted(piece.times, np.linspace(piece.times[0], piece.times[-1], count + 1) - 1e-9)
+            cut += [piece.part(int(a), int(b)) for a, b in pairwise(ends)]
+        return cut
+
     def solve(self, law: Law, most: int) -> tuple[Fit, Solved]:
         """Fit with steps so short that halving them does not change the motion, at the first and the last values."""
         fit, starts = self.prepared(law)
         z, pieces = self.first(fit, starts), fit.segments.pieces
+        fit = self.pinned(fit, z, starts)
+        if isinstance(fit.law, TreeMotion) and fit.law.has_servos:
+            fit, solved = self.weighted(fit, z, starts, most)
+            law = replace(fit.law, frozen=False)
+            z, starts, fit = solved.z, solved.starts, self.fit(law, pieces, fit.noise)
         while True:
             fit, solved = self.weighted(fit, z, starts, most)
-            if self.follows(fit, solved.z, solved.starts):
+            if self.watch.is_late or self.follows(fit, solved.z, solved.starts):
                 return fit, solved
             z, starts = solved.z, solved.starts
             fit = self.shortened(fit, pieces, fit.noise)
+
+    def pinned(self, fit: Fit, z: Array, starts: Array) -> Fit:
+        """Return the fit in which quantities that the recordings do not determine keep the model's values.
+
+        They are those whose deviation would exceed their own size if they were estimated alone.
+        """
+        point = fit.at(z, starts)
+        if point is None or isinstance(fit.law, DiscreteMotion):
+            return fit
+        finer = np.nanmax(fit.noise / self.first_noise)  # the residuals may fall to the noise of the samples
+        known = finer * np.linalg.norm(fit.reduce(point).R, axis=0) * self.unknowns.widths / FAR
+        blind = [bool(np.all(known[s] * UNSEEN < 1)) and unknown.prior is None for unknown, s in self.unknowns.items()]
+        if not any(blind):
+            return fit
+        each = [replace(u, pinned=is_blind) for u, is_blind in zip(self.unknowns.each, blind, strict=True)]
+        names = [u.name for u in each if u.pinned]
+        self.watch.say(f"the recordings do not determine {', '.join(names)}; they keep the model's values")
+        self.unknowns = replace(self.unknowns, each=tuple(each))
+        return self.fit(replace(fit.law, unknowns=self.unknowns), fit.segments.pieces, fit.noise)
 
     def first(self, fit: Fit, starts: Array) -> Array:
         """Return the initial guess: the model's values, and the delay with the best prediction for the rest.
@@ -262,7 +334,7 @@ class Problem:
             ends.append(xs[np.arange(len(xs)), segments.counts])
         with np.errstate(over="ignore", invalid="ignore"):
             gap = fit.space.minus(*ends) / fit.gap_scale
-        return bool(np.all(np.isfinite(gap)) and np.max(np.abs(gap)) <= STEP_ERROR)
+        return bool(np.all(np.isfinite(gap)) and np.max(np.abs(gap)) <= (SERVO_ERROR if fit.has_servos else STEP_ERROR))
 
     def shortened(self, fit: Fit, pieces: Sequence[Excerpt], noise: Array) -> Fit:
         law = fit.shorter
@@ -278,11 +350,11 @@ class Problem:
         for _ in range(ROUNDS):
             solved = fit.solve(z, starts, most)
             z, starts = solved.z, solved.starts
-            if not self.follows(fit, z, starts):
+            if self.watch.is_late or not self.follows(fit, z, starts):
                 return fit, solved
             noise = np.where(np.isfinite(self.stated), self.stated, np.fmax(noise_of(fit, solved), 1e-3 * self.scatter))
             seen = np.isfinite(noise)
-            if np.max(np.abs(noise[seen] / fit.noise[seen] - 1)) < SAME_NOISE:
+            if np.max(np.abs(noise[seen] / fit.noise[seen] - 1)) < (SAME_WITH_SERVOS if fit.has_servos else SAME_NOISE):
                 return fit, solved
             fit = self.fit(fit.law, fit.segments.pieces, noise)
         return fit, fit.solve(z, starts, most)
@@ -317,7 +389,7 @@ class Problem:
         self, fit: Fit, solved: Solved, known: Known, freedom: float
     ) -> tuple[float, float, str, list[Followed]]:
         """Return (error with the model's values, with the estimates, why it is too large or "", the motions)."""
-        held = [piece for piece in self.pieces if piece.held_out]
+        held = self.windows(fit.law, [piece for piece in self.pieces if piece.held_out])
         pieces = held or list(fit.segments.pieces)
         states_fit = self.fit(fit.law, pieces, fit.noise, fixed=True)
         errors, moved = [], []

@@ -23,7 +23,18 @@ from drake_diff.derivatives.contact.laws import QUANTITIES
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
 from drake_diff.exceptions import GradientError, InputError
 from drake_diff.identification.recordings import Excerpt
-from drake_diff.identification.tree import ORDER_8, Branch, Grip, Method, Tree, TreeDynamics, branches_of, whole
+from drake_diff.identification.tree import (
+    ORDER_4,
+    ORDER_8,
+    SLIP_SPEED,
+    Branch,
+    Grip,
+    Method,
+    Tree,
+    TreeDynamics,
+    branches_of,
+    whole,
+)
 from drake_diff.identification.unknowns import (
     BIAS,
     COULOMB,
@@ -191,6 +202,8 @@ class Slopes:
 
 
 LONGEST = 0.02  # [s] longest step in continuous time
+SERVO_SLIP = 0.05  # [rad/s or m/s] of joints with servos; a sharper change needs steps below 1 ms
+SHORT_STEP = 0.005  # [s] the same with servos
 CHUNK = 256  # number of steps that are differentiated in one call
 FINITE_DIFFERENCE, DIFFERENCE = "finite_difference", 1e-5  # relative difference of a parameter
 
@@ -210,6 +223,7 @@ class TreeMotion:
     method: Method = ORDER_8
     frozen: bool = False  # whether derivatives use the equations linearized at the midpoint of a step
     smooth: bool = False
+    slip: float = SLIP_SPEED  # [rad/s or m/s] over which smooth friction changes its sign
 
     @cached_property
     def dry(self) -> tuple[int, ...]:
@@ -220,6 +234,11 @@ class TreeMotion:
         return tuple(sorted(joints if coupling is None else {int(coupling.of_v[i]) for i in joints}))
 
     @property
+    def has_servos(self) -> bool:
+        """Whether any input is a commanded position."""
+        return bool(np.any(self.tree.commanded))
+
+    @property
     def kinks(self) -> bool:
         """Whether any joint can stick."""
         return bool(self.dry)
@@ -227,7 +246,8 @@ class TreeMotion:
     @property
     def words(self) -> str:
         friction = ", with Coulomb friction that sticks" if self.dry else ""
-        return f"continuous time, by steps of order 8 of at most {1e3 * self.longest:.3g} ms{friction}"
+        order = 8 if self.method is ORDER_8 else 4
+        return f"continuous time, by steps of order {order} of at most {1e3 * self.longest:.3g} ms{friction}"
 
     def cut(self, period: float) -> tuple[float, ...]:
         """Return the lengths of the steps [s] over a time between samples [s]."""
@@ -245,20 +265,23 @@ class TreeMotion:
     def dynamics(self, values: Array) -> TreeDynamics:
         """Return the dynamics of the tree for these values of the unknowns."""
         numbers = set_numbers(self.model, self.tree, self.unknowns, values)
-        return TreeDynamics(self.tree, numbers, self.dry, self.method, self.frozen)
+        return TreeDynamics(self.tree, numbers, self.dry, self.method, self.frozen, self.slip)
 
     def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
         """Return the states (K, M+1, nx) from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
-        dynamics = self.dynamics(values)
-        xs = np.empty((len(starts), hs.shape[1] + 1, starts.shape[1]))
-        xs[:, 0] = starts
-        for m in range(hs.shape[1]):
-            xs[:, m + 1], some = xs[:, m], hs[:, m] > 0
-            xs[some, m + 1] = self._step(dynamics, xs[some, m], hs[some, m], us[some, m])
+        dynamics, (K, M) = self.dynamics(values), hs.shape
+        xs = np.empty((K, M + 1, starts.shape[1]))
+        for branch in self.branches:
+            alone, x = branch.restrict(dynamics), starts[:, branch.states]
+            xs[:, 0, branch.states] = x
+            for m in range(M):
+                some = hs[:, m] > 0
+                x[some] = self._step(alone, x[some], hs[some, m], us[some, m][:, branch.inputs])
+                xs[:, m + 1, branch.states] = x
         return xs
 
     def _step(self, dynamics: TreeDynamics, x: Array, h: Array, u: Array) -> Array:
-        return step_with_friction(dynamics, x, h, u)[0] if self.dry else dynamics.step(x, h, u)
+        return step_with_friction(dynamics, x, h, u)[0] if dynamics.dry else dynamics.step(x, h, u)
 
     @cached_property
     def branches(self) -> tuple[Branch, ...]:
@@ -284,7 +307,7 @@ class TreeMotion:
         return Slopes(branch.states, branch.tangent, columns, total[..., :nx], total[..., nx:])
 
     def _jacobians(self, dynamics: TreeDynamics, x: Array, h: Array, u: Array, by: Array) -> Array:
-        return friction_jacobians(dynamics, x, h, u, by) if self.dry else dynamics.step_jacobians(x, h, u, by)
+        return friction_jacobians(dynamics, x, h, u, by) if dynamics.dry else dynamics.step_jacobians(x, h, u, by)
 
     def by(self, z: Array) -> Array:
         """Return the derivatives (count, np) of the tree's numbers with respect to z."""
@@ -295,6 +318,15 @@ class TreeMotion:
         q, v = x[:, : self.model.nq], x[:, self.model.nq :]
         speed = (self.tree.coordinates.rate(q) @ v[..., None])[..., 0]
         return np.concatenate([speed, self.dynamics(values).accelerate(x, u)], axis=1)
+
+
+def servo_motion(model: Model, tree: Tree, unknowns: Unknowns) -> TreeMotion:
+    """Return the law for robots with servos: short steps, as servos are stiff, and friction that changes smoothly.
+
+    Its derivatives are approximate; `frozen=False` makes them exact.
+    """
+    options = {"segment": np.inf, "method": ORDER_4, "smooth": True, "frozen": True, "slip": SERVO_SLIP}
+    return TreeMotion(model, tree, unknowns, SHORT_STEP, **options)
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,7 +360,7 @@ class EulerMotion(TreeMotion):
         return by
 
     def _step(self, dynamics: TreeDynamics, x: Array, h: Array, u: Array) -> Array:
-        return euler_step(self.tree.coordinates, self.longest, x, dynamics.accelerate(x, u))
+        return euler_step(dynamics.tree.coordinates, self.longest, x, dynamics.accelerate(x, u))
 
     def _jacobians(self, dynamics: TreeDynamics, x: Array, h: Array, u: Array, by: Array) -> Array:
         a, by_state = dynamics.acceleration_jacobians(x, u, by)

@@ -141,6 +141,7 @@ class TreeDynamics:
     dry: tuple[int, ...] = ()
     method: Method = ORDER_8
     frozen: bool = False  # whether derivatives use the equations linearized at the midpoint of a step
+    slip: float = SLIP_SPEED  # [rad/s or m/s] over which smooth friction changes its sign
 
     @property
     def nv(self) -> int:
@@ -170,7 +171,7 @@ class TreeDynamics:
         of_joints, of_servos = ([getattr(self.numbers, n) for n in names] for names in (OF_JOINTS, OF_SERVOS))
         starts = reversed(tree.coordinates.starts)
         arrays = (*follow, tree.spread, *starts, tree.positions, *of_joints, tree.servo, *of_servos)
-        return kernel(KERNEL).TreeSystem(self.links.tables, *map(_array, arrays), 0.0 if self.dry else SLIP_SPEED)
+        return kernel(KERNEL).TreeSystem(self.links.tables, *map(_array, arrays), 0.0 if self.dry else self.slip)
 
     def _push(self, u: Array) -> Array:
         """Return the forces (N, n) of inputs u (N, nu); for servos, the commanded positions."""
@@ -255,8 +256,8 @@ class TreeDynamics:
         jacobians[:, diagonal, diagonal] += numbers.stiffness
         jacobians[:, diagonal, n + diagonal] += numbers.damping
         if not self.dry:
-            slide = np.tanh(v / SLIP_SPEED)
-            jacobians[:, diagonal, n + diagonal] += numbers.coulomb / SLIP_SPEED * (1 - slide**2)
+            slide = np.tanh(v / self.slip)
+            jacobians[:, diagonal, n + diagonal] += numbers.coulomb / self.slip * (1 - slide**2)
         terms = (a @ E.T, v, q[:, tree.positions] - numbers.rest, -numbers.stiffness, slide)
         for name, term in zip(OF_JOINTS, terms, strict=True):
             jacobians[..., 2 * n :] += np.broadcast_to(term, v.shape)[..., None] * by[places(name)]

@@ -9,14 +9,14 @@ They are their own coordinates, with a lower bound of 0.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen, slices_of
 from drake_diff._base.differences import complex_steps
 from drake_diff.exceptions import InputError, UnknownNameError
-from drake_diff.identification.tree import Numbers, Tree, ten_numbers
+from drake_diff.identification.tree import Numbers, Tree, TreeDynamics, ten_numbers
 from drake_diff.mechanics.description import names_of
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import (
@@ -31,6 +31,7 @@ from drake_diff.model.plant import actuators, bodies, joints, labelled, radius_o
 MASS, CENTER, INERTIA = "mass", "center_of_mass", "inertia"
 COULOMB, STRENGTH, BIAS = "coulomb_friction", "strength", "bias"
 DELAY, LIMIT = "input_delay", "limit"  # [s] of all inputs; of one input
+FIXED_OR_FREE = ("weld", "quaternion_floating")
 GAINS = ("kp", "kd")
 OF_JOINTS = {  # quantities with one number per joint, and their names in `tree.Numbers`
     "damping": "damping",
@@ -44,6 +45,13 @@ OF_TREE = (
     "gear_ratio", "rotor_inertia", "gravity", COULOMB, STRENGTH, *GAINS,
 )  # fmt: skip
 OF_ALL = (MASS, CENTER, INERTIA, "damping", "spring_stiffness", "rotor_inertia")
+PINNED = 1e-6  # factor of the width of a pinned quantity
+MOST_ROTOR = 1000.0  # times the inertia that a joint moves: the largest reflected rotor inertia
+LEAST_SPEED = 0.1  # [rad/s, m/s] at which the largest damping takes the largest effort, which is the largest friction
+MOST_GAIN = 10.0  # times the model's gain: the largest one; the smallest is the inverse
+MOST_DELAY = 0.2  # [s]
+USUAL = 0.1  # share of the largest effort that is a usual friction, or damping at 1 rad/s or 1 m/s
+USUAL_DELAY = 0.02  # [s]
 FAR = 3.0  # prior standard deviation of a quantity's change, in units of its own size
 
 
@@ -59,6 +67,7 @@ class Unknown:
     upper: float = np.inf
     prior: tuple[Array, Array] | None = None  # mean (k,) and standard deviation (k,), from the user
     shifts: bool = False  # whether it is a delay of the inputs
+    pinned: bool = False  # whether it keeps the model's value, as the recordings do not determine it
 
     @property
     def label(self) -> str:
@@ -130,9 +139,10 @@ class Unknowns:
 
     @property
     def pulls(self) -> Array:
-        """The widths (np,), but infinite for unknowns with a prior."""
+        """The widths (np,), but infinite for unknowns with a prior, and small for pinned ones."""
         pulls = self.widths
         for unknown, s in self.items():
+            pulls[s] *= PINNED if unknown.pinned else 1.0
             if unknown.prior is not None:
                 pulls[s] = np.inf
         return pulls
@@ -225,6 +235,7 @@ def choose_unknowns(
     priors: Mapping[str, Any] | None = None,
     bounds: Mapping[str, Any] | None = None,
     columns: Sequence[str] = (),
+    physical: Mapping[str, "Physical"] | None = None,
 ) -> Unknowns:
     """Return the unknowns `names`; "all" are all inertial parameters, dampings, spring stiffnesses and rotor inertias.
 
@@ -248,11 +259,13 @@ def choose_unknowns(
         why = _why_not(model, tree, name, value)
         if why is not None:
             raise InputError(name, got=why, expected="a quantity that can be estimated")
-        low, high = _bounds_of(name, (bounds or {}).get(name), lower)
+        usual = (physical or {}).get(name, Physical(lower, np.inf, 0.0))
+        low, high = _bounds_of(name, (bounds or {}).get(name, (usual.lower, usual.upper)), lower)
         start = np.array(value, dtype=float)
         prior = _prior_of(name, priors[name], len(start)) if priors and name in priors else None
         shifts = name.endswith(f".{DELAY}")
-        unknowns.append(Unknown(name, unit, start, low, _size(model, name, value), high, prior, shifts))
+        size = _size(model, name, value) or usual.size
+        unknowns.append(Unknown(name, unit, start, low, size, high, prior, shifts))
     for subject, given in (("prior of", priors), ("bounds of", bounds)):
         for name in given or {}:
             if name not in names:
@@ -262,10 +275,42 @@ def choose_unknowns(
     return Unknowns(tuple(unknowns))
 
 
+class Physical(NamedTuple):
+    """The bounds of a quantity in any machine like the model, and the size of a change by 100 % if the model has 0."""
+
+    lower: float
+    upper: float
+    size: float
+
+
+def physical_ranges(model: Model, tree: Tree, largest: Array) -> dict[str, Physical]:
+    """Return the ranges of joints, servos and delays by name, for the largest inputs or servo errors (nu,)."""
+    motors, numbers = labelled(rotors(model.plant)), tree.numbers
+    kinds = {f"model.{DELAY}": Physical(0.0, MOST_DELAY, USUAL_DELAY)}
+    still = np.zeros((1, tree.n))
+    q = tree.joint_positions(model.default_state[None, : model.nq])
+    inertias = np.diag(TreeDynamics(tree, numbers).inverse_dynamics(q, still, still)[1][0])
+    efforts = np.abs(tree.actuation) @ np.minimum(np.where(tree.commanded, numbers.kp, 1.0) * largest, numbers.limit)
+    names = names_of(model.plant)[1]
+    by_joint = {link.joint: link.v_start for link in tree.bodies.values() if link.kind not in FIXED_OR_FREE}
+    for label, v in by_joint.items():
+        if efforts[v] > 0:
+            kinds[f"{label}.{COULOMB}"] = Physical(0.0, efforts[v], USUAL * efforts[v])
+            kinds[f"{label}.damping"] = Physical(0.0, efforts[v] / LEAST_SPEED, USUAL * efforts[v])
+    for label, motor in motors.items():
+        inertia = inertias[by_joint[names[motor.joint().index()]]] / max(motor.default_gear_ratio() ** 2, 1e-300)
+        kinds[f"{label}.rotor_inertia"] = Physical(0.0, MOST_ROTOR * inertia, 10 * inertia)
+    for i, label in enumerate(model.input_names):
+        for name in GAINS if tree.commanded[i] else ():
+            gain = float(getattr(numbers, name)[i])
+            kinds[f"{label}.{name}"] = Physical(gain / MOST_GAIN, gain * MOST_GAIN or np.inf, gain)
+    return kinds
+
+
 def _bounds_of(name: str, given: Any, lower: float) -> tuple[float, float]:
     """Return the lower and the upper bound: the given ones, limited to possible values."""
-    if given is None:
-        return lower, np.inf
+    if given == (lower, np.inf):
+        return given
     subject = f"bounds of {name}"
     try:
         low, high = (float(value) for value in given)
