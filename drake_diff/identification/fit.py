@@ -11,7 +11,6 @@ A QR factorization of each piece eliminates its d_first. The second term matters
 it is one standard deviation if a quantity differs from the file's by three times its own size.
 """
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -22,8 +21,9 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.clock import now
 from drake_diff.exceptions import ModelError, SimulationError
-from drake_diff.identification.motion import DiscreteMotion, Law, Slopes, TreeMotion
+from drake_diff.identification.motion import SERVOS, DiscreteMotion, Law, Slopes, TreeMotion
 from drake_diff.identification.recordings import LEAST, Excerpt
 from drake_diff.identification.sensors import Sensors
 from drake_diff.identification.unknowns import BIAS, Unknowns
@@ -38,7 +38,6 @@ PROMISED = 1e-2  # the same where derivatives predict too much, as at kinks: a t
 FAR_ABOVE = (
     9.0  # mean square of residuals, in units of the noise, above which PROMISED counts in units of the residuals
 )
-SMOOTHED, ROUGH = 0.1, 1.0  # the same with servos and smooth friction; with approximate derivatives
 CLOSED = 1e-3  # largest gaps of a converged fit, in units of the noise
 HALVINGS = 8
 FARTHER = 3.0  # growth of the trust region after an accepted full step, for motions with kinks
@@ -148,17 +147,17 @@ class Reduced:
 
 
 @dataclass(frozen=True)
-class Watch:
+class Progress:
     """The time after which a fit ends, and where its progress is reported."""
 
-    end: float = np.inf  # [s] of `time.monotonic`
+    end: float = np.inf  # [s] of the clock of limits
     limit: float = np.inf  # [s]
     report: Callable[[str], None] | None = None
 
     @property
     def is_late(self) -> bool:
         """Whether the time has ended."""
-        return time.monotonic() > self.end
+        return now() > self.end
 
     def say(self, line: str) -> None:
         """Report a line of progress."""
@@ -188,10 +187,10 @@ class Fit:
         *,
         sensors: Sensors | None = None,
         fixed: bool = False,
-        watch: Watch = Watch(),  # noqa: B008
+        watch: Progress | None = None,
     ):
         self.sensors = Sensors(None, (), ()) if sensors is None else sensors
-        self.watch = watch
+        self.watch = Progress() if watch is None else watch
         self.fixed = fixed  # whether the unknowns are fixed, and only first states are estimated
         self.model, self.law, self.unknowns, self.noise = model, law, unknowns, noise
         self.space = tangent_space(model)
@@ -329,12 +328,12 @@ class Fit:
         )
         for branch in self.law.slopes(z, xs, s.hs, s.us, together=self.sensors.count > 0):
             self._eliminate(point, branch, rates, reach, parts)
-        each = [_triangle(np.vstack(rows)) for rows in parts.rows]
-        R = _triangle(np.vstack([rows[: nz + 1] for rows in each]))
-        now = sum(float(np.nansum(r**2)) for r in parts.residuals)
-        own = [(block[:, :nt], block[:, nt:-1], block[:, -1]) for block in parts.blocks]
-        Rs = [rows[:nz, :nz] for rows in each]
-        return Reduced(now, R[:nz, :nz], R[:nz, -1], float(R[nz, -1] ** 2), own, parts.nodes, parts.residuals, Rs)
+        triangles = [_triangle(np.vstack(rows)) for rows in parts.rows]
+        R = _triangle(np.vstack([rows[: nz + 1] for rows in triangles]))
+        total = sum(float(np.nansum(r**2)) for r in parts.residuals)
+        starts = [(block[:, :nt], block[:, nt:-1], block[:, -1]) for block in parts.blocks]
+        Rs = [rows[:nz, :nz] for rows in triangles]
+        return Reduced(total, R[:nz, :nz], R[:nz, -1], float(R[nz, -1] ** 2), starts, parts.nodes, parts.residuals, Rs)
 
     def _eliminate(
         self, point: "FittedMotion", branch: Slopes, rates: Array | None, reach: float, parts: "_Parts"
@@ -349,10 +348,10 @@ class Fit:
         (K, M, nx, _), n = branch.by_x.shape, len(tangent)
         along = np.zeros((K, M + 1, nx, n + len(columns)))
         along[:, 0, :, :n] = self.space.derivative_of_plus(point.starts)[:, states[:, None], tangent]
-        own = n + np.searchsorted(columns, branch.columns)
+        moving = n + np.searchsorted(columns, branch.columns)
         for m in range(M):
             along[:, m + 1] = branch.by_x[:, m] @ along[:, m]
-            along[:, m + 1][..., own] += branch.by_z[:, m]
+            along[:, m + 1][..., moving] += branch.by_z[:, m]
             if rates is not None:
                 along[:, m + 1, :, n + int(np.searchsorted(columns, delay))] += rates[:, m, states]
         read = self._read_slopes(z, s, xs) if self.sensors.count else []
@@ -440,18 +439,18 @@ class Fit:
         for steps in range(most + 1):
             reduced = self.reduce(here, reach)
             dz, promised = self._promised(here, reduced)
-            now = reduced.now + self._pull(here.z)
-            settled = PROMISED if self.law.kinks else SETTLED * (1 + SETTLED * now)
+            value = reduced.now + self._pull(here.z)
+            settled = PROMISED if self.law.kinks else SETTLED * (1 + SETTLED * value)
             if isinstance(self.law, TreeMotion) and self.law.has_servos:
-                settled = ROUGH if self.law.frozen else SMOOTHED
-            if now > FAR_ABOVE * self.count:
-                settled = max(settled, PROMISED * now / self.count)
+                settled = SERVOS.roughly if self.law.frozen else SERVOS.settled
+            if value > FAR_ABOVE * self.count:
+                settled = max(settled, PROMISED * value / self.count)
             if promised <= settled and here.gap <= CLOSED:
                 return Solved(here.z, here.starts, reduced, True, steps, "")
             if steps == most or self.watch.is_late:
                 break
-            self.watch.say(f"step {steps + 1}: residuals of {np.sqrt(now / self.count):.4g} times the noise")
-            less = here.value - now + promised
+            self.watch.say(f"step {steps + 1}: residuals of {np.sqrt(value / self.count):.4g} times the noise")
+            less = here.value - value + promised
             if here.gap > 0:
                 merit = max(merit, 2 * max(-less, 0.0) / here.gap + 1.0)
             fraction, ahead = self._ahead(here, reduced, dz, merit, less + merit * here.gap)

@@ -202,8 +202,6 @@ class Slopes:
 
 
 LONGEST = 0.02  # [s] longest step in continuous time
-SERVO_SLIP = 0.05  # [rad/s or m/s] of joints with servos; a sharper change needs steps below 1 ms
-SHORT_STEP = 0.005  # [s] the same with servos
 CHUNK = 256  # number of steps that are differentiated in one call
 FINITE_DIFFERENCE, DIFFERENCE = "finite_difference", 1e-5  # relative difference of a parameter
 
@@ -320,13 +318,36 @@ class TreeMotion:
         return np.concatenate([speed, self.dynamics(values).accelerate(x, u)], axis=1)
 
 
+@dataclass(frozen=True)
+class ServoOptions:
+    """How motions with servos are simulated and fitted."""
+
+    step: float = 0.005  # [s] the longest step
+    slip: float = 0.05  # [rad/s or m/s] over which friction changes its sign; a sharper change needs steps below 1 ms
+    window: float = 0.5  # [s] length of a piece with its own first state
+    few: int = 8  # number of windows from which the initial guess of a delay is found
+    step_error: float = 2e-3  # in units of the noise: largest change of a window's end by steps of half the length
+    same_noise: float = 0.03  # relative change of the noise below which it is not estimated again
+    settled: float = 0.02  # predicted decrease of |r|^2 at the end of a fit: a seventh of a standard deviation
+    roughly: float = 1.0  # the same with approximate derivatives
+
+
+SERVOS = ServoOptions()
+
+
 def servo_motion(model: Model, tree: Tree, unknowns: Unknowns) -> TreeMotion:
     """Return the law for robots with servos: short steps, as servos are stiff, and friction that changes smoothly.
 
     Its derivatives are approximate; `frozen=False` makes them exact.
     """
-    options = {"segment": np.inf, "method": ORDER_4, "smooth": True, "frozen": True, "slip": SERVO_SLIP}
-    return TreeMotion(model, tree, unknowns, SHORT_STEP, **options)
+    return TreeMotion(
+        model, tree, unknowns, SERVOS.step, np.inf, method=ORDER_4, frozen=True, smooth=True, slip=SERVOS.slip
+    )
+
+
+def with_exact_derivatives(law: "Law", exact: bool = True) -> "Law":
+    """Return a law for servos with exact or approximate derivatives; other laws as they are."""
+    return replace(law, frozen=not exact) if isinstance(law, TreeMotion) and law.has_servos else law
 
 
 @dataclass(frozen=True, eq=False)

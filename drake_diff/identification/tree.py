@@ -413,18 +413,18 @@ def branches_of(tree: Tree) -> tuple[Branch, ...]:
         count, v = np.arange(len(links)), t.first[links]
         inputs = np.flatnonzero(np.any(tree.actuation[v] != 0, axis=0))
         parent = np.where(t.parent[links] < 0, -1, np.searchsorted(links, t.parent[links]))
-        tables = t._replace(
-            **{name: _array(getattr(t, name)[links]) for name in PER_LINK},
-            **dict.fromkeys(("link_parent", "parent"), parent),
-            **dict.fromkeys(("joint", "q_start", "v_start", "first"), count),
-        )
+        changed = {name: _array(getattr(t, name)[links]) for name in PER_LINK}
+        changed |= dict.fromkeys(("link_parent", "parent"), parent)
+        changed |= dict.fromkeys(("joint", "q_start", "v_start", "first"), count)
         rows = {"inertial": links, "offset": links, "gravity": np.arange(3)}
         rows |= dict.fromkeys(OF_JOINTS, v) | dict.fromkeys(OF_SERVOS, inputs)
         numbers = {name: tree.numbers.places(name)[rows[name]] for name in vars(tree.numbers)}
         some = replace(
             tree,
             links=tuple(tree.links[i] for i in links),
-            compiled=CompiledTree(tables, {tree.links[i].joint.body: k for k, i in enumerate(links)}, len(links)),
+            compiled=CompiledTree(
+                t._replace(**changed), {tree.links[i].joint.body: k for k, i in enumerate(links)}, len(links)
+            ),
             coordinates=Coordinates((), tuple((k, k) for k in range(len(links)))),
             positions=count,
             damping=tree.damping[v],

@@ -45,14 +45,25 @@ OF_TREE = (
     "gear_ratio", "rotor_inertia", "gravity", COULOMB, STRENGTH, *GAINS,
 )  # fmt: skip
 OF_ALL = (MASS, CENTER, INERTIA, "damping", "spring_stiffness", "rotor_inertia")
-PINNED = 1e-6  # factor of the width of a pinned quantity
-MOST_ROTOR = 1000.0  # times the inertia that a joint moves: the largest reflected rotor inertia
-LEAST_SPEED = 0.1  # [rad/s, m/s] at which the largest damping takes the largest effort, which is the largest friction
-MOST_GAIN = 10.0  # times the model's gain: the largest one; the smallest is the inverse
-MOST_DELAY = 0.2  # [s]
-USUAL = 0.1  # share of the largest effort that is a usual friction, or damping at 1 rad/s or 1 m/s
-USUAL_DELAY = 0.02  # [s]
+OF_SERVOS = ("damping", COULOMB, "rotor_inertia", DELAY)
 FAR = 3.0  # prior standard deviation of a quantity's change, in units of its own size
+
+
+@dataclass(frozen=True)
+class RangeOptions:
+    """The physical ranges of joints, servos and delays, and the usual sizes of quantities that are 0 in the model."""
+
+    most_rotor: float = 1000.0  # times the inertia that a joint moves: the largest reflected rotor inertia
+    least_speed: float = 0.1  # [rad/s, m/s] at which the largest damping takes the largest effort
+    most_gain: float = 10.0  # times the model's gain: the largest one; the smallest is the inverse
+    most_delay: float = 0.2  # [s]
+    usual_share: float = 0.1  # of the largest effort: a usual friction, or damping at 1 rad/s or 1 m/s
+    usual_delay: float = 0.02  # [s]
+    pinned: float = 1e-6  # factor of the width of a quantity that the recordings do not determine
+    settling: float = 0.005  # [s] least time constant that kd gives a joint whose rotor inertia is guessed
+
+
+RANGES = RangeOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +78,7 @@ class Unknown:
     upper: float = np.inf
     prior: tuple[Array, Array] | None = None  # mean (k,) and standard deviation (k,), from the user
     shifts: bool = False  # whether it is a delay of the inputs
+    first: float | None = None  # the initial guess of a search, if it is not the model's value
     pinned: bool = False  # whether it keeps the model's value, as the recordings do not determine it
 
     @property
@@ -142,7 +154,7 @@ class Unknowns:
         """The widths (np,), but infinite for unknowns with a prior, and small for pinned ones."""
         pulls = self.widths
         for unknown, s in self.items():
-            pulls[s] *= PINNED if unknown.pinned else 1.0
+            pulls[s] *= RANGES.pinned if unknown.pinned else 1.0
             if unknown.prior is not None:
                 pulls[s] = np.inf
         return pulls
@@ -170,8 +182,11 @@ class Unknowns:
 
     @property
     def z_first(self) -> Array:
-        """The initial z of a search: the model's own values, clipped to the bounds."""
-        return np.clip(self.z_start, *self.bounds)
+        """The initial z of a search: the model's own values or `first`, clipped to the bounds."""
+        z = self.z_start
+        for unknown, s in self.items():
+            z[s] = z[s] if unknown.first is None else unknown.first
+        return np.clip(z, *self.bounds)
 
     @property
     def delay(self) -> int | None:
@@ -247,7 +262,12 @@ def choose_unknowns(
     known |= {f"{column}.{BIAS}": ("", np.zeros(1), -np.inf) for column in columns}
     known = {n: e for n, e in _extra(model).items() if tree is not None or n.endswith(f".{BIAS}")} | known
     if isinstance(names, str) and names == "all":
-        names = [name for name in parameters if name.rsplit(".", 1)[1] in OF_ALL]
+        servos = tree is not None and bool(np.any(tree.commanded))
+        names = [
+            name
+            for name in (known if servos else parameters)
+            if name.rsplit(".", 1)[1] in (OF_SERVOS if servos else OF_ALL)
+        ]
         names = [name for name in names if _why_not(model, tree, name, known[name][1]) is None]
     elif isinstance(names, str):
         names = [names]
@@ -265,7 +285,8 @@ def choose_unknowns(
         prior = _prior_of(name, priors[name], len(start)) if priors and name in priors else None
         shifts = name.endswith(f".{DELAY}")
         size = _size(model, name, value) or usual.size
-        unknowns.append(Unknown(name, unit, start, low, size, high, prior, shifts))
+        first = usual.first if usual.first and not np.any(start) else None
+        unknowns.append(Unknown(name, unit, start, low, size, high, prior, shifts, first))
     for subject, given in (("prior of", priors), ("bounds of", bounds)):
         for name in given or {}:
             if name not in names:
@@ -281,12 +302,13 @@ class Physical(NamedTuple):
     lower: float
     upper: float
     size: float
+    first: float = 0.0  # the initial guess of a search if the model has 0
 
 
 def physical_ranges(model: Model, tree: Tree, largest: Array) -> dict[str, Physical]:
     """Return the ranges of joints, servos and delays by name, for the largest inputs or servo errors (nu,)."""
     motors, numbers = labelled(rotors(model.plant)), tree.numbers
-    kinds = {f"model.{DELAY}": Physical(0.0, MOST_DELAY, USUAL_DELAY)}
+    kinds = {f"model.{DELAY}": Physical(0.0, RANGES.most_delay, RANGES.usual_delay)}
     still = np.zeros((1, tree.n))
     q = tree.joint_positions(model.default_state[None, : model.nq])
     inertias = np.diag(TreeDynamics(tree, numbers).inverse_dynamics(q, still, still)[1][0])
@@ -295,15 +317,19 @@ def physical_ranges(model: Model, tree: Tree, largest: Array) -> dict[str, Physi
     by_joint = {link.joint: link.v_start for link in tree.bodies.values() if link.kind not in FIXED_OR_FREE}
     for label, v in by_joint.items():
         if efforts[v] > 0:
-            kinds[f"{label}.{COULOMB}"] = Physical(0.0, efforts[v], USUAL * efforts[v])
-            kinds[f"{label}.damping"] = Physical(0.0, efforts[v] / LEAST_SPEED, USUAL * efforts[v])
+            kinds[f"{label}.{COULOMB}"] = Physical(0.0, efforts[v], RANGES.usual_share * efforts[v])
+            kinds[f"{label}.damping"] = Physical(0.0, efforts[v] / RANGES.least_speed, RANGES.usual_share * efforts[v])
     for label, motor in motors.items():
-        inertia = inertias[by_joint[names[motor.joint().index()]]] / max(motor.default_gear_ratio() ** 2, 1e-300)
-        kinds[f"{label}.rotor_inertia"] = Physical(0.0, MOST_ROTOR * inertia, 10 * inertia)
+        v, ratio = by_joint[names[motor.joint().index()]], max(motor.default_gear_ratio() ** 2, 1e-300)
+        inertia, kd = inertias[v] / ratio, numbers.kd[tree.servo[v]] if tree.servo[v] >= 0 else 0.0
+        first = max(RANGES.settling * kd / ratio - inertia, 0.0)
+        kinds[f"{label}.rotor_inertia"] = Physical(
+            0.0, max(RANGES.most_rotor * inertia, 10 * first), max(10 * inertia, first), first
+        )
     for i, label in enumerate(model.input_names):
         for name in GAINS if tree.commanded[i] else ():
             gain = float(getattr(numbers, name)[i])
-            kinds[f"{label}.{name}"] = Physical(gain / MOST_GAIN, gain * MOST_GAIN or np.inf, gain)
+            kinds[f"{label}.{name}"] = Physical(gain / RANGES.most_gain, gain * RANGES.most_gain or np.inf, gain)
     return kinds
 
 
