@@ -170,6 +170,7 @@ def identify(
     sensor: Annotated[
         list[str] | None, repeated("LABEL=BODY:X,Y,Z[,R,P,Y]", "Pose of a sensor in the frame of its body [m, rad]")
     ] = None,
+    time_limit: Annotated[float | None, typer.Option(help="Time limit of the fit in seconds.")] = None,
     out: Annotated[Path | None, out_option("artifacts/identify_<model>")] = None,
 ) -> None:
     """Estimate parameters of MODEL from recordings, with confidence intervals, and list what cannot be identified.
@@ -193,7 +194,8 @@ def identify(
         holdout = held_out
     asked: dict[str, Any] = {"noise": given, "held_out": holdout, "motion": motion, "sensors": mounted}
     with written_whole(directory) as folder:
-        with progress_line("fitting"):
+        with progress_line("fitting", pause=5.0) as line:
+            asked |= {"time_limit": time_limit, "callback": line}
             identification = estimate(model, list(recording), names, **asked, priors=priors, bounds=limits)
         record: Any = write_identification(identification, folder)
     show(judged(record.verdict), record.sentence)
@@ -204,6 +206,8 @@ def identify(
         remark = plain("not known", "dim") if not known else plain("differs", "yellow") if differs else ""
         rows.append((e.name, e.before, e.value, e.lower, e.upper, e.unit, remark))
     show_table(("parameter", "before", "found", "95 % from", "to", "unit", ""), rows, left=1)
+    if record.rms and not record.explained:
+        show_table(("rms error", "before", "after", "unit"), [(name, *e) for name, e in record.rms.items()], left=1)
     for line in record.unidentifiable:
         show(plain("left open", "bold dim"), line)
     show(f"fitted: {record.motion}")

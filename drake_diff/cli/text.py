@@ -119,6 +119,10 @@ def _load(
         str | None, typer.Option(metavar="X,Y,Z", show_default="0,0,-9.81", help="Gravity in m/s^2.")
     ] = None,
     contact: Annotated[bool, typer.Option(help="Whether to simulate contact.")] = True,
+    gains: Annotated[
+        str | None,
+        typer.Option(metavar="KP,KD|file", help="Inputs are commanded positions, with these gains or the file's."),
+    ] = None,
 ) -> Any:
     # Invalid input is rejected before Drake is loaded.
     options: dict[str, Any] = {
@@ -137,6 +141,8 @@ def _load(
         else ground and _number("--ground", ground, "true, or a friction coefficient"),
         "gravity": gravity and floats_in("--gravity", gravity, "three numbers"),
         "contact": contact,
+        "inputs": gains and "position",
+        "gains": None if gains in (None, "file") else tuple(floats_in("--gains", gains, "two numbers, or file")),
     }
     from drake_diff.model.model import load_model
 

@@ -31,7 +31,7 @@ from drake_diff.logs.mcap_file import has_channels, raw_messages, read_mcap
 from drake_diff.mechanics.coordinates import rotation
 from drake_diff.mechanics.description import Link, describe_whole
 from drake_diff.model.model import Model
-from drake_diff.model.plant import joints, labelled
+from drake_diff.model.plant import actuators, joints, labelled
 from drake_diff.model.tangent import tangent_space
 
 JOINTS, ODOMETRY = "sensor_msgs/msg/JointState", "nav_msgs/msg/Odometry"
@@ -210,6 +210,10 @@ FACTS = (
     "seeds", "reset distribution",
 )  # fmt: skip
 NORM_TOLERANCE = 1e-3  # of a quaternion's norm: allows float32 and five printed digits, but not another order
+# Names of quantities of joints in the columns of a CSV file.
+POSITION, VELOCITY = ("position", "pos", "q"), ("velocity", "vel", "v", "dq", "qd")
+COMMAND = ("q_desired", "q_des", "desired_position", "position_command", "command", "target")
+EFFORT = ("effort", "torque", "tau")
 CLOCK_TOLERANCE = 1e-3  # relative to a time step: allows printed times and nanoseconds
 
 
@@ -509,18 +513,41 @@ def _number(subject: str, text: str) -> float:
     return value if text.strip() else math.nan
 
 
-def _columns(path: Path, model: Model, header: list[str], wanted: Sequence[str], spared: Sequence[str]) -> list[int]:
-    """Return the index of each wanted column, or -1 for a column in `spared` that is missing."""
-    by_joint = {}
+def _other_names(model: Model) -> dict[str, str]:
+    """Return other names of columns: QUANTITY.JOINT, QUANTITY_JOINT, JOINT.QUANTITY or JOINT_QUANTITY, and t.
+
+    A quantity and a number, as q0, q_0 or q[0], count the joints in the order of the model.
+    """
+    names, motors, index = {"t": "time"}, actuators(model.plant), 0
     for label, joint in labelled(joints(model.plant)).items():
         q, v = model.places(joint)
-        if len(q) == len(v) == 1:
-            by_joint[f"position.{label}"] = model.state_names[q.start]
-            by_joint[f"velocity.{label}"] = model.state_names[model.nq + v.start]
-    names = [by_joint.get(text.strip(), text.strip()) for text in header]
+        if len(q) != 1 or len(v) != 1:
+            continue
+        columns = {model.state_names[q.start]: POSITION, model.state_names[model.nq + v.start]: VELOCITY}
+        for i in np.flatnonzero(model.inputs.actuator >= 0):
+            if motors[model.inputs.actuator[i]].joint().index() == joint.index():
+                columns[model.input_names[i]] = COMMAND if model.inputs.commanded[i] else EFFORT
+        for column, quantities in columns.items():
+            for name in quantities:
+                for text in dict.fromkeys((label, label.removesuffix("_joint"))):
+                    names |= dict.fromkeys(
+                        (f"{name}.{text}", f"{name}_{text}", f"{text}.{name}", f"{text}_{name}"), column
+                    )
+                names |= dict.fromkeys((f"{name}{index}", f"{name}_{index}", f"{name}[{index}]"), column)
+        index += 1
+    return names
+
+
+def _columns(path: Path, model: Model, header: list[str], wanted: Sequence[str], spared: Sequence[str]) -> list[int]:
+    """Return the index of each wanted column, or -1 for a column in `spared` that is missing."""
+    others = _other_names(model)
+    names = [text.strip() if text.strip() in wanted else others.get(text.strip(), text.strip()) for text in header]
     for given, column in zip(header, names, strict=True):
+        if column not in wanted and any(name in column for name in COMMAND) and not np.any(model.inputs.commanded):
+            expected = 'a model with inputs="position" and gains (--gains KP,KD)'
+            raise InputError(f"{path} line 1, column {given[:80]}", got="a commanded position", expected=expected)
         if column not in wanted:
-            raise UnknownNameError(f"{path} line 1, column", got=given[:80], known=[*wanted, *by_joint])
+            raise UnknownNameError(f"{path} line 1, column", got=given[:80], known=[*wanted, *others])
         if names.count(column) > 1:
             raise InputError(f"{path} line 1, column {column}", got="twice", expected="once")
     for column in wanted:

@@ -29,7 +29,7 @@ from drake_diff.identification.judge import (
     noise_of,
 )
 from drake_diff.identification.messages import changed_to
-from drake_diff.identification.motion import LONGEST, EulerMotion, Law, TreeMotion
+from drake_diff.identification.motion import LONGEST, EulerMotion, Law, Slopes, TreeMotion
 from drake_diff.identification.recordings import Excerpt, noise_by_differences
 from drake_diff.identification.results import Explanation
 from drake_diff.identification.tree import ORDER_4, Tree
@@ -194,17 +194,19 @@ class WithLimits:
     law: TreeMotion
     unknowns: Unknowns
 
-    def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
-        """Return the derivatives of each step with respect to the state (K, M, nx, nx) and to z (K, M, nx, np)."""
-        by_x, by_z = self.law.slopes(z, xs, hs, us)
-        columns = self.unknowns.columns
+    def slopes(self, z: Array, xs: Array, hs: Array, us: Array, *, together: bool = False) -> list[Slopes]:
+        """Return the derivatives of each step of each independent branch, or of the whole tree."""
+        columns, branches = self.unknowns.columns, self.law.slopes(z, xs, hs, us, together=together)
         for unknown, s in self.unknowns.items():
             strength = f"{unknown.label}.{STRENGTH}"
             if unknown.quantity == LIMIT and z[s][0] == unknown.start[0] and strength in columns:
                 u = np.abs(us[..., self.law.model.input_names.index(unknown.label)])
                 share = np.clip(1 - CUT * unknown.start[0] / np.maximum(u, 1e-300), 0, None)
-                by_z[..., s.start] = -share[..., None] * by_z[..., columns.index(strength)]
-        return by_x, by_z
+                for branch in branches:
+                    limited = branch.columns == s.start
+                    by_strength = branch.by_z[..., branch.columns == columns.index(strength)]
+                    branch.by_z[..., limited] = -share[..., None, None] * by_strength
+        return branches
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.law, name)

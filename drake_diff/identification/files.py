@@ -146,6 +146,7 @@ def record_of(e: Identification, name: str) -> FitRecord:
         "estimates": estimates_of(e),
         "unidentifiable": list(e.unidentifiable),
         "noise": dict(e.noise),
+        "rms": dict(e.sizes),
         "correlation": _correlation(e.covariance),
     }
     return FitRecord(**fields)

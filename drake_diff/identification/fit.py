@@ -11,17 +11,19 @@ A QR factorization of each piece eliminates its d_first. The second term matters
 it is one standard deviation if a quantity differs from the file's by three times its own size.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.clock import now
 from drake_diff.exceptions import ModelError, SimulationError
-from drake_diff.identification.motion import DiscreteMotion, Law, TreeMotion
+from drake_diff.identification.motion import SERVOS, DiscreteMotion, Law, Slopes, TreeMotion
 from drake_diff.identification.recordings import LEAST, Excerpt
 from drake_diff.identification.sensors import Sensors
 from drake_diff.identification.unknowns import BIAS, Unknowns
@@ -33,6 +35,9 @@ GROWTH = 1e6  # growth of a perturbation beyond which a piece's end does not det
 LARGEST = 1.0  # the largest change of an unknown in one step, in widths / FAR
 SETTLED = 1e-5  # predicted decrease of |r|^2, in units of the noise, below which the fit has converged
 PROMISED = 1e-2  # the same where derivatives predict too much, as at kinks: a tenth of a standard deviation
+FAR_ABOVE = (
+    9.0  # mean square of residuals, in units of the noise, above which PROMISED counts in units of the residuals
+)
 CLOSED = 1e-3  # largest gaps of a converged fit, in units of the noise
 HALVINGS = 8
 FARTHER = 3.0  # growth of the trust region after an accepted full step, for motions with kinks
@@ -57,7 +62,9 @@ class Segments:
     by_delay: Array  # (K, M) derivatives of the step lengths with respect to a delay of inputs
 
 
-def steps_between(law: Law, piece: Excerpt, k: int, delay: float | None) -> tuple[Array, Array, Array]:
+def steps_between(
+    law: Law, piece: Excerpt, k: int, delay: float | None, switches: tuple[Array, Array]
+) -> tuple[Array, Array, Array]:
     """Return step lengths (m,) [s] and inputs (m, nu) from sample k to the next, and d length / d delay (m,).
 
     With a delay, steps also end where an input changes. The first input also acts before its time. An input that
@@ -67,9 +74,9 @@ def steps_between(law: Law, piece: Excerpt, k: int, delay: float | None) -> tupl
     if delay is None:
         lengths = np.array(law.cut(b - a))
         return lengths, np.repeat(piece.us[k : k + 1], len(lengths), axis=0), np.zeros(len(lengths))
-    begin, inputs = piece.switches
+    begin, inputs = switches
     late = begin + delay
-    inner = np.flatnonzero((late >= a) & (late < b))
+    inner = np.arange(*np.searchsorted(late, [a, b]))
     ends = np.concatenate([[a], late[inner], [b]])
     before = max(int(inner[0]) - 1 if len(inner) else int(np.searchsorted(late, a, side="right")) - 1, 0)
     held = [before, *inner]
@@ -89,7 +96,7 @@ def cut_segments(law: Law, pieces: Sequence[Excerpt], nu: int, delay: float | No
     """Cut pieces into segments; a boundary sample belongs to the later segment, the last sample to the last one."""
     of_piece, first, hs, us, samples, offsets, by_delay = [], [], [], [], [], [], []
     for p, piece in enumerate(pieces):
-        n = len(piece.times)
+        n, switches = len(piece.times), piece.switches
         bounds = [0]
         while bounds[-1] < n - 1:
             k = bounds[-1]
@@ -98,7 +105,8 @@ def cut_segments(law: Law, pieces: Sequence[Excerpt], nu: int, delay: float | No
         if len(bounds) > 2 and bounds[-1] - bounds[-2] < SEGMENT_SAMPLES:
             bounds.pop(-2)
         for a, b in pairwise(bounds):
-            lengths, inputs, changes = zip(*(steps_between(law, piece, k, delay) for k in range(a, b)), strict=True)
+            parts = (steps_between(law, piece, k, delay, switches) for k in range(a, b))
+            lengths, inputs, changes = zip(*parts, strict=True)
             of_piece.append(p)
             first.append(a)
             hs.append(np.concatenate(lengths))
@@ -138,6 +146,34 @@ class Reduced:
         return bool(np.all(np.abs(np.column_stack([self.R, self.b])) < TOO_LARGE))
 
 
+@dataclass(frozen=True)
+class Progress:
+    """The time after which a fit ends, and where its progress is reported."""
+
+    end: float = np.inf  # [s] of the clock of limits
+    limit: float = np.inf  # [s]
+    report: Callable[[str], None] | None = None
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the time has ended."""
+        return now() > self.end
+
+    def say(self, line: str) -> None:
+        """Report a line of progress."""
+        if self.report is not None:
+            self.report(line)
+
+
+class _Parts(NamedTuple):
+    """What the elimination of first states fills, branch by branch."""
+
+    blocks: list[Array]  # per piece: R of the first states (2 nv, 2 nv + np + 1)
+    rows: list[list[Array]]  # per piece: rows (k, np + 1) in the unknowns alone
+    nodes: list[tuple[Array, Array]]  # per segment, as in `Reduced`
+    residuals: list[Array]  # per piece, as in `Reduced`
+
+
 class Fit:
     """The least-squares problem in the unknowns and states of a set of pieces."""
 
@@ -151,17 +187,26 @@ class Fit:
         *,
         sensors: Sensors | None = None,
         fixed: bool = False,
+        watch: Progress | None = None,
     ):
         self.sensors = Sensors(None, (), ()) if sensors is None else sensors
+        self.watch = Progress() if watch is None else watch
         self.fixed = fixed  # whether the unknowns are fixed, and only first states are estimated
         self.model, self.law, self.unknowns, self.noise = model, law, unknowns, noise
         self.space = tangent_space(model)
-        self.segments = cut_segments(law, pieces, model.nu, None if unknowns.delay is None else 0.0)
+        delay = None if unknowns.delay is None else 0.0
+        self.segments = cut_segments(law, pieces, model.nu, delay)
+        self._cut = delay, self.segments  # the latest cut, and its delay
         self.gap_scale = np.empty(self.space.size)
         nv, period = model.nv, max(float(np.median(np.diff(pieces[0].times))), 1e-3)
         from_positions = np.where(np.isfinite(noise[:nv]), noise[:nv], 1.0) / (5 * period)
         self.gap_scale[:nv] = np.where(np.isfinite(noise[:nv]), noise[:nv], 1.0)
         self.gap_scale[nv:] = np.where(np.isfinite(noise[nv : 2 * nv]), noise[nv : 2 * nv], from_positions)
+
+    @property
+    def has_servos(self) -> bool:
+        """Whether any input is a commanded position."""
+        return isinstance(self.law, TreeMotion) and self.law.has_servos
 
     @property
     def count(self) -> int:
@@ -175,9 +220,10 @@ class Fit:
 
     def cut(self, values: Array) -> Segments:
         """Return the segments for these values; a delay of inputs changes their steps."""
-        if self.unknowns.delay is None:
-            return self.segments
-        return cut_segments(self.law, self.segments.pieces, self.model.nu, float(values[self.unknowns.delay]))
+        delay = None if self.unknowns.delay is None else float(values[self.unknowns.delay])
+        if delay != self._cut[0]:
+            self._cut = delay, cut_segments(self.law, self.segments.pieces, self.model.nu, delay)
+        return self._cut[1]
 
     def _measured(self, p: int) -> Array:
         piece = self.segments.pieces[p]
@@ -268,60 +314,86 @@ class Fit:
     @np.errstate(over="ignore", invalid="ignore")  # the motion may overflow
     def reduce(self, point: "FittedMotion", reach: float = 1.0) -> Reduced:
         """Linearize, close the gaps to first order, and eliminate the first states; `reach` enlarges their region."""
-        z, starts, xs, residuals, gaps = point.z, point.starts, point.xs, point.residuals, point.gaps
-        s, nt, nz = point.segments, self.space.size, len(z)
-        A, C = self.law.slopes(z, xs, s.hs, s.us)
+        z, xs, s, nt, nz = point.z, point.xs, point.segments, self.space.size, len(point.z)
+        rates = None
         if self.unknowns.delay is not None:
             flat = xs[:, 1:].reshape(-1, xs.shape[2]), s.us.reshape(-1, s.us.shape[2])
             rates = self._continuous.rates(self.unknowns.values(z), *flat).reshape(xs[:, 1:].shape)
-            C[..., self.unknowns.delay] = rates * s.by_delay[..., None]
-        K, M, nx = A.shape[:3]
-        along = np.zeros((K, M + 1, nx, nt + nz))
-        along[:, 0, :, :nt] = self.space.derivative_of_plus(starts)
+            rates *= s.by_delay[..., None]
+        parts = _Parts(
+            blocks=[np.zeros((nt, nt + nz + 1)) for _ in s.pieces],
+            rows=[[np.zeros((0, nz + 1))] for _ in s.pieces],
+            nodes=[(np.zeros((nt, nt + nz)), np.zeros(nt)) for _ in s.first],
+            residuals=[np.full((len(piece.times), len(self.noise)), np.nan) for piece in s.pieces],
+        )
+        for branch in self.law.slopes(z, xs, s.hs, s.us, together=self.sensors.count > 0):
+            self._eliminate(point, branch, rates, reach, parts)
+        triangles = [_triangle(np.vstack(rows)) for rows in parts.rows]
+        R = _triangle(np.vstack([rows[: nz + 1] for rows in triangles]))
+        total = sum(float(np.nansum(r**2)) for r in parts.residuals)
+        starts = [(block[:, :nt], block[:, nt:-1], block[:, -1]) for block in parts.blocks]
+        Rs = [rows[:nz, :nz] for rows in triangles]
+        return Reduced(total, R[:nz, :nz], R[:nz, -1], float(R[nz, -1] ** 2), starts, parts.nodes, parts.residuals, Rs)
+
+    def _eliminate(
+        self, point: "FittedMotion", branch: Slopes, rates: Array | None, reach: float, parts: "_Parts"
+    ) -> None:
+        """Close the gaps of an independent branch, and eliminate its first states in each piece."""
+        z, xs, gaps, s = point.z, point.xs, point.gaps, point.segments
+        states, tangent, delay, nz, nt = branch.states, branch.tangent, self.unknowns.delay, len(z), self.space.size
+        seen_in = np.concatenate([tangent, np.arange(nt, len(self.noise))])  # entries of a sample
+        biases = [(column, entry) for column, entry in self._bias_columns() if entry in seen_in]
+        more = [column for column, _ in biases] + ([] if delay is None else [delay])
+        columns = np.union1d(branch.columns, np.array(more, dtype=np.intp)).astype(np.intp)
+        (K, M, nx, _), n = branch.by_x.shape, len(tangent)
+        along = np.zeros((K, M + 1, nx, n + len(columns)))
+        along[:, 0, :, :n] = self.space.derivative_of_plus(point.starts)[:, states[:, None], tangent]
+        moving = n + np.searchsorted(columns, branch.columns)
         for m in range(M):
-            along[:, m + 1] = A[:, m] @ along[:, m]
-            along[:, m + 1, :, nt:] += C[:, m]
-        blocks, rows_z, nodes, by_piece, rest = [], [np.zeros((0, nz + 1))], [], [], 0.0
+            along[:, m + 1] = branch.by_x[:, m] @ along[:, m]
+            along[:, m + 1][..., moving] += branch.by_z[:, m]
+            if rates is not None:
+                along[:, m + 1, :, n + int(np.searchsorted(columns, delay))] += rates[:, m, states]
         read = self._read_slopes(z, s, xs) if self.sensors.count else []
-        for p, piece in enumerate(s.pieces):
-            D, e = np.eye(nt, nt + nz), np.zeros(nt)
-            rows, linearized = [], np.full((len(piece.times), len(self.noise)), np.nan)
+        entries = seen_in[: n + self.sensors.count]
+        noise, scale = self.noise[entries], self.gap_scale[tangent]
+        for p in range(len(s.pieces)):
+            D, e, rows = np.eye(n, n + len(columns)), np.zeros(n), []
             for k in np.flatnonzero(s.of_piece == p):
-                nodes.append((D, e))
-                states = xs[k, s.at[k]]
-                moved = self.space.derivative_of_minus(states) @ along[k, s.at[k]]
+                parts.nodes[k][0][np.ix_(tangent, [*tangent, *(nt + columns)])] = D
+                parts.nodes[k][1][tangent] = e
+                moved = self._minus(xs[k, s.at[k]], branch) @ along[k, s.at[k]]
                 if read:
                     by_x, by_z = read[k]
                     of_outputs = by_x @ moved
-                    of_outputs[..., nt:] += by_z
+                    of_outputs[..., n:] += by_z[..., columns]
                     moved = np.concatenate([moved, of_outputs], axis=1)
-                J = moved[..., :nt] @ D
-                J[..., nt:] += moved[..., nt:]
-                r = residuals[k] - (moved[..., :nt] @ e) / self.noise
-                for column, entry in self._bias_columns():
-                    J[:, entry, nt + column] += 1.0
-                J /= self.noise[:, None]
+                J = moved[..., :n] @ D
+                J[..., n:] += moved[..., n:]
+                r = point.residuals[k][:, entries] - (moved[..., :n] @ e) / noise
+                for column, entry in biases:
+                    J[:, np.flatnonzero(entries == entry)[0], n + np.searchsorted(columns, column)] += 1.0
+                J /= noise[:, None]
                 seen = np.isfinite(r)
                 rows.append(np.column_stack([J[seen], r[seen]]))
-                linearized[s.samples[k]] = r
-                end = self.space.derivative_of_minus(xs[k, s.counts[k]]) @ along[k, s.counts[k]]
-                e = end[:, :nt] @ e + gaps[k]
-                D = end[:, :nt] @ D
-                D[:, nt:] += end[:, nt:]
-            by_piece.append(linearized)
-            ridge = np.zeros((nt, nt + nz + 1))
-            ridge[:, :nt] = NO_PRIOR * np.eye(nt)
+                parts.residuals[p][np.ix_(s.samples[k], entries)] = r
+                end = self._minus(xs[k, s.counts[k]], branch) @ along[k, s.counts[k]]
+                e = end[:, :n] @ e + gaps[k, tangent]
+                D = end[:, :n] @ D
+                D[:, n:] += end[:, n:]
+            ridge = np.zeros((n, n + len(columns) + 1))
+            ridge[:, :n] = NO_PRIOR * np.eye(n)
             if self.law.kinks:
-                ridge[nt // 2 :, nt // 2 : nt] = np.diag(1 / (reach * NEAR * self.gap_scale[nt // 2 :]))
+                ridge[n // 2 :, n // 2 : n] = np.diag(1 / (reach * NEAR * scale[n // 2 :]))
             R = _triangle(np.vstack([*rows, ridge]))
-            blocks.append((R[:nt, :nt], R[:nt, nt:-1], R[:nt, -1]))
-            rows_z.append(R[nt : nt + nz, nt:])
-            rest += float(R[nt + nz, -1] ** 2)
-        R = _triangle(np.vstack(rows_z))
-        rest += float(R[nz, -1] ** 2)
-        now = sum(float(np.nansum(r**2)) for r in by_piece)
-        Rs = [rows[:, :nz] for rows in rows_z[1:]]
-        return Reduced(now, R[:nz, :nz], R[:nz, -1], rest, blocks, nodes, by_piece, Rs)
+            parts.blocks[p][np.ix_(tangent, [*tangent, *(nt + columns), -1])] = R[:n]
+            free = np.zeros((len(columns) + 1, nz + 1))
+            free[:, [*columns, -1]] = R[n:, n:]
+            parts.rows[p].append(free)
+
+    def _minus(self, x: Array, branch: Slopes) -> Array:
+        """Return the derivatives (..., 2 nv, nx) of a branch's tangent vector by its states."""
+        return np.asarray(self.space.derivative_of_minus(x)[..., branch.tangent[:, None], branch.states])
 
     def step_of(self, z: Array, reduced: Reduced) -> Array:
         """Return the step dz (np,) of the linearized problem, limited to the bounds and to LARGEST."""
@@ -355,7 +427,7 @@ class Fit:
     def by(self, law: Law) -> "Fit":
         """Return the same fit with another law, whose segments have the same length."""
         arguments = self.model, law, self.unknowns, self.segments.pieces, self.noise
-        return Fit(*arguments, sensors=self.sensors, fixed=self.fixed)
+        return Fit(*arguments, sensors=self.sensors, fixed=self.fixed, watch=self.watch)
 
     def solve(self, z: Array, starts: Array, most: int) -> "Solved":
         """Solve from z and the segment starts in at most `most` steps. Raises SimulationError if no motion exists."""
@@ -367,13 +439,18 @@ class Fit:
         for steps in range(most + 1):
             reduced = self.reduce(here, reach)
             dz, promised = self._promised(here, reduced)
-            now = reduced.now + self._pull(here.z)
-            settled = PROMISED if self.law.kinks else SETTLED * (1 + SETTLED * now)
+            value = reduced.now + self._pull(here.z)
+            settled = PROMISED if self.law.kinks else SETTLED * (1 + SETTLED * value)
+            if isinstance(self.law, TreeMotion) and self.law.has_servos:
+                settled = SERVOS.roughly if self.law.frozen else SERVOS.settled
+            if value > FAR_ABOVE * self.count:
+                settled = max(settled, PROMISED * value / self.count)
             if promised <= settled and here.gap <= CLOSED:
                 return Solved(here.z, here.starts, reduced, True, steps, "")
-            if steps == most:
+            if steps == most or self.watch.is_late:
                 break
-            less = here.value - now + promised
+            self.watch.say(f"step {steps + 1}: residuals of {np.sqrt(value / self.count):.4g} times the noise")
+            less = here.value - value + promised
             if here.gap > 0:
                 merit = max(merit, 2 * max(-less, 0.0) / here.gap + 1.0)
             fraction, ahead = self._ahead(here, reduced, dz, merit, less + merit * here.gap)
@@ -385,7 +462,8 @@ class Fit:
                 return Solved(here.z, here.starts, reduced, ended, steps, "" if ended else STUCK)
             reach = reach * FARTHER if fraction == 1.0 else max(reach / FARTHER, 1.0)
             here = ahead
-        return Solved(here.z, here.starts, reduced, False, most, f"it reached the limit of {most} steps")
+        limit = f"{most} steps" if steps == most else f"{self.watch.limit:g} s"
+        return Solved(here.z, here.starts, reduced, False, steps, f"it reached the limit of {limit}")
 
     def _promised(self, here: "FittedMotion", reduced: Reduced) -> tuple[Array, float]:
         """Return the step dz (np,), and its predicted decrease of |r|^2."""

@@ -1,23 +1,26 @@
 """Estimation of a model's parameters, with intervals, from recordings of its motion."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
-from drake_diff._base.arrays import Array, frozen, positive_int
+from drake_diff._base.arrays import Array, frozen, positive_float, positive_int
+from drake_diff._base.clock import now
 from drake_diff._base.values import Refusal
 from drake_diff.certificates.truth import overlaps_along
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import InputError, ModelError, UnknownNameError
-from drake_diff.identification.fit import Fit, Solved, growth_cuts
+from drake_diff.identification.fit import Fit, Progress, Solved, growth_cuts
 from drake_diff.identification.impacts import fit_through_impacts
 from drake_diff.identification.judge import (
     COLOURED,
     FALSE_ALARM,
+    UNSEEN,
     Known,
     colour_of,
     covariance_of,
@@ -28,8 +31,16 @@ from drake_diff.identification.judge import (
     noise_of,
     score_of,
 )
-from drake_diff.identification.messages import unidentifiable
-from drake_diff.identification.motion import Law, TreeMotion, discrete_motion
+from drake_diff.identification.messages import Sizes, in_usual_units, unidentifiable
+from drake_diff.identification.motion import (
+    SERVOS,
+    DiscreteMotion,
+    Law,
+    TreeMotion,
+    discrete_motion,
+    servo_motion,
+    with_exact_derivatives,
+)
 from drake_diff.identification.recordings import (
     Excerpt,
     columns_of,
@@ -41,8 +52,8 @@ from drake_diff.identification.recordings import (
 )
 from drake_diff.identification.results import Followed, Identification, Request, identification
 from drake_diff.identification.sensors import Sensors, choose_sensors
-from drake_diff.identification.tree import tree_for_identification
-from drake_diff.identification.unknowns import Unknowns, choose_unknowns
+from drake_diff.identification.tree import Tree, tree_for_identification
+from drake_diff.identification.unknowns import FAR, Unknowns, choose_unknowns, physical_ranges
 from drake_diff.model.model import Model
 from drake_diff.model.tangent import tangent_space
 
@@ -67,6 +78,8 @@ def identify(
     priors: Mapping[str, tuple[Any, Any]] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     sensors: Mapping[str, tuple[str, Sequence[float]]] | None = None,
+    time_limit: float | None = None,
+    callback: Callable[[str], None] | None = None,
 ) -> Identification:
     """Estimate parameters of a model from recordings of its motion, with intervals.
 
@@ -77,12 +90,15 @@ def identify(
             from each sample to the next. The sample times need not be equidistant.
         parameters: Names as in `dd.list_parameters`, and also JOINT.coulomb_friction, INPUT.strength, STATE.bias and
             model.input_delay [s], by which inputs act later than they are recorded. Or "all": masses, centres of mass,
-            inertias, dampings, spring stiffnesses and rotor inertias.
+            inertias, dampings, spring stiffnesses and rotor inertias. If inputs are commanded positions, "all" are
+            dampings, Coulomb frictions, rotor inertias and the input delay; INPUT.kp and INPUT.kd can be added.
         noise: The standard deviation of the noise of states, by name. Missing values are estimated.
         held_out: The fraction at the end of each recording that is predicted instead of fitted, or a recording's name.
         motion: The motion law that is fitted:
 
-            - "continuous": the model's equations of motion in continuous time, without contact, limits and controllers;
+            - "continuous": the model's equations of motion in continuous time, without contact and limits. If inputs
+              are commanded positions, effort = kp (u(t - delay) - q) - kd v within the effort limit, Coulomb friction
+              changes sign smoothly over 0.05 rad/s, and windows of 0.5 s have their own first states;
             - "steps": the model's own discrete steps with all their forces, contact parameters included;
             - "impacts": the model's own steps through impacts, by the search of `identify_contact`: contact parameters,
               centres of mass and biases, for motions with every position and velocity measured;
@@ -90,9 +106,14 @@ def identify(
         max_iterations: The maximum number of Gauss-Newton steps of the fit; through impacts, the limit is 32.
         priors: Prior knowledge of parameters: mean and standard deviation, by name. A prior counts as one more
             measurement. Without a prior, the file's value matters only where the data are uninformative.
-        bounds: Lower and upper bound of parameters, by name.
+        bounds: Lower and upper bound of parameters, by name. In continuous time, the defaults are: Coulomb friction up
+            to the largest effort E, damping up to E / (0.1 rad/s), rotor inertia up to 1000 times the inertia that its
+            joint moves in the default state, gains a tenth to ten times the model's, delays up to 0.2 s. E is the
+            effort limit, or less if the recordings have only smaller inputs.
         sensors: The mounts of recorded sensors that are not at the frame of a body: by label, the body and x, y, z
             [m], or x, y, z [m], roll, pitch, yaw [rad], in the body's frame.
+        time_limit: Time after which the fit ends, in seconds; the held-out samples are predicted afterwards.
+        callback: Called with a line of progress before each step of the fit.
 
     Returns:
         `.values`, `.intervals` (95 %), `.unidentifiable`, `.explained` with its `.reason`, and a `.sentence`.
@@ -114,12 +135,14 @@ def identify(
         0.2
     """
     positive_int("max_iterations", max_iterations)
+    limit = np.inf if time_limit is None else positive_float("time_limit [s]", time_limit)
+    watch = Progress(now() + limit, limit, callback)
     if motion not in MOTIONS:
         raise UnknownNameError("motion", got=motion, known=MOTIONS)
     given, files = read_given(model, recordings)
     columns = columns_of(given)
     pieces = read_pieces(model, given, held_out, columns)
-    tree = tree_for_identification(model)
+    tree = tree_for_identification(model, servos=True)
     why = str(tree) if isinstance(tree, Refusal) else what_acts(model, pieces)
     if motion == "continuous" and isinstance(tree, Refusal):
         raise ModelError(f"{model.name}: motion in continuous time is not supported: {why}")
@@ -128,17 +151,22 @@ def identify(
     if columns and own_tree is None:
         raise ModelError(f"{model.name}: sensors need motion in continuous time, but {why or 'steps are fitted'}")
     outputs = choose_sensors(model, own_tree, columns, sensors)
-    unknowns = choose_unknowns(model, own_tree, parameters, priors, bounds, columns)
+    ranges = None if own_tree is None else physical_ranges(model, own_tree, _largest(own_tree, pieces))
+    unknowns = choose_unknowns(model, own_tree, parameters, priors, bounds, columns, ranges)
     stated = given_noise(model, noise, columns)
     scatter = noise_by_differences(model, pieces)
-    problem = Problem(model, unknowns, pieces, stated, scatter, outputs)
+    problem = Problem(model, unknowns, pieces, stated, scatter, outputs, watch=watch)
     if motion == "impacts":
         if priors or bounds:
             raise InputError("priors and bounds", got="given", expected='no priors and no bounds with motion="impacts"')
         result = fit_through_impacts(model, pieces, parameters, problem.first_noise)
     else:
         law: Law = (
-            discrete_motion(model, unknowns, pieces) if own_tree is None else TreeMotion(model, own_tree, unknowns)
+            discrete_motion(model, unknowns, pieces)
+            if own_tree is None
+            else servo_motion(model, own_tree, unknowns)
+            if np.any(own_tree.commanded)
+            else TreeMotion(model, own_tree, unknowns)
         )
         fit, solved = problem.solve(law, max_iterations)
         result = problem.judged(fit, solved, why if motion == "auto" else "")
@@ -157,6 +185,21 @@ def identify(
         dict(sensors or {}),
     )
     return replace(result, asked=asked)
+
+
+def _largest(tree: Tree, pieces: Sequence[Excerpt]) -> Array:
+    """Return the largest input (nu,) in the recordings; for a servo, the largest distance from the commanded position.
+
+    Positions that were not measured do not count.
+    """
+    joints = np.flatnonzero(tree.servo >= 0)
+    largest = [np.zeros(tree.actuation.shape[1])]
+    for piece in pieces:
+        far = np.abs(piece.us)
+        q = tree.joint_positions(piece.ys[:-1, : tree.coordinates.nq])[:, tree.positions[joints]]
+        far[:, tree.servo[joints]] = np.nan_to_num(np.abs(piece.us[:, tree.servo[joints]] - q))
+        largest.append(np.max(far, axis=0))
+    return np.max(largest, axis=0)
 
 
 def what_acts(model: Model, pieces: Sequence[Excerpt]) -> str:
@@ -184,6 +227,7 @@ class Problem:
     scatter: Array  # (2 nv + m,) the noise estimated from neighbouring samples
     sensors: Sensors | None = None
     jumps: bool = False  # whether the motion has jumps, as at impacts
+    watch: Progress = field(default_factory=Progress)
 
     @property
     def entries(self) -> tuple[str, ...]:
@@ -191,7 +235,8 @@ class Problem:
         return (*tangent_space(self.model).names, *(() if self.sensors is None else self.sensors.columns))
 
     def fit(self, law: Law, pieces: Sequence[Excerpt], noise: Array, *, fixed: bool = False) -> Fit:
-        return Fit(self.model, law, self.unknowns, pieces, noise, sensors=self.sensors, fixed=fixed)
+        watch = Progress() if fixed else self.watch
+        return Fit(self.model, law, self.unknowns, pieces, noise, sensors=self.sensors, fixed=fixed, watch=watch)
 
     def guess(self, fit: Fit) -> Array:
         s = fit.segments
@@ -209,23 +254,62 @@ class Problem:
     def prepared(self, law: Law) -> tuple[Fit, Array]:
         """Return a fit with short enough integration steps and pieces, and a guess of the starts of its segments."""
         z, noise = self.unknowns.z_first, self.first_noise
-        fit = self.fit(law, self.fitted, noise)
+        fit = self.fit(law, self.windows(law, self.fitted), noise)
         starts = self.guess(fit)
+        if isinstance(law, TreeMotion) and law.has_servos and (point := fit.at(z, starts)) is not None:
+            every = np.concatenate(point.residuals)
+            size = np.sqrt(np.nansum(every**2, axis=0) / np.isfinite(every).sum(axis=0).clip(1))
+            noise = np.where(np.isfinite(self.stated), noise, noise * np.maximum(size, 1.0))
+            fit = self.fit(law, fit.segments.pieces, noise)
         while not self.follows(fit, z, starts):
             fit = self.shortened(fit, fit.segments.pieces, noise)
         fit = self.fit(fit.law, growth_cuts(fit, z, starts), noise)
         return fit, self.guess(fit)
 
+    def windows(self, law: Law, pieces: Sequence[Excerpt]) -> list[Excerpt]:
+        """Cut pieces of a servo's motion into windows, each with its own first state, as errors of the model add up."""
+        if not (isinstance(law, TreeMotion) and law.has_servos):
+            return list(pieces)
+        cut = []
+        for piece in pieces:
+            count = max(1, round((piece.times[-1] - piece.times[0]) / SERVOS.window))
+            ends = np.searchsorted(piece.times, np.linspace(piece.times[0], piece.times[-1], count + 1) - 1e-9)
+            cut += [piece.part(int(a), int(b)) for a, b in pairwise(ends)]
+        return cut
+
     def solve(self, law: Law, most: int) -> tuple[Fit, Solved]:
         """Fit with steps so short that halving them does not change the motion, at the first and the last values."""
         fit, starts = self.prepared(law)
         z, pieces = self.first(fit, starts), fit.segments.pieces
+        fit = self.pinned(fit, z, starts)
+        if fit.has_servos:
+            fit, solved = self.weighted(fit, z, starts, most)
+            z, starts, fit = solved.z, solved.starts, self.fit(with_exact_derivatives(fit.law), pieces, fit.noise)
         while True:
             fit, solved = self.weighted(fit, z, starts, most)
-            if self.follows(fit, solved.z, solved.starts):
+            if self.watch.is_late or self.follows(fit, solved.z, solved.starts):
                 return fit, solved
             z, starts = solved.z, solved.starts
             fit = self.shortened(fit, pieces, fit.noise)
+
+    def pinned(self, fit: Fit, z: Array, starts: Array) -> Fit:
+        """Return the fit in which quantities that the recordings do not determine keep the model's values.
+
+        They are those whose deviation would exceed their own size if they were estimated alone.
+        """
+        point = fit.at(z, starts)
+        if point is None or isinstance(fit.law, DiscreteMotion):
+            return fit
+        finer = np.nanmax(fit.noise / self.first_noise)  # the residuals may fall to the noise of the samples
+        known = finer * np.linalg.norm(fit.reduce(point).R, axis=0) * self.unknowns.widths / FAR
+        blind = [bool(np.all(known[s] * UNSEEN < 1)) and unknown.prior is None for unknown, s in self.unknowns.items()]
+        if not any(blind):
+            return fit
+        pinned = [replace(u, pinned=is_blind) for u, is_blind in zip(self.unknowns.each, blind, strict=True)]
+        names = [u.name for u in pinned if u.pinned]
+        self.watch.say(f"the recordings do not determine {', '.join(names)}; they keep the model's values")
+        self.unknowns = replace(self.unknowns, each=tuple(pinned))
+        return self.fit(replace(fit.law, unknowns=self.unknowns), fit.segments.pieces, fit.noise)
 
     def first(self, fit: Fit, starts: Array) -> Array:
         """Return the initial guess: the model's values, and the delay with the best prediction for the rest.
@@ -237,6 +321,9 @@ class Problem:
             return z
         low, high = (float(bound[column]) for bound in self.unknowns.bounds)
         period = float(np.median(np.diff(self.pieces[0].times)))
+        if fit.has_servos:  # a delay is one of few numbers, so some of the windows determine it
+            fit = self.fit(fit.law, fit.segments.pieces[:: 1 + len(fit.segments.pieces) // SERVOS.few], fit.noise)
+            starts = self.guess(fit)
         tried = []
         for delay in np.clip(period * np.array(DELAYS), low, high):
             candidate = z.copy()
@@ -262,7 +349,9 @@ class Problem:
             ends.append(xs[np.arange(len(xs)), segments.counts])
         with np.errstate(over="ignore", invalid="ignore"):
             gap = fit.space.minus(*ends) / fit.gap_scale
-        return bool(np.all(np.isfinite(gap)) and np.max(np.abs(gap)) <= STEP_ERROR)
+        return bool(
+            np.all(np.isfinite(gap)) and np.max(np.abs(gap)) <= (SERVOS.step_error if fit.has_servos else STEP_ERROR)
+        )
 
     def shortened(self, fit: Fit, pieces: Sequence[Excerpt], noise: Array) -> Fit:
         law = fit.shorter
@@ -278,11 +367,13 @@ class Problem:
         for _ in range(ROUNDS):
             solved = fit.solve(z, starts, most)
             z, starts = solved.z, solved.starts
-            if not self.follows(fit, z, starts):
+            if self.watch.is_late or not self.follows(fit, z, starts):
                 return fit, solved
             noise = np.where(np.isfinite(self.stated), self.stated, np.fmax(noise_of(fit, solved), 1e-3 * self.scatter))
             seen = np.isfinite(noise)
-            if np.max(np.abs(noise[seen] / fit.noise[seen] - 1)) < SAME_NOISE:
+            if np.max(np.abs(noise[seen] / fit.noise[seen] - 1)) < (
+                SERVOS.same_noise if fit.has_servos else SAME_NOISE
+            ):
                 return fit, solved
             fit = self.fit(fit.law, fit.segments.pieces, noise)
         return fit, fit.solve(z, starts, most)
@@ -292,7 +383,7 @@ class Problem:
         freedom = freedom_of(fit, solved)
         known = known_of(unknowns, z, solved.reduced.R)
         intervals = intervals_of(unknowns, z, known.covariance, freedom.left)
-        before, after, why_not, motions = self._predicted(fit, solved, known, freedom.left)
+        (before, after), sizes, why_not, motions = self._predicted(fit, solved, known, freedom.left)
         reason = self.doubt(fit, solved, why_not)
         return identification(
             unknowns,
@@ -300,6 +391,7 @@ class Problem:
             intervals,
             open_=unidentifiable(unknowns, z, known.open),
             errors=(before, after),
+            sizes=sizes,
             reason=reason,
             noise={n: float(s) for n, s in zip(self.entries, fit.noise, strict=True) if np.isfinite(s)},
             residuals=tuple(frozen(r) for r in solved.reduced.residuals),
@@ -315,30 +407,43 @@ class Problem:
 
     def _predicted(
         self, fit: Fit, solved: Solved, known: Known, freedom: float
-    ) -> tuple[float, float, str, list[Followed]]:
-        """Return (error with the model's values, with the estimates, why it is too large or "", the motions)."""
-        held = [piece for piece in self.pieces if piece.held_out]
+    ) -> tuple[tuple[float, float], dict[str, Sizes], str, list[Followed]]:
+        """Return the errors with the model's values and with the estimates, why they are too large, and the motions.
+
+        The errors are in units of the noise, and by entry in its unit.
+        """
+        held = self.windows(fit.law, [piece for piece in self.pieces if piece.held_out])
         pieces = held or list(fit.segments.pieces)
-        states_fit = self.fit(fit.law, pieces, fit.noise, fixed=True)
-        errors, moved = [], []
+        states_fit = self.fit(with_exact_derivatives(fit.law, False), pieces, fit.noise, fixed=True)
+        errors, sizes, moved = [], [], []
         for z in (self.unknowns.z_start, solved.z):
             fixed = states_fit.solve(z, self.guess(states_fit), 20)
             moved.append([frozen(xs) for xs in states_fit.states(fixed)])
             left = max(freedom_of(states_fit, fixed).left, 1)
             total = sum(float(np.nansum(r**2)) for r in fixed.reduced.residuals)
             errors.append(float(np.sqrt(total / left)))
+            every = np.concatenate(fixed.reduced.residuals)
+            sizes.append(fit.noise * np.sqrt(np.nansum(every**2, axis=0) / np.isfinite(every).sum(axis=0).clip(1)))
+        contract = self.model.contract
+        units = {c.name: c.unit for c in (*contract.positions, *contract.velocities)}
+        by_entry = {
+            name: in_usual_units(float(was), float(now), units.get(name, ""))
+            for name, was, now in zip(self.entries, *sizes, strict=True)
+            if np.isfinite(was)
+        }
+        pair = (errors[0], errors[1])
         fitted = [frozen(xs) for xs in fit.states(solved)]
         if not held:
-            return errors[0], errors[1], "", [*map(Followed, pieces, fitted, moved[0])]
+            return pair, by_entry, "", [*map(Followed, pieces, fitted, moved[0])]
         motions = [Followed(p, xs, None) for p, xs in zip(fit.segments.pieces, fitted, strict=True)]
         motions += map(Followed, held, moved[1], moved[0])
         finite = np.where(np.isfinite(known.covariance), known.covariance, 0.0)
         extra = float(np.trace(fixed.reduced.R @ finite @ fixed.reduced.R.T))
         allowed = float(stats.f.ppf(0.999, left, max(freedom, 1))) * (1 + extra / left)
         if fixed.converged and errors[1] ** 2 <= allowed:
-            return errors[0], errors[1], "", motions
+            return pair, by_entry, "", motions
         why = f"the error on held-out samples is {errors[1]:.3g} times the noise"
-        return errors[0], errors[1], why, motions
+        return pair, by_entry, why, motions
 
     def doubt(self, fit: Fit, solved: Solved, why_not: str) -> str:
         """Return why the model does not explain the recordings, or "" if it does."""

@@ -33,6 +33,11 @@ class TreeSystem(NamedTuple):
     stiffness: Array
     rest: Array
     coulomb: Array
+    servo: Whole  # (n,) index of the input that is the joint's commanded position; -1 if there is none
+    kp: Array  # (nu,)
+    kd: Array  # (nu,)
+    strength: Array  # (nu,)
+    limit: Array  # (nu,) maximum effort of a servo
     slip: float  # speed over which smooth friction changes its sign; 0 if `turn` gives the direction of sliding
 
 
@@ -51,7 +56,10 @@ def _load(s: TreeSystem, x: Array, q: Array, v: Array) -> None:
 
 @inner
 def _add_forces(s: TreeSystem, q: Array, v: Array, push: Array, turn: Array, mass: Array, tau: Array) -> None:
-    """Replace tau (n,) by the accelerating force, and add the reflected inertia to mass (n, n)."""
+    """Replace tau (n,) by the accelerating force, and add the reflected inertia to mass (n, n).
+
+    push (n,) is the force on a joint, or the commanded position of a servo.
+    """
     for i in range(len(v)):
         slide = 0.0
         if s.slip > 0:
@@ -60,7 +68,11 @@ def _add_forces(s: TreeSystem, q: Array, v: Array, push: Array, turn: Array, mas
             for j in range(len(turn)):
                 slide += np.sign(s.spread[i, j]) * turn[j]
         mass[i, i] += s.reflected[i]
-        tau[i] = push[i] - tau[i] - s.damping[i] * v[i] - s.coulomb[i] * slide
+        force, k = push[i], s.servo[i]
+        if k >= 0:
+            force = s.kp[k] * (push[i] - q[s.position[i]]) - s.kd[k] * v[i]
+            force = s.strength[k] * min(max(force, -s.limit[k]), s.limit[k])
+        tau[i] = force - tau[i] - s.damping[i] * v[i] - s.coulomb[i] * slide
         if s.stiffness[i] != 0:
             tau[i] -= s.stiffness[i] * (q[s.position[i]] - s.rest[i])
 

@@ -8,10 +8,18 @@ import numpy as np
 from drake_diff._base.arrays import Array
 from drake_diff.identification.unknowns import Unknowns
 
+Sizes = tuple[float, float, str]  # rms errors before and after, and their unit
+DEGREES = {"rad": "degrees", "rad/s": "degrees/s"}
 PART = 0.03  # fraction of the largest change in a combination below which a change is omitted
 COMBINED = ("friction", "stiffness")  # Drake combines those of two bodies in contact: 2 a b / (a + b), or half of it
 NOISE_IS_LEFT = "the residuals are noise, and held-out samples are predicted"
 NO_CHANGE = "Not explained: no change that was tried explains the recording"
+
+
+def in_usual_units(before: float, after: float, unit: str) -> Sizes:
+    """Return two errors with their unit; angles are in degrees."""
+    factor = 180 / np.pi if unit in DEGREES else 1.0
+    return factor * before, factor * after, DEGREES.get(unit, unit)
 
 
 def changed_to(name: str, values: Array, intervals: Array, start: Array, unit: str) -> str:
@@ -78,9 +86,13 @@ def identification_sentence(
     intervals: Array,
     unidentifiable: Sequence[str],
     errors: tuple[float, float],
+    sizes: Mapping[str, Sizes],
     reason: str,
 ) -> str:
-    """Return the sentence about the estimates (np,), their intervals (np, 2) and the decrease of the error."""
+    """Return the sentence about the estimates (np,), their intervals (np, 2) and the decrease of the error.
+
+    The error of a motion that is not explained is in the units of its entries (`sizes`), as its noise is not known.
+    """
     start, width = unknowns.start, np.maximum(intervals[:, 1] - intervals[:, 0], 1e-300)
     known = np.all(np.isfinite(intervals), axis=1)
     within = known & (intervals[:, 0] <= start) & (start <= intervals[:, 1])
@@ -105,7 +117,13 @@ def identification_sentence(
         first = f" ({unidentifiable[0]}{more})" if unidentifiable else ""
         clauses.append(f"{np.sum(~known)} cannot be known from these recordings{first}")
     verdict = f"Not explained: {'; '.join(clauses)}" if reason else f"Explained: {'; '.join(clauses)}"
-    error = f"the error falls from {errors[0]:.3g} to {errors[1]:.3g} times the noise"
+    change = "falls" if errors[1] <= errors[0] else "rises"
+    error = f"the error {change} from {errors[0]:.3g} to {errors[1]:.3g} times the noise"
+    if reason and sizes:
+        worst = max(sizes, key=lambda name: sizes[name][1])
+        _, now, unit = sizes[worst]
+        rms = np.sqrt(np.mean(np.square([size[:2] for size in sizes.values() if size[2] == unit]), axis=0))
+        error = f"the rms error {change} from {rms[0]:.3g} to {rms[1]:.3g} {unit}, at most {now:.3g} in {worst}"
     return f"{verdict}; {error}; {reason or NOISE_IS_LEFT}."
 
 

@@ -23,7 +23,18 @@ from drake_diff.derivatives.contact.laws import QUANTITIES
 from drake_diff.derivatives.step import StepDerivatives, derivatives_along
 from drake_diff.exceptions import GradientError, InputError
 from drake_diff.identification.recordings import Excerpt
-from drake_diff.identification.tree import ORDER_8, Grip, Method, Tree, TreeDynamics
+from drake_diff.identification.tree import (
+    ORDER_4,
+    ORDER_8,
+    SLIP_SPEED,
+    Branch,
+    Grip,
+    Method,
+    Tree,
+    TreeDynamics,
+    branches_of,
+    whole,
+)
 from drake_diff.identification.unknowns import (
     BIAS,
     COULOMB,
@@ -179,6 +190,17 @@ def _jump(dynamics: TreeDynamics, phase: SlidingPhase) -> Array:
     return jump
 
 
+@dataclass(frozen=True, eq=False)
+class Slopes:
+    """The derivatives of steps of some states with respect to themselves and to the unknowns that move them."""
+
+    states: Indices  # (nx,) among all states
+    tangent: Indices  # (2 nv,) among the entries of a tangent vector
+    columns: Indices  # (np,) among all unknowns
+    by_x: Array  # (K, M, nx, nx)
+    by_z: Array  # (K, M, nx, np)
+
+
 LONGEST = 0.02  # [s] longest step in continuous time
 CHUNK = 256  # number of steps that are differentiated in one call
 FINITE_DIFFERENCE, DIFFERENCE = "finite_difference", 1e-5  # relative difference of a parameter
@@ -199,6 +221,7 @@ class TreeMotion:
     method: Method = ORDER_8
     frozen: bool = False  # whether derivatives use the equations linearized at the midpoint of a step
     smooth: bool = False
+    slip: float = SLIP_SPEED  # [rad/s or m/s] over which smooth friction changes its sign
 
     @cached_property
     def dry(self) -> tuple[int, ...]:
@@ -209,6 +232,11 @@ class TreeMotion:
         return tuple(sorted(joints if coupling is None else {int(coupling.of_v[i]) for i in joints}))
 
     @property
+    def has_servos(self) -> bool:
+        """Whether any input is a commanded position."""
+        return bool(np.any(self.tree.commanded))
+
+    @property
     def kinks(self) -> bool:
         """Whether any joint can stick."""
         return bool(self.dry)
@@ -216,7 +244,8 @@ class TreeMotion:
     @property
     def words(self) -> str:
         friction = ", with Coulomb friction that sticks" if self.dry else ""
-        return f"continuous time, by steps of order 8 of at most {1e3 * self.longest:.3g} ms{friction}"
+        order = 8 if self.method is ORDER_8 else 4
+        return f"continuous time, by steps of order {order} of at most {1e3 * self.longest:.3g} ms{friction}"
 
     def cut(self, period: float) -> tuple[float, ...]:
         """Return the lengths of the steps [s] over a time between samples [s]."""
@@ -234,35 +263,49 @@ class TreeMotion:
     def dynamics(self, values: Array) -> TreeDynamics:
         """Return the dynamics of the tree for these values of the unknowns."""
         numbers = set_numbers(self.model, self.tree, self.unknowns, values)
-        return TreeDynamics(self.tree, numbers, self.dry, self.method, self.frozen)
+        return TreeDynamics(self.tree, numbers, self.dry, self.method, self.frozen, self.slip)
 
     def run(self, values: Array, starts: Array, hs: Array, us: Array) -> Array:
         """Return the states (K, M+1, nx) from starts (K, nx) by steps of hs (K, M) [s] under us (K, M, nu)."""
-        dynamics = self.dynamics(values)
-        xs = np.empty((len(starts), hs.shape[1] + 1, starts.shape[1]))
-        xs[:, 0] = starts
-        for m in range(hs.shape[1]):
-            xs[:, m + 1], some = xs[:, m], hs[:, m] > 0
-            xs[some, m + 1] = self._step(dynamics, xs[some, m], hs[some, m], us[some, m])
+        dynamics, (K, M) = self.dynamics(values), hs.shape
+        xs = np.empty((K, M + 1, starts.shape[1]))
+        for branch in self.branches:
+            alone, x = branch.restrict(dynamics), starts[:, branch.states]
+            xs[:, 0, branch.states] = x
+            for m in range(M):
+                some = hs[:, m] > 0
+                x[some] = self._step(alone, x[some], hs[some, m], us[some, m][:, branch.inputs])
+                xs[:, m + 1, branch.states] = x
         return xs
 
     def _step(self, dynamics: TreeDynamics, x: Array, h: Array, u: Array) -> Array:
-        return step_with_friction(dynamics, x, h, u)[0] if self.dry else dynamics.step(x, h, u)
+        return step_with_friction(dynamics, x, h, u)[0] if dynamics.dry else dynamics.step(x, h, u)
 
-    def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
-        """Return the derivatives of each step with respect to the state (K, M, nx, nx) and to z (K, M, nx, np)."""
-        dynamics, by, nx = self.dynamics(self.unknowns.values(z)), self.by(z), xs.shape[2]
-        x, h, u = xs[:, :-1].reshape(-1, nx), hs.reshape(-1), us.reshape(hs.size, -1)
-        total = np.zeros((hs.size, nx, nx + by.shape[1]))
+    @cached_property
+    def branches(self) -> tuple[Branch, ...]:
+        """The independent branches of the tree."""
+        return branches_of(self.tree)
+
+    def slopes(self, z: Array, xs: Array, hs: Array, us: Array, *, together: bool = False) -> list["Slopes"]:
+        """Return the derivatives of each step of each independent branch, or of the whole tree."""
+        dynamics, by = self.dynamics(self.unknowns.values(z)), self.by(z)
+        return [self._slopes(b, dynamics, by, xs, hs, us) for b in ((whole(self.tree),) if together else self.branches)]
+
+    def _slopes(self, branch: Branch, dynamics: TreeDynamics, by: Array, xs: Array, hs: Array, us: Array) -> "Slopes":
+        by, dynamics, nx = by[branch.flat], branch.restrict(dynamics), len(branch.states)
+        columns = np.flatnonzero(np.any(by != 0, axis=0))
+        x = xs[:, :-1, branch.states].reshape(-1, nx)
+        h, u = hs.reshape(-1), us[..., branch.inputs].reshape(hs.size, -1)
+        total = np.zeros((hs.size, nx, nx + len(columns)))
         total[:, :, :nx] = np.eye(nx)
         steps = np.flatnonzero(h > 0)
         for rows in np.split(steps, range(CHUNK, len(steps), CHUNK)):
-            total[rows] = self._jacobians(dynamics, x[rows], h[rows], u[rows], by)
+            total[rows] = self._jacobians(dynamics, x[rows], h[rows], u[rows], by[:, columns])
         total = total.reshape(*hs.shape, nx, -1)
-        return total[..., :nx], total[..., nx:]
+        return Slopes(branch.states, branch.tangent, columns, total[..., :nx], total[..., nx:])
 
     def _jacobians(self, dynamics: TreeDynamics, x: Array, h: Array, u: Array, by: Array) -> Array:
-        return friction_jacobians(dynamics, x, h, u, by) if self.dry else dynamics.step_jacobians(x, h, u, by)
+        return friction_jacobians(dynamics, x, h, u, by) if dynamics.dry else dynamics.step_jacobians(x, h, u, by)
 
     def by(self, z: Array) -> Array:
         """Return the derivatives (count, np) of the tree's numbers with respect to z."""
@@ -273,6 +316,38 @@ class TreeMotion:
         q, v = x[:, : self.model.nq], x[:, self.model.nq :]
         speed = (self.tree.coordinates.rate(q) @ v[..., None])[..., 0]
         return np.concatenate([speed, self.dynamics(values).accelerate(x, u)], axis=1)
+
+
+@dataclass(frozen=True)
+class ServoOptions:
+    """How motions with servos are simulated and fitted."""
+
+    step: float = 0.005  # [s] the longest step
+    slip: float = 0.05  # [rad/s or m/s] over which friction changes its sign; a sharper change needs steps below 1 ms
+    window: float = 0.5  # [s] length of a piece with its own first state
+    few: int = 8  # number of windows from which the initial guess of a delay is found
+    step_error: float = 2e-3  # in units of the noise: largest change of a window's end by steps of half the length
+    same_noise: float = 0.03  # relative change of the noise below which it is not estimated again
+    settled: float = 0.02  # predicted decrease of |r|^2 at the end of a fit: a seventh of a standard deviation
+    roughly: float = 1.0  # the same with approximate derivatives
+
+
+SERVOS = ServoOptions()
+
+
+def servo_motion(model: Model, tree: Tree, unknowns: Unknowns) -> TreeMotion:
+    """Return the law for robots with servos: short steps, as servos are stiff, and friction that changes smoothly.
+
+    Its derivatives are approximate; `frozen=False` makes them exact.
+    """
+    return TreeMotion(
+        model, tree, unknowns, SERVOS.step, np.inf, method=ORDER_4, frozen=True, smooth=True, slip=SERVOS.slip
+    )
+
+
+def with_exact_derivatives(law: "Law", exact: bool = True) -> "Law":
+    """Return a law for servos with exact or approximate derivatives; other laws as they are."""
+    return replace(law, frozen=not exact) if isinstance(law, TreeMotion) and law.has_servos else law
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,12 +381,12 @@ class EulerMotion(TreeMotion):
         return by
 
     def _step(self, dynamics: TreeDynamics, x: Array, h: Array, u: Array) -> Array:
-        return euler_step(self.tree.coordinates, self.longest, x, dynamics.accelerate(x, u))
+        return euler_step(dynamics.tree.coordinates, self.longest, x, dynamics.accelerate(x, u))
 
     def _jacobians(self, dynamics: TreeDynamics, x: Array, h: Array, u: Array, by: Array) -> Array:
         a, by_state = dynamics.acceleration_jacobians(x, u, by)
-        x_next = euler_step(self.tree.coordinates, self.longest, x, a)
-        return euler_jacobian(self.tree.coordinates, self.longest, x, x_next, by_state)
+        coordinates = dynamics.tree.coordinates
+        return euler_jacobian(coordinates, self.longest, x, euler_step(coordinates, self.longest, x, a), by_state)
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,8 +422,8 @@ class DiscreteMotion:
                 xs[k, count + 1 :] = xs[k, count]
         return xs
 
-    def slopes(self, z: Array, xs: Array, hs: Array, us: Array) -> tuple[Array, Array]:
-        """Return the derivatives of each step with respect to the state (K, M, nx, nx) and to z (K, M, nx, np)."""
+    def slopes(self, z: Array, xs: Array, hs: Array, us: Array, *, together: bool = True) -> list[Slopes]:
+        """Return the derivatives of each step; the states are always `together`, as contact may couple them."""
         vector, by_z = self.vector.at(self.unknowns.values(z)[self.own]), self.unknowns.by_z(z)[self.own]
         K, M, nx = *hs.shape, xs.shape[2]
         by_x, by = np.tile(np.eye(nx), (K, M, 1, 1)), np.zeros((K, M, nx, len(z)))
@@ -368,7 +443,8 @@ class DiscreteMotion:
                 by_values[..., s] = _differences(vector, p, s, starts, inputs)
         by_x[taken] = np.array([step.A for step in steps])
         by[taken] = by_values @ by_z
-        return by_x, by
+        tangent = np.arange(2 * self.model.nv)
+        return [Slopes(np.arange(nx), tangent, np.arange(len(z)), by_x, by)]
 
     def _derivatives(self, model: Model, vector: ParameterVector, xs: Array, us: Array) -> Sequence[StepDerivatives]:
         """Differentiate the steps from xs (N, nx) under us (N, nu), also with respect to the vector's parameters."""

@@ -9,7 +9,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.comparison.recordings import Recording
 from drake_diff.exceptions import InputError
-from drake_diff.identification.messages import NOISE_IS_LEFT, identification_sentence
+from drake_diff.identification.messages import NOISE_IS_LEFT, Sizes, identification_sentence
 from drake_diff.identification.recordings import Excerpt
 from drake_diff.identification.unknowns import Unknowns
 from drake_diff.model.model import Model
@@ -66,6 +66,7 @@ class Identification(ShowsItsRepr):
     steps: int
     motion: str  # the law of motion that was fitted
     motions: tuple[Followed, ...]  # of the fitted pieces, then of the held-out ones
+    sizes: Mapping[str, Sizes] = field(default_factory=dict)  # by entry, the rms errors before and after, and the unit
     at_half_step: Mapping[str, Any] | None = None  # through impacts, the values with half the time step, if available
     asked: Request | None = None  # the request, which `dd.save` writes and `dd.verify` repeats
 
@@ -105,6 +106,7 @@ def identification(
     open_: tuple[str, ...],
     errors: tuple[float, float],
     reason: str,
+    sizes: Mapping[str, Sizes] | None = None,
     **rest: Any,
 ) -> Identification:
     """Return an identification of values (np,) with intervals (np, 2); it is explained if `reason` is empty."""
@@ -116,7 +118,8 @@ def identification(
         unidentifiable=open_,
         explained=not reason,
         reason=reason or NOISE_IS_LEFT,
-        sentence=identification_sentence(unknowns, values, intervals, open_, errors, reason),
+        sentence=identification_sentence(unknowns, values, intervals, open_, errors, sizes or {}, reason),
+        sizes=sizes or {},
         error_before=errors[0],
         error_after=errors[1],
         columns=unknowns.columns,

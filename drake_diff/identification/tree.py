@@ -33,6 +33,8 @@ SLIP_SPEED = 0.02  # [rad/s or m/s] over which smooth friction changes its sign
 REST = 1e-9  # [rad/s, m/s] below which a joint is at rest
 SHIFT = 0.437  # size of a central difference of numbers, which is exact for quadratic polynomials
 OF_JOINTS = ("reflected", "damping", "stiffness", "rest", "coulomb")
+OF_SERVOS = ("kp", "kd", "strength", "limit")
+PER_LINK = ("kind", "axis", "frame", "back", "mass", "center", "inertia", "size")
 Mask = NDArray[np.bool_]
 Method = tuple[Array, Array]  # of Runge-Kutta type: stages (m, m) and weights (m,)
 ORDER_8: Method = (np.array(DOP853.A[: len(DOP853.B), : len(DOP853.B)]), np.array(DOP853.B))
@@ -62,7 +64,9 @@ class Numbers:
     rest: Any  # (n,)
     coulomb: Any  # (n,) Coulomb friction [N or N m]
     strength: Any  # (nu,) factor of an input
-    limit: Any  # (nu,) magnitude to which an input is clipped
+    limit: Any  # (nu,) magnitude to which an input, or the effort of a servo, is clipped
+    kp: Any  # (nu,) gains of servos, whose inputs are commanded positions; 0 for other inputs
+    kd: Any  # (nu,)
 
     @property
     def flat(self) -> Any:
@@ -90,6 +94,7 @@ class Tree(TreeModel):
 
     coordinates: Coordinates  # of the independent joints
     actuation: Array  # (n, nu)
+    servo: Indices  # (n,) index of the input that is the joint's commanded position; -1 if there is none
     moved_by: Mapping[str, Array]  # (10, 10) by body: the map of its ten numbers to the frame of its link
     bodies: Mapping[str, Link]
     numbers: Numbers  # the model's own
@@ -98,6 +103,11 @@ class Tree(TreeModel):
     def n(self) -> int:
         """The degrees of freedom of all joints."""
         return len(self.damping)
+
+    @cached_property
+    def commanded(self) -> Mask:
+        """Whether each input (nu,) is a commanded position."""
+        return np.isin(np.arange(self.actuation.shape[1]), self.servo)
 
     @cached_property
     def spread(self) -> Array:
@@ -131,6 +141,7 @@ class TreeDynamics:
     dry: tuple[int, ...] = ()
     method: Method = ORDER_8
     frozen: bool = False  # whether derivatives use the equations linearized at the midpoint of a step
+    slip: float = SLIP_SPEED  # [rad/s or m/s] over which smooth friction changes its sign
 
     @property
     def nv(self) -> int:
@@ -157,14 +168,15 @@ class TreeDynamics:
         follow = (np.arange(nq), np.ones(nq), np.zeros(nq))
         if coupling is not None:
             follow = (coupling.of_q, coupling.ratio_q, coupling.offset)
-        numbers = (getattr(self.numbers, name) for name in OF_JOINTS)
-        arrays = (*follow, tree.spread, *reversed(tree.coordinates.starts), tree.positions, *numbers)
-        return kernel(KERNEL).TreeSystem(self.links.tables, *map(_array, arrays), 0.0 if self.dry else SLIP_SPEED)
+        of_joints, of_servos = ([getattr(self.numbers, n) for n in names] for names in (OF_JOINTS, OF_SERVOS))
+        starts = reversed(tree.coordinates.starts)
+        arrays = (*follow, tree.spread, *starts, tree.positions, *of_joints, tree.servo, *of_servos)
+        return kernel(KERNEL).TreeSystem(self.links.tables, *map(_array, arrays), 0.0 if self.dry else self.slip)
 
     def _push(self, u: Array) -> Array:
-        """Return the forces (N, n) of inputs u (N, nu)."""
+        """Return the forces (N, n) of inputs u (N, nu); for servos, the commanded positions."""
         inputs = np.clip(u, -self.numbers.limit, self.numbers.limit) * self.numbers.strength
-        return np.asarray(inputs @ self.tree.actuation.T)
+        return np.asarray(np.where(self.tree.commanded, u, inputs) @ self.tree.actuation.T)
 
     def grip(self, x: Array, u: Array, released: Array | None = None) -> Grip:
         """Return the grip at x (N, nx); joints at rest stick unless they are `released` or the force is too large."""
@@ -244,22 +256,37 @@ class TreeDynamics:
         jacobians[:, diagonal, diagonal] += numbers.stiffness
         jacobians[:, diagonal, n + diagonal] += numbers.damping
         if not self.dry:
-            slide = np.tanh(v / SLIP_SPEED)
-            jacobians[:, diagonal, n + diagonal] += numbers.coulomb / SLIP_SPEED * (1 - slide**2)
+            slide = np.tanh(v / self.slip)
+            jacobians[:, diagonal, n + diagonal] += numbers.coulomb / self.slip * (1 - slide**2)
         terms = (a @ E.T, v, q[:, tree.positions] - numbers.rest, -numbers.stiffness, slide)
         for name, term in zip(OF_JOINTS, terms, strict=True):
             jacobians[..., 2 * n :] += np.broadcast_to(term, v.shape)[..., None] * by[places(name)]
-        cut = np.clip(u, -numbers.limit, numbers.limit)
-        by_input = cut[..., None] * by[places("strength")]
-        beyond = np.where(np.abs(u) > numbers.limit, np.sign(u) * numbers.strength, 0.0)
-        by_input += beyond[..., None] * by[places("limit")]
-        jacobians[..., 2 * n :] -= tree.actuation @ by_input
+        jacobians[..., 2 * n :] -= tree.actuation @ self._by_input(u, q, v, jacobians, by)
         columns = [jacobians[..., :n] @ E, jacobians[..., n : 2 * n] @ E, jacobians[..., 2 * n :]]
         free = 1 - grip.held[..., None]
         right = free * (E.T @ np.concatenate(columns, axis=2))
         M = E.T @ (mass + np.diag(numbers.reflected)) @ E
         M = M * free * np.swapaxes(free, 1, 2) + np.eye(nv) * (1 - free)
         return a, np.asarray(-np.linalg.solve(M, right), dtype=float)
+
+    def _by_input(self, u: Array, q: Array, v: Array, jacobians: Array, by: Array) -> Array:
+        """Return the derivatives (N, nu, P) of efforts by parameters; add those of servos by q and v to `jacobians`."""
+        numbers, places, n = self.numbers, self.numbers.places, self.tree.n
+        joints = np.flatnonzero(self.tree.servo >= 0)
+        inputs, (lag, speed) = self.tree.servo[joints], np.zeros((2, *u.shape))
+        lag[:, inputs], speed[:, inputs] = u[:, inputs] - q[:, self.tree.positions[joints]], -v[:, joints]
+        force = np.where(self.tree.commanded, numbers.kp * lag + numbers.kd * speed, u)
+        is_free = np.abs(force) <= numbers.limit
+        by_force = np.where(is_free, numbers.strength, 0.0)
+        terms = {
+            "kp": lag * by_force,
+            "kd": speed * by_force,
+            "strength": np.clip(force, -numbers.limit, numbers.limit),
+            "limit": np.where(is_free, 0.0, np.sign(force) * numbers.strength),
+        }
+        jacobians[:, joints, joints] += (by_force * numbers.kp)[:, inputs]
+        jacobians[:, joints, n + joints] += (by_force * numbers.kd)[:, inputs]
+        return np.asarray(sum(term[..., None] * by[places(name)] for name, term in terms.items()))
 
     def inverse_dynamics(self, q: Array, v: Array, a: Array, by: Array | None = None) -> tuple[Array, Array, Array]:
         """Return tau (N, n), mass (N, n, n), and d tau (N, n, 2 n + P) with respect to q's tangent, v and parameters.
@@ -343,6 +370,72 @@ class TreeDynamics:
         return np.asarray(tree.spread.T @ (mass + np.diag(self.numbers.reflected)) @ tree.spread)
 
 
+@dataclass(frozen=True, eq=False)
+class Branch:
+    """A part of a tree that moves independently of the others, as a leg on a fixed base."""
+
+    tree: Tree
+    states: Indices  # (nx,) its entries in a state of the whole tree
+    tangent: Indices  # (2 nv,) its entries in a tangent vector
+    inputs: Indices  # (nu,)
+    numbers: Mapping[str, Indices]  # the places of its numbers in `flat` of the whole tree
+
+    @property
+    def flat(self) -> Indices:
+        """The places (count,) of all its numbers."""
+        return np.concatenate([np.ravel(places) for places in self.numbers.values()])
+
+    def restrict(self, dynamics: TreeDynamics) -> TreeDynamics:
+        """Return the dynamics of this part of a whole tree."""
+        flat, v = dynamics.numbers.flat, self.tangent[: len(self.tangent) // 2]
+        numbers = Numbers(**{name: flat[places] for name, places in self.numbers.items()})
+        dry = tuple(int(i) for i in np.flatnonzero(np.isin(v, dynamics.dry)))
+        return replace(dynamics, tree=self.tree, numbers=numbers, dry=dry)
+
+
+def whole(tree: Tree) -> Branch:
+    """Return the branch that is the whole tree."""
+    nx, nv, names = tree.coordinates.nq + tree.coordinates.nv, tree.coordinates.nv, vars(tree.numbers)
+    places = {name: tree.numbers.places(name) for name in names}
+    return Branch(tree, np.arange(nx), np.arange(2 * nv), np.arange(tree.actuation.shape[1]), places)
+
+
+def branches_of(tree: Tree) -> tuple[Branch, ...]:
+    """Return the independent branches of a tree; one if it has free bodies or mimic joints, which may couple them."""
+    if tree.coupling is not None or tree.coordinates.free or not tree.links:
+        return (whole(tree),)
+    roots = list(range(len(tree.links)))
+    for i, link in enumerate(tree.links):
+        roots[i] = i if link.parent < 0 else roots[link.parent]
+    branches, t, nq = [], tree.compiled.tables, tree.coordinates.nq
+    for root in np.unique(roots):
+        links = np.flatnonzero(np.array(roots) == root)
+        count, v = np.arange(len(links)), t.first[links]
+        inputs = np.flatnonzero(np.any(tree.actuation[v] != 0, axis=0))
+        parent = np.where(t.parent[links] < 0, -1, np.searchsorted(links, t.parent[links]))
+        changed = {name: _array(getattr(t, name)[links]) for name in PER_LINK}
+        changed |= dict.fromkeys(("link_parent", "parent"), parent)
+        changed |= dict.fromkeys(("joint", "q_start", "v_start", "first"), count)
+        rows = {"inertial": links, "offset": links, "gravity": np.arange(3)}
+        rows |= dict.fromkeys(OF_JOINTS, v) | dict.fromkeys(OF_SERVOS, inputs)
+        numbers = {name: tree.numbers.places(name)[rows[name]] for name in vars(tree.numbers)}
+        some = replace(
+            tree,
+            links=tuple(tree.links[i] for i in links),
+            compiled=CompiledTree(
+                t._replace(**changed), {tree.links[i].joint.body: k for k, i in enumerate(links)}, len(links)
+            ),
+            coordinates=Coordinates((), tuple((k, k) for k in range(len(links)))),
+            positions=count,
+            damping=tree.damping[v],
+            actuation=tree.actuation[np.ix_(v, inputs)],
+            servo=np.where(tree.servo[v] < 0, -1, np.searchsorted(inputs, tree.servo[v])),
+        )
+        states, tangent = np.concatenate([tree.positions[v], nq + v]), np.concatenate([v, nq + v])
+        branches.append(Branch(some, states, tangent, inputs, numbers))
+    return tuple(branches)
+
+
 def _array(values: Any) -> Any:
     """Return a contiguous array of float64 or int64; for other arrays the kernel would be compiled again."""
     array = np.asarray(values)
@@ -380,11 +473,16 @@ def _spun(w: Array) -> Array:
     return spun
 
 
-def tree_for_identification(model: Model) -> Tree | Refusal:
-    """Return the tree of a model with its own values, or a Refusal that names what a tree cannot represent."""
+def tree_for_identification(model: Model, *, servos: bool = False) -> Tree | Refusal:
+    """Return the tree of a model with its own values, or a Refusal that names what a tree cannot represent.
+
+    With `servos`, inputs may be commanded positions.
+    """
     if model.num_constraints:
         return Refusal("joints are held by constraints")
-    if any(actuator.has_controller() for actuator in actuators(model.plant)):
+    commanded = model.inputs.commanded
+    controllers = sum(actuator.has_controller() for actuator in actuators(model.plant))
+    if controllers and not (servos and np.sum(commanded) == controllers):
         return Refusal("actuators have PD controllers in the plant")
     dynamics, springs = tree_of(model, free=True), springs_of(model.plant)
     if isinstance(dynamics, Refusal):
@@ -407,7 +505,13 @@ def tree_for_identification(model: Model) -> Tree | Refusal:
         coulomb=np.zeros(len(dynamics.damping)),
         strength=np.ones(model.nu),
         limit=np.asarray(limits, dtype=float),
+        kp=np.where(commanded, model.servo_gains[0], 0.0),
+        kd=np.where(commanded, model.servo_gains[1], 0.0),
     )
+    actuation = model.inputs.of_actuators(np.asarray(model.plant.MakeActuationMatrix()).T[: len(motors)]).T
+    by_servo = (actuation != 0) & commanded
+    if np.any(by_servo.any(axis=1) & (np.count_nonzero(actuation, axis=1) > 1)):
+        return Refusal("a joint with a servo has another actuator")
     names = ["world", *(link.joint.body for link in links)]
     rigid = [
         replace(
@@ -422,7 +526,8 @@ def tree_for_identification(model: Model) -> Tree | Refusal:
     return Tree(
         **{**vars(dynamics), "compiled": compiled},
         coordinates=coordinates_of(model),
-        actuation=model.inputs.of_actuators(np.asarray(model.plant.MakeActuationMatrix()).T[: len(motors)]).T,
+        actuation=actuation,
+        servo=np.where(by_servo.any(axis=1), np.argmax(by_servo, axis=1) if model.nu else 0, -1),
         moved_by={body: _moved_by(pose) for body, (_, pose) in dynamics.on.items()},
         bodies={link.body: link for link in bodies},
         numbers=numbers,

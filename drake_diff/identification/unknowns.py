@@ -9,14 +9,14 @@ They are their own coordinates, with a lower bound of 0.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from drake_diff._base.arrays import Array, frozen, slices_of
 from drake_diff._base.differences import complex_steps
 from drake_diff.exceptions import InputError, UnknownNameError
-from drake_diff.identification.tree import Numbers, Tree, ten_numbers
+from drake_diff.identification.tree import Numbers, Tree, TreeDynamics, ten_numbers
 from drake_diff.mechanics.description import names_of
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import (
@@ -26,11 +26,13 @@ from drake_diff.model.parameters import (
     second_moment,
     to_log_cholesky,
 )
-from drake_diff.model.plant import bodies, joints, labelled, radius_of_gyration, rotors
+from drake_diff.model.plant import actuators, bodies, joints, labelled, radius_of_gyration, rotors
 
 MASS, CENTER, INERTIA = "mass", "center_of_mass", "inertia"
 COULOMB, STRENGTH, BIAS = "coulomb_friction", "strength", "bias"
 DELAY, LIMIT = "input_delay", "limit"  # [s] of all inputs; of one input
+FIXED_OR_FREE = ("weld", "quaternion_floating")
+GAINS = ("kp", "kd")
 OF_JOINTS = {  # quantities with one number per joint, and their names in `tree.Numbers`
     "damping": "damping",
     COULOMB: "coulomb",
@@ -40,10 +42,28 @@ OF_JOINTS = {  # quantities with one number per joint, and their names in `tree.
 }
 OF_TREE = (
     MASS, CENTER, INERTIA, "damping", "offset", "spring_stiffness", "spring_rest_angle", "spring_rest_length",
-    "gear_ratio", "rotor_inertia", "gravity", COULOMB, STRENGTH,
+    "gear_ratio", "rotor_inertia", "gravity", COULOMB, STRENGTH, *GAINS,
 )  # fmt: skip
 OF_ALL = (MASS, CENTER, INERTIA, "damping", "spring_stiffness", "rotor_inertia")
+OF_SERVOS = ("damping", COULOMB, "rotor_inertia", DELAY)
 FAR = 3.0  # prior standard deviation of a quantity's change, in units of its own size
+
+
+@dataclass(frozen=True)
+class RangeOptions:
+    """The physical ranges of joints, servos and delays, and the usual sizes of quantities that are 0 in the model."""
+
+    most_rotor: float = 1000.0  # times the inertia that a joint moves: the largest reflected rotor inertia
+    least_speed: float = 0.1  # [rad/s, m/s] at which the largest damping takes the largest effort
+    most_gain: float = 10.0  # times the model's gain: the largest one; the smallest is the inverse
+    most_delay: float = 0.2  # [s]
+    usual_share: float = 0.1  # of the largest effort: a usual friction, or damping at 1 rad/s or 1 m/s
+    usual_delay: float = 0.02  # [s]
+    pinned: float = 1e-6  # factor of the width of a quantity that the recordings do not determine
+    settling: float = 0.005  # [s] least time constant that kd gives a joint whose rotor inertia is guessed
+
+
+RANGES = RangeOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +78,8 @@ class Unknown:
     upper: float = np.inf
     prior: tuple[Array, Array] | None = None  # mean (k,) and standard deviation (k,), from the user
     shifts: bool = False  # whether it is a delay of the inputs
+    first: float | None = None  # the initial guess of a search, if it is not the model's value
+    pinned: bool = False  # whether it keeps the model's value, as the recordings do not determine it
 
     @property
     def label(self) -> str:
@@ -129,9 +151,10 @@ class Unknowns:
 
     @property
     def pulls(self) -> Array:
-        """The widths (np,), but infinite for unknowns with a prior."""
+        """The widths (np,), but infinite for unknowns with a prior, and small for pinned ones."""
         pulls = self.widths
         for unknown, s in self.items():
+            pulls[s] *= RANGES.pinned if unknown.pinned else 1.0
             if unknown.prior is not None:
                 pulls[s] = np.inf
         return pulls
@@ -159,8 +182,11 @@ class Unknowns:
 
     @property
     def z_first(self) -> Array:
-        """The initial z of a search: the model's own values, clipped to the bounds."""
-        return np.clip(self.z_start, *self.bounds)
+        """The initial z of a search: the model's own values or `first`, clipped to the bounds."""
+        z = self.z_start
+        for unknown, s in self.items():
+            z[s] = z[s] if unknown.first is None else unknown.first
+        return np.clip(z, *self.bounds)
 
     @property
     def delay(self) -> int | None:
@@ -224,6 +250,7 @@ def choose_unknowns(
     priors: Mapping[str, Any] | None = None,
     bounds: Mapping[str, Any] | None = None,
     columns: Sequence[str] = (),
+    physical: Mapping[str, "Physical"] | None = None,
 ) -> Unknowns:
     """Return the unknowns `names`; "all" are all inertial parameters, dampings, spring stiffnesses and rotor inertias.
 
@@ -235,7 +262,12 @@ def choose_unknowns(
     known |= {f"{column}.{BIAS}": ("", np.zeros(1), -np.inf) for column in columns}
     known = {n: e for n, e in _extra(model).items() if tree is not None or n.endswith(f".{BIAS}")} | known
     if isinstance(names, str) and names == "all":
-        names = [name for name in parameters if name.rsplit(".", 1)[1] in OF_ALL]
+        servos = tree is not None and bool(np.any(tree.commanded))
+        names = [
+            name
+            for name in (known if servos else parameters)
+            if name.rsplit(".", 1)[1] in (OF_SERVOS if servos else OF_ALL)
+        ]
         names = [name for name in names if _why_not(model, tree, name, known[name][1]) is None]
     elif isinstance(names, str):
         names = [names]
@@ -247,11 +279,14 @@ def choose_unknowns(
         why = _why_not(model, tree, name, value)
         if why is not None:
             raise InputError(name, got=why, expected="a quantity that can be estimated")
-        low, high = _bounds_of(name, (bounds or {}).get(name), lower)
+        usual = (physical or {}).get(name, Physical(lower, np.inf, 0.0))
+        low, high = _bounds_of(name, (bounds or {}).get(name, (usual.lower, usual.upper)), lower)
         start = np.array(value, dtype=float)
         prior = _prior_of(name, priors[name], len(start)) if priors and name in priors else None
         shifts = name.endswith(f".{DELAY}")
-        unknowns.append(Unknown(name, unit, start, low, _size(model, name, value), high, prior, shifts))
+        size = _size(model, name, value) or usual.size
+        first = usual.first if usual.first and not np.any(start) else None
+        unknowns.append(Unknown(name, unit, start, low, size, high, prior, shifts, first))
     for subject, given in (("prior of", priors), ("bounds of", bounds)):
         for name in given or {}:
             if name not in names:
@@ -261,10 +296,47 @@ def choose_unknowns(
     return Unknowns(tuple(unknowns))
 
 
+class Physical(NamedTuple):
+    """The bounds of a quantity in any machine like the model, and the size of a change by 100 % if the model has 0."""
+
+    lower: float
+    upper: float
+    size: float
+    first: float = 0.0  # the initial guess of a search if the model has 0
+
+
+def physical_ranges(model: Model, tree: Tree, largest: Array) -> dict[str, Physical]:
+    """Return the ranges of joints, servos and delays by name, for the largest inputs or servo errors (nu,)."""
+    motors, numbers = labelled(rotors(model.plant)), tree.numbers
+    kinds = {f"model.{DELAY}": Physical(0.0, RANGES.most_delay, RANGES.usual_delay)}
+    still = np.zeros((1, tree.n))
+    q = tree.joint_positions(model.default_state[None, : model.nq])
+    inertias = np.diag(TreeDynamics(tree, numbers).inverse_dynamics(q, still, still)[1][0])
+    efforts = np.abs(tree.actuation) @ np.minimum(np.where(tree.commanded, numbers.kp, 1.0) * largest, numbers.limit)
+    names = names_of(model.plant)[1]
+    by_joint = {link.joint: link.v_start for link in tree.bodies.values() if link.kind not in FIXED_OR_FREE}
+    for label, v in by_joint.items():
+        if efforts[v] > 0:
+            kinds[f"{label}.{COULOMB}"] = Physical(0.0, efforts[v], RANGES.usual_share * efforts[v])
+            kinds[f"{label}.damping"] = Physical(0.0, efforts[v] / RANGES.least_speed, RANGES.usual_share * efforts[v])
+    for label, motor in motors.items():
+        v, ratio = by_joint[names[motor.joint().index()]], max(motor.default_gear_ratio() ** 2, 1e-300)
+        inertia, kd = inertias[v] / ratio, numbers.kd[tree.servo[v]] if tree.servo[v] >= 0 else 0.0
+        first = max(RANGES.settling * kd / ratio - inertia, 0.0)
+        kinds[f"{label}.rotor_inertia"] = Physical(
+            0.0, max(RANGES.most_rotor * inertia, 10 * first), max(10 * inertia, first), first
+        )
+    for i, label in enumerate(model.input_names):
+        for name in GAINS if tree.commanded[i] else ():
+            gain = float(getattr(numbers, name)[i])
+            kinds[f"{label}.{name}"] = Physical(gain / RANGES.most_gain, gain * RANGES.most_gain or np.inf, gain)
+    return kinds
+
+
 def _bounds_of(name: str, given: Any, lower: float) -> tuple[float, float]:
     """Return the lower and the upper bound: the given ones, limited to possible values."""
-    if given is None:
-        return lower, np.inf
+    if given == (lower, np.inf):
+        return given
     subject = f"bounds of {name}"
     try:
         low, high = (float(value) for value in given)
@@ -388,6 +460,9 @@ def set_numbers(model: Model, tree: Tree, unknowns: Unknowns, values: Any) -> Nu
             arrays["gravity"][:] = value
         elif quantity in (STRENGTH, LIMIT):
             arrays[quantity][model.input_names.index(label)] = value
+        elif quantity in GAINS:
+            motor = list(labelled(actuators(model.plant))).index(label)
+            arrays[quantity][int(np.flatnonzero(model.inputs.actuator == motor)[0])] = value
     if any(name.rsplit(".", 1)[1] in ("gear_ratio", "rotor_inertia") for name in given):
         _set_rotors(model, by_joint, given, arrays["reflected"])
     return Numbers(**arrays)

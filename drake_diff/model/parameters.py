@@ -290,6 +290,11 @@ CONTACT_KINDS = (
 
 
 KINDS = (*MECHANISM_KINDS, *CONTACT_KINDS)
+EFFECTS = {
+    "mass": "the inertia scales with it",
+    "center_of_mass": "the inertia about the body's origin stays",
+    "inertia": "about the centre of mass, mass and centre stay",
+}
 TIME_STEP = "model.time_step"
 
 
@@ -309,7 +314,13 @@ class Parameter:
         value = ", ".join(f"{v:g}" for v in self.value)
         value = value if len(self.value) == 1 else f"({value})"
         least = ", at least 0" if self.lower == 0 else ""
-        return f"{self.name} = {value} {self.unit}{least}; derivative by {self.derivative_source}"
+        effect = f"; {self.effect}" if self.effect else ""
+        return f"{self.name} = {value} {self.unit}{least}{effect}; derivative by {self.derivative_source}"
+
+    @property
+    def effect(self) -> str:
+        """What else a change of a mass or a centre of mass changes, or what an inertia keeps; "" for the others."""
+        return EFFECTS.get(self.kind.quantity, "")
 
     @property
     def label(self) -> str:

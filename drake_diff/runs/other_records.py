@@ -84,6 +84,7 @@ class FitRecord(SealedRecord):
     noise: dict[str, float] = Field(default_factory=dict)
     error_before: float | None = None  # in standard deviations of the noise; null if there was no motion to measure
     error_after: float | None = None
+    rms: dict[str, tuple[float, float, str]] = Field(default_factory=dict)  # by entry: errors before, after, unit
     score: float | None = None
     count: int = 0
     correlation: list[list[float | None]] = Field(default_factory=list)  # of the estimates; null if it is unknown

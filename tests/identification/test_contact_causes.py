@@ -80,5 +80,7 @@ def test_slopes_by_a_parameter_that_drake_takes_as_a_float_are_those_of_the_step
     xs = law.run(radius.start, x, h, u)
     step = 1e-7 * radius.start
     by_differences = (law.run(radius.start + step, x, h, u) - law.run(radius.start - step, x, h, u))[0, 1] / (2 * step)
-    _, by_radius = law.slopes(radius.start, xs, h, u)
-    np.testing.assert_allclose(by_radius[0, 0, :, 0], by_differences, rtol=0, atol=1e-3 * np.abs(by_differences).max())
+    (slopes,) = law.slopes(radius.start, xs, h, u)
+    np.testing.assert_allclose(
+        slopes.by_z[0, 0, :, 0], by_differences, rtol=0, atol=1e-3 * np.abs(by_differences).max()
+    )

@@ -204,11 +204,11 @@ def test_steps_have_the_slopes_of_differences_by_unknowns(load):
     z = unknowns.z_start + 0.05
     start, hs = np.array([[0.4, -0.3, 1.0, -2.0]]), np.array([[0.01]])
     us = np.full((1, 1, model.nu), 0.3)
-    _, by_z = law.slopes(z, law.run(unknowns.values(z), start, hs, us), hs, us)
+    (slopes,) = law.slopes(z, law.run(unknowns.values(z), start, hs, us), hs, us)
     for j in range(len(z)):
         e = 1e-6 * np.eye(len(z))[j]
         ends = [law.run(unknowns.values(z + sign * e), start, hs, us)[0, -1] for sign in (1, -1)]
-        np.testing.assert_allclose(by_z[0, 0, :, j], (ends[0] - ends[1]) / 2e-6, atol=1e-8, err_msg=names[0])
+        np.testing.assert_allclose(slopes.by_z[0, 0, :, j], (ends[0] - ends[1]) / 2e-6, atol=1e-8, err_msg=names[0])
 
 
 @pytest.mark.slow

@@ -73,15 +73,14 @@ def test_the_derivative_by_a_delay_is_that_of_differences(load):
     point = fit.at(z, starts)
     segments = cut_segments(law, [piece], model.nu, delay)
     assert np.max(np.count_nonzero(segments.hs, axis=1)) > 15
-    _, by_z = law.slopes(z, point.xs, segments.hs, segments.us)
+    (slopes,) = law.slopes(z, point.xs, segments.hs, segments.us)
     rates = law.rates(unknowns.values(z), point.xs[:, 1:].reshape(-1, 4), segments.us.reshape(-1, 2))
-    by_delay = rates.reshape(by_z.shape[:3]) * segments.by_delay[..., None]
-    by_x, _ = law.slopes(z, point.xs, segments.hs, segments.us)
+    by_delay = rates.reshape(slopes.by_z.shape[:3]) * segments.by_delay[..., None]
     found = []
     for k in range(len(s.first)):
         moved, each = np.zeros(4), [np.zeros(4)]
         for m in range(segments.hs.shape[1]):
-            moved = by_x[k, m] @ moved + by_delay[k, m]
+            moved = slopes.by_x[k, m] @ moved + by_delay[k, m]
             each.append(moved)
         found.append(-np.array(each)[segments.at[k], :2] / 1e-3)
     wanted = (residuals(delay + h) - residuals(delay - h)) / (2 * h)

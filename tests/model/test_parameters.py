@@ -29,10 +29,12 @@ import drake_diff as dd
 from drake_diff.certificates import certify_jacobian
 from drake_diff.exceptions import InputError, ShapeError, SimulationError, UnknownNameError
 from drake_diff.model.parameters import (
+    applied,
     derivative_of_from_log_cholesky,
     from_log_cholesky,
     matrix,
     room_of_inertia,
+    select,
     to_log_cholesky,
 )
 
@@ -882,3 +884,15 @@ def test_a_point_or_a_rod_is_refused_where_its_inertia_is_differenced_or_optimiz
     )
     with pytest.raises(InputError, match="neither a point nor a rod"):
         dd.solve(problem, method="shooting")
+
+
+def test_the_list_states_what_a_mass_changes_beside_itself(load):
+    """Drake keeps the unit inertia, so twice the mass has twice the inertia about the joint."""
+    model = load("double_pendulum.urdf")
+    mass = next(p for p in dd.list_parameters(model) if p.name == "lower.mass")
+    assert "the inertia scales with it" in repr(mass)
+    with applied(select(model, {"lower.mass": 2 * mass.value})):
+        body = model.double.body("lower")
+        inertia = body.CalcSpatialInertiaInBodyFrame(model.double.context).CalcRotationalInertia().get_moments()
+    before = body.default_spatial_inertia().CalcRotationalInertia().get_moments()
+    np.testing.assert_allclose(inertia, 2 * before, rtol=1e-12)

@@ -1,0 +1,150 @@
+"""Check `dd.identify` on recordings of commanded positions, with hidden values and with differences."""
+
+import numpy as np
+import pytest
+from helpers.estimates import assert_known
+from scipy.integrate import solve_ivp
+
+import drake_diff as dd
+from drake_diff.comparison import read_recording
+from drake_diff.exceptions import InputError
+from drake_diff.identification.motion import servo_motion, with_exact_derivatives
+from drake_diff.identification.tree import tree_for_identification
+from drake_diff.identification.unknowns import choose_unknowns
+
+pytestmark = pytest.mark.solve
+
+MASS, LENGTH = 1.0, 0.5  # of models/pendulum.urdf [kg, m]
+PERIOD, N, NOISE = 0.005, 500, 2e-4  # [s] between samples; their number; [rad]
+TRUTH = {
+    "hinge.damping": 0.3,
+    "hinge.coulomb_friction": 0.4,
+    "motor.rotor_inertia": 0.15,
+    "model.input_delay": 0.0083,
+}
+
+
+@pytest.fixture
+def pendulum(load):
+    return load("pendulum.urdf", inputs="position", gains=(40.0, 3.0))
+
+
+@pytest.fixture
+def quadruped(load):
+    return load("quadruped.urdf", base="weld", inputs="position", gains=(30.0, 1.0))
+
+
+def commands():
+    t = PERIOD * np.arange(N)
+    return (0.6 * np.sin(2 * np.pi * (0.4 + 0.7 * t) * t))[:, None]
+
+
+def recorded(us, *, limit=np.inf, gains=(40.0, 3.0), seed=0, **changes):
+    """Return a recording of the pendulum with the true values, integrated by SciPy from one sample to the next."""
+    values = TRUTH | {f"{name.replace('_', '.', 1)}": value for name, value in changes.items()}
+    inertia = MASS * LENGTH**2 + values["motor.rotor_inertia"]
+    delay, (kp, kd) = values["model.input_delay"], gains
+    x, xs = np.zeros(2), np.zeros((N, 2))
+
+    def rate(t, x, u):
+        effort = np.clip(kp * (u - x[0]) - kd * x[1], -limit, limit)
+        friction = values["hinge.coulomb_friction"] * np.tanh(x[1] / 0.05) + values["hinge.damping"] * x[1]
+        return [x[1], (effort - friction - MASS * 9.81 * LENGTH * np.sin(x[0])) / inertia]
+
+    for k in range(N - 1):
+        xs[k] = x
+        late = delay % PERIOD
+        before = max(k - int(delay // PERIOD) - 1, 0)
+        for u, a, b in ((us[before], 0.0, late), (us[max(k - int(delay // PERIOD), 0)], late, PERIOD)):
+            if b > a:
+                x = solve_ivp(rate, (a, b), x, args=(u[0],), rtol=1e-10, atol=1e-12).y[:, -1]
+    xs[-1] = x
+    seen = np.column_stack([xs[:, 0], np.full(N, np.nan)])
+    seen[:, 0] += NOISE * np.random.default_rng(seed).standard_normal(N)
+    return dd.Recording("lab", "1", PERIOD * np.arange(N), seen, us[:-1])
+
+
+def test_the_hidden_values_of_a_servo_are_within_their_intervals(pendulum):
+    lines = []
+    fit = dd.identify(pendulum, recorded(commands()), callback=lines.append)
+    assert set(fit.values) == set(TRUTH)
+    for name, width in zip(TRUTH, (0.1, 0.1, 0.02, 0.002), strict=True):
+        assert_known(fit, name, TRUTH[name], width)
+    assert any(line.startswith("step 1") for line in lines)
+
+
+def test_wrong_gains_are_estimated(pendulum):
+    names = ["motor.kp", "motor.kd"]
+    log = recorded(commands(), gains=(33.0, 3.4), hinge_damping=0.1, hinge_coulomb_friction=0.0)
+    fit = dd.identify(pendulum, log, [*names, "motor.rotor_inertia", "model.input_delay"])
+    assert_known(fit, "motor.kp", 33.0, 1.0)
+    assert_known(fit, "motor.kd", 3.4, 0.5)
+    assert_known(fit, "model.input_delay", TRUTH["model.input_delay"], 0.002)
+
+
+def test_a_fit_ends_at_its_time_limit_and_says_so(pendulum):
+    fit = dd.identify(pendulum, recorded(commands()), time_limit=1e-6)
+    assert not fit.converged
+    assert "limit of 1e-06 s" in fit.reason
+
+
+def test_steps_with_servos_have_the_slopes_of_differences(quadruped):
+    """Half of the commands exceed the effort limit of the model."""
+    model, random = quadruped, np.random.default_rng(0)
+    tree = tree_for_identification(model, servos=True)
+    motors, joints = model.input_names, [name.removesuffix("_q") for name in model.position_names]
+    names = [f"{motors[i]}.{quantity}" for i in (0, 3) for quantity in ("kp", "kd", "rotor_inertia")]
+    names += [f"{joints[4]}.damping", f"{joints[4]}.coulomb_friction"]
+    unknowns = choose_unknowns(model, tree, names)
+    law = with_exact_derivatives(servo_motion(model, tree, unknowns))
+    z, hs = unknowns.z_start + 0.1, np.full((20, 1), 0.004)
+    starts = random.uniform(-0.5, 0.5, (20, model.nx))
+    us = starts[:, None, : model.nu] + random.uniform(-1, 1, (20, 1, model.nu))
+    xs = law.run(unknowns.values(z), starts, hs, us)
+    (whole,), branches = law.slopes(z, xs, hs, us, together=True), law.slopes(z, xs, hs, us)
+    assert len(branches) > 1
+    step = 1e-6
+    for j in range(len(z)):
+        ends = [law.run(unknowns.values(z + s * step * np.eye(len(z))[j]), starts, hs, us)[:, -1] for s in (1, -1)]
+        column = whole.by_z[:, 0, :, list(whole.columns).index(j)]
+        np.testing.assert_allclose(column, (ends[0] - ends[1]) / (2 * step), atol=1e-6, err_msg=names[j])
+    for j in range(model.nx):
+        move = step * np.eye(model.nx)[j]
+        ends = [law.run(unknowns.values(z), starts + s * move, hs, us)[:, -1] for s in (1, -1)]
+        np.testing.assert_allclose(whole.by_x[:, 0, :, j], (ends[0] - ends[1]) / (2 * step), atol=1e-6)
+    joined = np.zeros_like(whole.by_x)
+    for branch in branches:
+        joined[..., branch.states[:, None], branch.states] = branch.by_x
+        for k, column in enumerate(branch.columns):
+            same = whole.by_z[..., branch.states, list(whole.columns).index(column)]
+            np.testing.assert_allclose(branch.by_z[..., k], same, atol=1e-12)
+    np.testing.assert_allclose(joined, whole.by_x, atol=1e-12)
+
+
+def test_a_quantity_that_a_recording_at_rest_does_not_determine_is_named_and_keeps_its_value(pendulum):
+    lines, names = [], ["hinge.damping", "hinge.coulomb_friction", "motor.rotor_inertia"]
+    seen = np.column_stack([NOISE * np.random.default_rng(0).standard_normal(N), np.full(N, np.nan)])
+    log = dd.Recording("lab", "1", PERIOD * np.arange(N), seen, np.zeros((N - 1, 1)))
+    fit = dd.identify(pendulum, log, names, held_out=0.0, callback=lines.append)
+    assert any("do not determine hinge.coulomb_friction" in line for line in lines)
+    assert fit.values["hinge.coulomb_friction"] == pytest.approx(0.0, abs=1e-6)
+    for name in names:
+        low, high = fit.intervals[name]
+        assert low <= fit.start[name] <= high
+
+
+@pytest.mark.parametrize("style", ["q_{}", "{}.position", "q0"])
+def test_a_csv_file_may_use_usual_names_of_columns(pendulum, tmp_path, style):
+    path = tmp_path / "log.csv"
+    desired = {"q0": "q_desired[0]"}.get(style, "q_desired_{}").format("hinge")
+    path.write_text(f"t,{style.format('hinge')},{desired}\n0,0.1,0.2\n0.005,0.11,0.25\n")
+    recording = read_recording(path, pendulum, gaps=True)
+    np.testing.assert_array_equal(recording.xs[:, 0], [0.1, 0.11])
+    np.testing.assert_array_equal(recording.us, [[0.2]])
+
+
+def test_commanded_positions_need_a_model_with_servos(load, tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,q_hinge,q_desired_hinge\n0,0.1,0.2\n0.005,0.11,0.25\n")
+    with pytest.raises(InputError, match="--gains"):
+        read_recording(path, load("pendulum.urdf"), gaps=True)
