@@ -9,7 +9,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import called, carrying, gradient_of, traced_gradient, user_function
-from drake_diff.derivatives.step import StepDerivatives
+from drake_diff.derivatives.step import Linearization
 from drake_diff.exceptions import GradientError, InputError
 from drake_diff.motion.policy import Feedback, policy_parameters
 
@@ -19,32 +19,36 @@ AUTOGRAD, AUTODIFF = "autograd", "autodiff"  # the methods that differentiate a 
 
 @dataclass(frozen=True, eq=False)
 class Totals:
-    """Total gradients of a loss with respect to states, inputs and parameters."""
+    """Total gradients of a loss with respect to states, inputs and parameters, each with the batch's dimensions."""
 
-    states: Array  # (N+1, nx)
-    inputs: Array  # (N, nu)
-    parameters: Array  # (np,) of the model
+    states: Array  # (..., N+1, nx)
+    inputs: Array  # (..., N, nu)
+    parameters: Array  # (..., np) of the model
     policy: Array  # (n,) of the policy
     loss_method: str = ""  # see `differentiate_loss`
 
 
 def accumulate(
-    linearization: Sequence[StepDerivatives],
+    jacobians: Array,
     by_xs: Array,
     by_us: Array,
     feedback: Sequence[Feedback] = (),
     num_policy_parameters: int = 0,
 ) -> Totals:
-    """Compute the total gradients of a loss from its partial gradients `by_xs` (N+1, nx) and `by_us` (N, nu)."""
+    """Compute the total gradients of a loss from its partial gradients `by_xs` (..., N+1, nx) and `by_us` (..., N, nu).
+
+    `jacobians` (..., N, nx, nx + nu + np) are those of the steps. Only products of a row with a Jacobian are formed.
+    With the feedback of a policy, there are no leading dimensions.
+    """
     state, inputs = np.array(by_xs), np.array(by_us)
-    parameters = np.zeros(linearization[0].C.shape[1])
+    nx, end = state.shape[-1], state.shape[-1] + inputs.shape[-1]
+    parameters = np.zeros((*state.shape[:-2], jacobians.shape[-1] - end))
     policy = np.zeros(num_policy_parameters)
-    for k in reversed(range(len(linearization))):
-        d = linearization[k]
-        inputs[k] += state[k + 1].dot(d.B)
-        if parameters.size:
-            parameters += state[k + 1].dot(d.C)
-        state[k] += state[k + 1].dot(d.A)
+    for k in reversed(range(inputs.shape[-2])):
+        row = np.matmul(state[..., k + 1, None, :], jacobians[..., k, :, :])[..., 0, :]
+        state[..., k, :] += row[..., :nx]
+        inputs[..., k, :] += row[..., nx:end]
+        parameters += row[..., end:]
         if feedback:
             by_x, by_parameters, active = feedback[k]
             state[k] += by_x.T @ inputs[k]
@@ -57,13 +61,13 @@ def total_gradients(
     x0: Array,
     us: Array,
     policy: Any,
-    linearization: Sequence[StepDerivatives],
+    linearization: Linearization,
     feedback: Sequence[Feedback],
 ) -> tuple[float, Totals]:
     """Return the value of a loss of the steps from `x0` (nx,) under `us` (N, nu), and its total gradients."""
-    xs = np.vstack([x0, [d.x_next for d in linearization]])
+    xs = np.vstack([x0, linearization.x_next])
     value, by_xs, by_us, method = differentiate_loss(loss, xs, us)
-    totals = accumulate(linearization, by_xs, by_us, feedback, len(policy_parameters(policy)))
+    totals = accumulate(linearization.jacobians, by_xs, by_us, feedback, len(policy_parameters(policy)))
     return value, replace(totals, loss_method=method)
 
 
