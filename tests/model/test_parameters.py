@@ -29,10 +29,12 @@ import drake_diff as dd
 from drake_diff.certificates import certify_jacobian
 from drake_diff.exceptions import InputError, ShapeError, SimulationError, UnknownNameError
 from drake_diff.model.parameters import (
+    applied,
     derivative_of_from_log_cholesky,
     from_log_cholesky,
     matrix,
     room_of_inertia,
+    select,
     to_log_cholesky,
 )
 
@@ -882,3 +884,19 @@ def test_a_point_or_a_rod_is_refused_where_its_inertia_is_differenced_or_optimiz
     )
     with pytest.raises(InputError, match="neither a point nor a rod"):
         dd.solve(problem, method="shooting")
+
+
+def test_an_inner_block_of_other_parameters_keeps_the_values_of_the_outer_one(load):
+    model = load("pendulum.urdf")
+    point, both = ([0.5, 1.0], [0.2]), {"pole.mass": 1.3, "hinge.damping": 0.4, "model.gravity": [0, 0, -5.0]}
+    outer = select(model, {name: both[name] for name in ("pole.mass", "model.gravity")})
+    inner = select(model, {"hinge.damping": 0.4})
+    expected = dd.differentiate_step(model, *point, parameters=both, method="autodiff")
+    with applied(outer):
+        with applied(inner):
+            d = dd.differentiate_step(model, *point, method="autodiff")
+        after = dd.step(model, *point)
+    assert np.array_equal(d.x_next, expected.x_next)
+    np.testing.assert_allclose(d.A, expected.A, rtol=1e-14)
+    assert np.array_equal(after, dd.step(model, *point, parameters=outer.to_dict()))
+    assert model.applied is None
