@@ -145,17 +145,24 @@ def linearize(
 def step_jacobians(model: Model, vector: ParameterVector, x: Array, u: Array, method: str) -> StepDerivatives:
     """Compute `differentiate_step` on a model with `vector` applied, without checks of the shapes."""
     steps = take_step(model, vector, x, u)
-    reason = OF_ONE_SMOOTH_STEP.get(method)
-    if reason is not None and not vector.parameters and not steps.some_touch:
-        jacobian = one_smooth_step(model, steps)
-        if jacobian is not None:
-            _check_derivatives(model, jacobian[None])
-            jacobian.setflags(write=False)
-            x_next = steps.x_next[0]
-            x_next.setflags(write=False)
-            A, B, C = jacobian[:, : model.nx], jacobian[:, model.nx :], jacobian[:, len(x) + len(u) :]
-            return StepDerivatives(x_next, A, B, C, (), (), ANALYTIC.name, reason)
+    jacobian = _smooth_jacobian(steps, method)
+    if jacobian is not None:
+        jacobian.setflags(write=False)
+        x_next = steps.x_next[0]
+        x_next.setflags(write=False)
+        A, B, C = jacobian[:, : model.nx], jacobian[:, model.nx :], jacobian[:, len(x) + len(u) :]
+        return StepDerivatives(x_next, A, B, C, (), (), ANALYTIC.name, OF_ONE_SMOOTH_STEP[method])
     return _derivatives_of(steps, choose(steps, method, single=True))[0]
+
+
+def _smooth_jacobian(steps: Steps, method: str) -> Array | None:
+    """Return the checked Jacobian (nx, nx + nu) of one smooth step without parameters, or None for other steps."""
+    if method not in OF_ONE_SMOOTH_STEP or steps.vector.parameters or steps.some_touch:
+        return None
+    jacobian = one_smooth_step(steps.model, steps)
+    if jacobian is not None:
+        _check_derivatives(steps.model, jacobian[None])
+    return jacobian
 
 
 def derivatives_along(
@@ -188,6 +195,9 @@ class Linearization:
 
 def linearize_steps(steps: Steps, method: str, *, single: bool = False) -> Linearization:
     """Return the checked Jacobians of steps whose parameters are applied."""
+    jacobian = _smooth_jacobian(steps, method) if single else None
+    if jacobian is not None:
+        return Linearization(steps.x_next, jacobian[None], (), (), (ANALYTIC.name,))
     chosen = choose(steps, method, single=single)
     _check_derivatives(steps.model, chosen.values)
     sources = _column_sources(steps.vector, chosen.methods[0])

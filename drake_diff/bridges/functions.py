@@ -1,0 +1,167 @@
+"""Steps, rollouts and plans as functions of arrays of a library that differentiates, such as PyTorch and JAX."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from drake_diff._base.arrays import number_of_steps
+from drake_diff.bridges.plans import PlanArrays, PlanFunction
+from drake_diff.bridges.rollouts import RolloutFunction, rollout_function
+from drake_diff.exceptions import InputError
+from drake_diff.model.model import Model
+from drake_diff.optimize.problem.problem import Problem
+
+
+class Functions(ABC):
+    """The functions of `drake_diff.torch` and `drake_diff.jax`, in double precision.
+
+    Their arrays are those of the library; other numbers are converted to its arrays of float64. Leading dimensions of
+    all arguments are broadcast. The derivatives are those of `differentiate_step`, `differentiate_rollout` and
+    `sensitivity`, in reverse mode, without second derivatives.
+    """
+
+    def step(
+        self,
+        model: Model,
+        x: Any,
+        u: Any = None,
+        parameters: Mapping[str, Any] | None = None,
+        *,
+        method: str = "auto",
+        certify: bool = False,
+    ) -> Any:
+        """Return the state one time step later (..., nx), as `drake_diff.step` does.
+
+        Args:
+            model: The discrete model.
+            x: (..., nx) the state.
+            u: (..., nu) the input [N or N m]; may be omitted if the model has no inputs.
+            parameters, method, certify: See `rollout`.
+        """
+        named = self._arrays(parameters)
+        function = rollout_function(model, tuple(named), method, bool(certify))
+        return self._end(function, self._array(x), self._array([] if u is None and model.nu == 0 else u), named)
+
+    def rollout(
+        self,
+        model: Model,
+        x0: Any,
+        us: Any = None,
+        policy: Callable[[Any, Any], Any] | None = None,
+        parameters: Mapping[str, Any] | None = None,
+        *,
+        num_steps: int | None = None,
+        method: str = "auto",
+        certify: bool = False,
+    ) -> tuple[Any, Any]:
+        """Return the states (..., N+1, nx) and inputs (..., N, nu) of a rollout.
+
+        Args:
+            model: The discrete model.
+            x0: (..., nx) the initial state.
+            us: (..., N, nu) the inputs [N or N m]; may be omitted if the model has no inputs.
+            policy: `policy(x, t)` (..., nu) of the states (..., nx) and the time [s], in place of `us`. The library
+                differentiates it with respect to all that it depends on. JAX traces it once.
+            parameters: The model's parameters (see `list_parameters`): names, and values (...) of parameters that are
+                one number, or (..., n).
+            num_steps: N, if `us` is not given.
+            method: As in `differentiate_rollout`. With "continuous", a GradientWarning names the columns of the
+                gradient without a slope.
+            certify: Whether a backward pass screens the derivatives of its steps by differences. A GradientWarning
+                names the steps whose verdict is not "agree". "continuous" always checks the gradient.
+
+        Raises:
+            ShapeError, NonFiniteError, UnknownNameError, InputError: An argument is invalid, or JAX uses single
+                precision.
+            GradientError, SimulationError: See `differentiate_rollout`. If JAX runs a compiled function, it raises its
+                JaxRuntimeError with the text of this error.
+        """
+        named, x0 = self._arrays(parameters), self._array(x0)
+        function = rollout_function(model, tuple(named), method, bool(certify))
+        if policy is None:
+            us = self._array([[]] * number_of_steps(num_steps) if us is None and model.nu == 0 else us)
+            return self._states(function, *self._full(function, x0, us, named)), us
+        if us is not None:
+            raise InputError("rollout", got="us and policy", expected="one of them")
+        h = named.get("model.time_step", model.time_step)
+
+        def advance(x: Any, k: Any) -> tuple[Any, Any]:
+            u = self._array(policy(x, k * h))
+            return self._end(function, x, u, named), u
+
+        batch = function.leading(x0.shape, (1, model.nu), [value.shape for value in named.values()])
+        return self._loop(advance, self._broadcast(x0, (*batch, model.nx)), number_of_steps(num_steps))
+
+    def solve(
+        self, problem: Problem, parameters: Mapping[str, Any], *, certify: bool = False, **options: Any
+    ) -> PlanArrays:
+        """Return the plan of a problem for other values of its first state, its goal or model parameters.
+
+        Args:
+            problem: The problem of a model.
+            parameters: Values by name: "x0" (..., nx), "goal" (..., nx), and names of the model's parameters, with
+                values (...) of parameters that are one number, or (..., n). Each entry of a batch is solved.
+            certify: Whether problems are solved again on both sides, see `sensitivity`. A GradientWarning names the
+                derivatives whose verdict is not "agree" and, also without `certify`, those that are one-sided.
+            options: Further arguments of `drake_diff.solve`.
+
+        Returns:
+            The states `xs` (..., N+1, nx), the inputs `us` (..., N, nu), the `cost` (...) and the `horizon` (...) [s].
+
+        Raises:
+            InputError, UnknownNameError, ShapeError: An argument is invalid.
+            GradientError: A problem was not solved, or its plan has no derivative.
+        """
+        named = self._arrays(parameters)
+        function = PlanFunction(problem, tuple(named), options, certify)
+        batch = function.leading([value.shape for value in named.values()])
+        shapes = [(*batch, *shape) for shape in function.shapes.values()]
+        values = [self._broadcast(value, shape) for value, shape in zip(named.values(), shapes, strict=True)]
+        return PlanArrays(*self._plans(function, values))
+
+    def _arrays(self, parameters: Mapping[str, Any] | None) -> dict[str, Any]:
+        return {name: self._array(value) for name, value in (parameters or {}).items()}
+
+    def _full(
+        self, function: RolloutFunction, x0: Any, us: Any, named: Mapping[str, Any], ndim: int = 2
+    ) -> tuple[Any, Any, Any]:
+        """Return x0 (..., nx), us (of which `ndim` dimensions are not leading) and values (..., np), broadcast."""
+        shape = us.shape if ndim == 2 else (*us.shape[:-1], 1, *us.shape[-1:])
+        batch = function.leading(x0.shape, shape, [value.shape for value in named.values()])
+        columns = [v[..., None] if size == 1 else v for v, size in zip(named.values(), function.sizes, strict=True)]
+        values = [self._broadcast(column, (*batch, *column.shape[-1:])) for column in columns]
+        return (
+            self._broadcast(x0, (*batch, *x0.shape[-1:])),
+            self._broadcast(us, (*batch, *us.shape[-ndim:])),
+            self._concatenate(values) if values else self._broadcast(self._array([]), (*batch, 0)),
+        )
+
+    @abstractmethod
+    def _array(self, value: Any) -> Any:
+        """Return a value as an array of float64."""
+
+    @abstractmethod
+    def _broadcast(self, array: Any, shape: tuple[int, ...]) -> Any:
+        """Return an array of a larger shape."""
+
+    @abstractmethod
+    def _concatenate(self, columns: list[Any]) -> Any:
+        """Concatenate arrays (..., n) along the last dimension."""
+
+    @abstractmethod
+    def _states(self, function: RolloutFunction, x0: Any, us: Any, values: Any) -> Any:
+        """Return the states (..., N+1, nx) of rollouts with equal leading dimensions."""
+
+    @abstractmethod
+    def _end(self, function: RolloutFunction, x: Any, u: Any, named: Mapping[str, Any]) -> Any:
+        """Return the end states (..., nx) of single steps."""
+
+    @abstractmethod
+    def _loop(self, advance: Callable[[Any, Any], tuple[Any, Any]], x0: Any, count: int) -> tuple[Any, Any]:
+        """Return the states and inputs of `count` steps by `advance(x, k)`, which returns the next state and u."""
+
+    @abstractmethod
+    def _plans(self, function: PlanFunction, values: list[Any]) -> Any:
+        """Return the arrays of a plan for values with equal leading dimensions."""

@@ -1,0 +1,107 @@
+"""Steps, rollouts and plans as functions of JAX arrays in double precision, for `jit`, `grad` and `vmap`.
+
+`step`, `rollout` and `solve` are documented at `drake_diff.bridges.functions.Functions`. They call Drake through
+`jax.pure_callback`, so that errors and warnings of a call appear when JAX runs it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from drake_diff.bridges.functions import Functions
+from drake_diff.bridges.plans import PlanFunction
+from drake_diff.bridges.rollouts import RolloutFunction
+from drake_diff.exceptions import InputError, MissingDependencyError
+
+try:
+    import jax
+    import jax.numpy as jnp
+except ImportError as error:
+    raise MissingDependencyError(f"it needs JAX ({error}): pip install 'drake-diff[jax]'") from error
+
+
+def _call(function: Callable[..., Any], shapes: Any, *arguments: Any) -> Any:
+    """Call a function of NumPy arrays, whose results have the `shapes`, for all entries of a batch at once."""
+    return jax.pure_callback(function, shapes, *arguments, vmap_method="broadcast_all")
+
+
+def _like(shape: tuple[int, ...], kind: type = float) -> Any:
+    return jax.ShapeDtypeStruct(shape, kind)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _pure_states(function: RolloutFunction, x0: Any, us: Any, values: Any) -> Any:
+    """Return the states (..., N+1, nx) of rollouts with equal leading dimensions."""
+    return _states_and_saved(function, x0, us, values)[0]
+
+
+def _states_and_saved(function: RolloutFunction, x0: Any, us: Any, values: Any) -> tuple[Any, Any]:
+    (*batch, nx), count = x0.shape, us.shape[-2]
+    xs, touching = _call(
+        function.states, (_like((*batch, count + 1, nx)), _like((*batch, count), bool)), x0, us, values
+    )
+    return xs, (xs, us, touching, values)
+
+
+def _pull_back_states(function: RolloutFunction, saved: tuple[Any, ...], by_xs: Any) -> tuple[Any, ...]:
+    (*batch, _, nx), us, values = saved[0].shape, saved[1], saved[3]
+    return tuple(_call(function.pull_back, tuple(map(_like, ((*batch, nx), us.shape, values.shape))), *saved, by_xs))
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _plans(function: PlanFunction, values: list[Any]) -> Any:
+    """Return the arrays of a plan for values with equal leading dimensions."""
+    return _plans_and_saved(function, values)[0]
+
+
+def _plans_and_saved(function: PlanFunction, values: list[Any]) -> tuple[Any, Any]:
+    batch = function.leading([value.shape for value in values])
+    return _call(function.plans, tuple(map(_like, function.sizes(batch))), values), values
+
+
+def _pull_back_plans(function: PlanFunction, values: list[Any], by_plan: Any) -> tuple[Any]:
+    return (_call(function.pull_back, [_like(value.shape) for value in values], values, by_plan),)
+
+
+_pure_states.defvjp(_states_and_saved, _pull_back_states)
+_plans.defvjp(_plans_and_saved, _pull_back_plans)
+_states = jax.jit(_pure_states, static_argnums=0)
+
+
+class _JaxFunctions(Functions):
+    """The functions of JAX arrays."""
+
+    def _array(self, value: Any) -> Any:
+        if jax.dtypes.canonicalize_dtype(float) != jnp.float64:
+            expected = 'double precision: jax.config.update("jax_enable_x64", True)'
+            raise InputError("jax_enable_x64", got="False, single precision", expected=expected)
+        return jnp.asarray(value, dtype=float)
+
+    def _broadcast(self, array: Any, shape: tuple[int, ...]) -> Any:
+        return jnp.broadcast_to(array, shape)
+
+    def _concatenate(self, columns: list[Any]) -> Any:
+        return jnp.concatenate(columns, axis=-1)
+
+    def _states(self, function: RolloutFunction, x0: Any, us: Any, values: Any) -> Any:
+        return _states(function, x0, us, values)
+
+    def _end(self, function: RolloutFunction, x: Any, u: Any, named: Mapping[str, Any]) -> Any:
+        return _states(function, *self._full(function, x, u[..., None, :], named))[..., 1, :]
+
+    def _loop(self, advance: Callable[[Any, Any], Any], x0: Any, count: int) -> tuple[Any, Any]:
+        def body(x: Any, k: Any) -> tuple[Any, tuple[Any, Any]]:
+            x_next, u = advance(x, k)
+            return x_next, (x_next, u)
+
+        _, (ends, us) = jax.lax.scan(body, x0, jnp.arange(count))
+        return jnp.moveaxis(jnp.concatenate([x0[None], ends]), 0, -2), jnp.moveaxis(us, 0, -2)
+
+    def _plans(self, function: PlanFunction, values: list[Any]) -> Any:
+        return _plans(function, values)
+
+
+_FUNCTIONS = _JaxFunctions()
+step, rollout, solve = _FUNCTIONS.step, _FUNCTIONS.rollout, _FUNCTIONS.solve
