@@ -59,7 +59,7 @@ class RolloutGradient(ShowsItsRepr):
     xs: Array  # (N+1, nx) the trajectory
     us: Array  # (N, nu) the applied inputs
     methods: tuple[str, ...]  # the methods of the step Jacobians: one name, or more if a fallback was used
-    loss_method: str  # the method that differentiated the loss: "autograd", or "autodiff" if autograd cannot
+    loss_method: str  # the method that differentiated the loss: "autograd", "autodiff" if autograd cannot, or "jax"
     # For method="continuous": the columns in which the loss has no slope. Their derivative is valid at the point only.
     undefined: tuple[Undefined, ...] = ()
 
@@ -117,7 +117,8 @@ def differentiate_rollout(
         us: (N, nu) the inputs [N or N m], or (..., N, nu), with leading dimensions that are broadcast with those of
             `x0`; None with a policy, or if the model has no actuators.
         loss: `loss(xs, us)` of the states (N+1, nx) and the inputs, or `loss(x_final)` if it takes one argument. It
-            returns a scalar and is written with ordinary arithmetic and NumPy functions that AutoDiffXd supports.
+            returns a scalar and is written with ordinary arithmetic and NumPy functions that AutoDiffXd supports, or in
+            JAX with double precision.
         policy: u = policy(x, t), written likewise (see `drake_diff.motion.policy`), in place of `us`.
         parameters: Names of the model's parameters for the gradient, or a mapping of the names to values.
         num_steps: N, if `us` is not given.

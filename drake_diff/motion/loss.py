@@ -1,8 +1,10 @@
 """The loss of a trajectory, and its gradient by reverse accumulation through the derivatives of the steps."""
 
 import inspect
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,7 @@ from drake_diff.exceptions import GradientError, InputError
 from drake_diff.motion.policy import Feedback, policy_parameters
 
 Loss = Callable[..., Any]
-AUTOGRAD, AUTODIFF = "autograd", "autodiff"  # the methods that differentiate a loss
+AUTOGRAD, AUTODIFF, JAX = "autograd", "autodiff", "jax"  # the methods that differentiate a loss
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +82,16 @@ def evaluate_loss(loss: Loss, xs: Array, us: Array) -> float:
 def differentiate_loss(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, Array, str]:
     """Return the value of `loss`, its partial gradients with respect to xs (N+1, nx) and us (N, nu), and the method.
 
-    The method is "autograd", or "autodiff" for a function that autograd does not support and for a loss of the final
-    state only. The time of "autodiff" grows with the square of the trajectory's length.
+    The method is "jax" for a function that returns a JAX array. Otherwise it is "autograd", or "autodiff" for a
+    function that autograd does not support and for a loss of the final state only. The time of "autodiff" grows with
+    the square of the trajectory's length.
     """
+    arguments = (xs[-1],) if takes_one_argument(loss) else (xs, us)
     with np.errstate(all="ignore"):
-        evaluate_loss(loss, xs, us)  # raises a descriptive error if the loss is invalid
-    if takes_one_argument(loss):
+        result = called("loss", loss, *arguments, shape=())  # raises a descriptive error if the loss is invalid
+    if "jax" in sys.modules and isinstance(result, sys.modules["jax"].Array):
+        return _by_jax(loss, arguments, xs, us)
+    if len(arguments) == 1:
         value, gradient = gradient_of(user_function("loss", loss), xs[-1])
         return value, np.vstack([np.zeros_like(xs[:-1]), gradient]), np.zeros_like(us), AUTODIFF
     try:
@@ -93,9 +99,35 @@ def differentiate_loss(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, 
             value, (by_xs, by_us) = traced_gradient(loss, (xs, us))
     except Exception:  # not supported by autograd, or an error in the loss, which AutoDiffXd then reports
         return *_by_autodiff(loss, xs, us), AUTODIFF
+    return _finite(value, by_xs, by_us, AUTOGRAD)
+
+
+def _by_jax(loss: Loss, arguments: tuple[Array, ...], xs: Array, us: Array) -> tuple[float, Array, Array, str]:
+    """Differentiate a loss that is written in JAX."""
+    value, gradients = carrying("loss", lambda: _jax_gradient(loss, len(arguments))(*arguments))
+    if value.dtype != float:
+        expected = 'double precision: jax.config.update("jax_enable_x64", True)'
+        raise InputError("loss", got=f"a JAX array of {value.dtype}", expected=expected)
+    by_xs, by_us = np.zeros_like(xs), np.zeros_like(us)
+    if len(arguments) == 1:
+        by_xs[-1] = gradients[0]
+    else:
+        by_xs[:], by_us[:] = gradients
+    return _finite(float(value), by_xs, by_us, JAX)
+
+
+@lru_cache(maxsize=32)
+def _jax_gradient(loss: Loss, count: int) -> Callable[..., Any]:
+    """Return the compiled value and gradients of a loss, so that JAX traces it once for each shape."""
+    jax: Any = sys.modules["jax"]
+    return jax.jit(jax.value_and_grad(loss, argnums=tuple(range(count))))
+
+
+def _finite(value: float, by_xs: Array, by_us: Array, method: str) -> tuple[float, Array, Array, str]:
+    """Return the arguments if they are finite, or raise GradientError."""
     if not (np.isfinite(value) and np.all(np.isfinite(by_xs)) and np.all(np.isfinite(by_us))):
         raise GradientError(f"the loss or its gradient is not finite, like the gradient of a norm at 0: loss {value}")
-    return value, by_xs, by_us, AUTOGRAD
+    return value, by_xs, by_us, method
 
 
 def _by_autodiff(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, Array]:
