@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -51,57 +51,50 @@ def _pull_back_states(function: RolloutFunction, saved: tuple[Any, ...], by_xs: 
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _plans(function: PlanFunction, values: list[Any]) -> Any:
+def _plans(function: PlanFunction, *values: Any) -> Any:
     """Return the arrays of a plan for values with equal leading dimensions."""
-    return _plans_and_saved(function, values)[0]
+    return _plans_and_saved(function, *values)[0]
 
 
-def _plans_and_saved(function: PlanFunction, values: list[Any]) -> tuple[Any, Any]:
+def _plans_and_saved(function: PlanFunction, *values: Any) -> tuple[Any, Any]:
     batch = function.leading([value.shape for value in values])
     return _call(function.plans, tuple(map(_like, function.sizes(batch))), values), values
 
 
-def _pull_back_plans(function: PlanFunction, values: list[Any], by_plan: Any) -> tuple[Any]:
-    return (_call(function.pull_back, [_like(value.shape) for value in values], values, by_plan),)
+def _pull_back_plans(function: PlanFunction, values: Any, by_plan: Any) -> tuple[Any, ...]:
+    return tuple(_call(function.pull_back, tuple(_like(value.shape) for value in values), values, by_plan))
 
 
 _pure_states.defvjp(_states_and_saved, _pull_back_states)
 _plans.defvjp(_plans_and_saved, _pull_back_plans)
-_states = jax.jit(_pure_states, static_argnums=0)
 
 
-class _JaxFunctions(Functions):
-    """The functions of JAX arrays."""
-
-    def _array(self, value: Any) -> Any:
-        if jax.dtypes.canonicalize_dtype(float) != jnp.float64:
-            expected = 'double precision: jax.config.update("jax_enable_x64", True)'
-            raise InputError("jax_enable_x64", got="False, single precision", expected=expected)
-        return jnp.asarray(value, dtype=float)
-
-    def _broadcast(self, array: Any, shape: tuple[int, ...]) -> Any:
-        return jnp.broadcast_to(array, shape)
-
-    def _concatenate(self, columns: list[Any]) -> Any:
-        return jnp.concatenate(columns, axis=-1)
-
-    def _states(self, function: RolloutFunction, x0: Any, us: Any, values: Any) -> Any:
-        return _states(function, x0, us, values)
-
-    def _end(self, function: RolloutFunction, x: Any, u: Any, named: Mapping[str, Any]) -> Any:
-        return _states(function, *self._full(function, x, u[..., None, :], named))[..., 1, :]
-
-    def _loop(self, advance: Callable[[Any, Any], Any], x0: Any, count: int) -> tuple[Any, Any]:
-        def body(x: Any, k: Any) -> tuple[Any, tuple[Any, Any]]:
-            x_next, u = advance(x, k)
-            return x_next, (x_next, u)
-
-        _, (ends, us) = jax.lax.scan(body, x0, jnp.arange(count))
-        return jnp.moveaxis(jnp.concatenate([x0[None], ends]), 0, -2), jnp.moveaxis(us, 0, -2)
-
-    def _plans(self, function: PlanFunction, values: list[Any]) -> Any:
-        return _plans(function, values)
+@partial(jax.jit, static_argnums=(0, 1))
+def _states(function: RolloutFunction, single: bool, x0: Any, us: Any, values: Any) -> Any:
+    if single:
+        return _pure_states(function, x0, us[..., None, :], values)[..., 1, :]
+    return _pure_states(function, x0, us, values)
 
 
-_FUNCTIONS = _JaxFunctions()
+def _array(value: Any) -> Any:
+    if jax.dtypes.canonicalize_dtype(float) != jnp.float64:
+        expected = 'double precision: jax.config.update("jax_enable_x64", True)'
+        raise InputError("jax_enable_x64", got="False, single precision", expected=expected)
+    return jnp.asarray(value, dtype=float)
+
+
+def _concatenate(columns: list[Any]) -> Any:
+    return jnp.concatenate(columns, axis=-1)
+
+
+def _loop(advance: Callable[[Any, Any], Any], x0: Any, count: int) -> tuple[Any, Any]:
+    def body(x: Any, k: Any) -> tuple[Any, tuple[Any, Any]]:
+        x_next, u = advance(x, k)
+        return x_next, (x_next, u)
+
+    _, (ends, us) = jax.lax.scan(body, x0, jnp.arange(count))
+    return jnp.moveaxis(jnp.concatenate([x0[None], ends]), 0, -2), jnp.moveaxis(us, 0, -2)
+
+
+_FUNCTIONS = Functions(_array, jnp.broadcast_to, _concatenate, _states, _loop, _plans)
 step, rollout, solve = _FUNCTIONS.step, _FUNCTIONS.rollout, _FUNCTIONS.solve

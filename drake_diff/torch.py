@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -78,35 +78,26 @@ def _numbers(tensor: Tensor) -> Array:
     return np.asarray(tensor.detach().cpu().numpy())
 
 
-class _TorchFunctions(Functions):
-    """The functions of tensors."""
-
-    def _array(self, value: Any) -> Tensor:
-        return torch.as_tensor(value, dtype=torch.float64)
-
-    def _broadcast(self, array: Tensor, shape: tuple[int, ...]) -> Tensor:
-        return array if array.shape == shape else array.expand(shape)  # `expand` takes as long as a small step
-
-    def _concatenate(self, columns: list[Tensor]) -> Tensor:
-        return torch.cat(columns, -1)
-
-    def _states(self, function: RolloutFunction, x0: Tensor, us: Tensor, values: Tensor) -> Any:
-        return _States.apply(function, False, x0, us, values)
-
-    def _end(self, function: RolloutFunction, x: Tensor, u: Tensor, named: Mapping[str, Tensor]) -> Any:
-        return _States.apply(function, True, *self._full(function, x, u, named, ndim=1))
-
-    def _loop(self, advance: Callable[[Any, Any], Any], x0: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        xs, us = [x0], []
-        for k in range(count):
-            x, u = advance(xs[-1], k)
-            xs.append(x)
-            us.append(u)
-        return torch.stack(xs, -2), torch.stack(us, -2)
-
-    def _plans(self, function: PlanFunction, values: list[Tensor]) -> Any:
-        return _Plans.apply(function, *values)
+def _array(value: Any) -> Tensor:
+    return torch.as_tensor(value, dtype=torch.float64)
 
 
-_FUNCTIONS = _TorchFunctions()
+def _broadcast(array: Tensor, shape: tuple[int, ...]) -> Tensor:
+    return array if array.shape == shape else array.expand(shape)  # `expand` takes as long as a small step
+
+
+def _concatenate(columns: list[Tensor]) -> Tensor:
+    return torch.cat(columns, -1)
+
+
+def _loop(advance: Callable[[Any, Any], Any], x0: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    xs, us = [x0], []
+    for k in range(count):
+        x, u = advance(xs[-1], k)
+        xs.append(x)
+        us.append(u)
+    return torch.stack(xs, -2), torch.stack(us, -2)
+
+
+_FUNCTIONS = Functions(_array, _broadcast, _concatenate, _States.apply, _loop, _Plans.apply)
 step, rollout, solve = _FUNCTIONS.step, _FUNCTIONS.rollout, _FUNCTIONS.solve

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from drake_diff._base.arrays import number_of_steps
@@ -14,13 +14,22 @@ from drake_diff.model.model import Model
 from drake_diff.optimize.problem.problem import Problem
 
 
-class Functions(ABC):
+@dataclass(frozen=True)
+class Functions:
     """The functions of `drake_diff.torch` and `drake_diff.jax`, in double precision.
 
     Their arrays are those of the library; other numbers are converted to its arrays of float64. Leading dimensions of
     all arguments are broadcast. The derivatives are those of `differentiate_step`, `differentiate_rollout` and
     `sensitivity`, in reverse mode, without second derivatives.
     """
+
+    array: Callable[[Any], Any]  # a value as an array of float64
+    broadcast: Callable[[Any, tuple[int, ...]], Any]
+    concatenate: Callable[[list[Any]], Any]  # along the last dimension
+    # The states (..., N+1, nx) of rollouts, or the end (..., nx) of single steps, for x0, us and values (..., np).
+    states: Callable[[RolloutFunction, bool, Any, Any, Any], Any]
+    loop: Callable[[Callable[[Any, Any], tuple[Any, Any]], Any, int], tuple[Any, Any]]  # xs and us by (x, k) -> (x, u)
+    plans: Callable[..., Any]  # the arrays of plans for a PlanFunction and the values
 
     def step(
         self,
@@ -42,7 +51,8 @@ class Functions(ABC):
         """
         named = self._arrays(parameters)
         function = rollout_function(model, tuple(named), method, bool(certify))
-        return self._end(function, self._array(x), self._array([] if u is None and model.nu == 0 else u), named)
+        u = self.array([] if u is None and model.nu == 0 else u)
+        return self.states(function, True, *self._full(function, self.array(x), u, named, ndim=1))
 
     def rollout(
         self,
@@ -78,21 +88,21 @@ class Functions(ABC):
             GradientError, SimulationError: See `differentiate_rollout`. If JAX runs a compiled function, it raises its
                 JaxRuntimeError with the text of this error.
         """
-        named, x0 = self._arrays(parameters), self._array(x0)
+        named, x0 = self._arrays(parameters), self.array(x0)
         function = rollout_function(model, tuple(named), method, bool(certify))
         if policy is None:
-            us = self._array([[]] * number_of_steps(num_steps) if us is None and model.nu == 0 else us)
-            return self._states(function, *self._full(function, x0, us, named)), us
+            us = self.array([[]] * number_of_steps(num_steps) if us is None and model.nu == 0 else us)
+            return self.states(function, False, *self._full(function, x0, us, named)), us
         if us is not None:
             raise InputError("rollout", got="us and policy", expected="one of them")
         h = named.get("model.time_step", model.time_step)
 
         def advance(x: Any, k: Any) -> tuple[Any, Any]:
-            u = self._array(policy(x, k * h))
-            return self._end(function, x, u, named), u
+            u = self.array(policy(x, k * h))
+            return self.states(function, True, *self._full(function, x, u, named, ndim=1)), u
 
         batch = function.leading(x0.shape, (1, model.nu), [value.shape for value in named.values()])
-        return self._loop(advance, self._broadcast(x0, (*batch, model.nx)), number_of_steps(num_steps))
+        return self.loop(advance, self.broadcast(x0, (*batch, model.nx)), number_of_steps(num_steps))
 
     def solve(
         self, problem: Problem, parameters: Mapping[str, Any], *, certify: bool = False, **options: Any
@@ -118,11 +128,11 @@ class Functions(ABC):
         function = PlanFunction(problem, tuple(named), options, certify)
         batch = function.leading([value.shape for value in named.values()])
         shapes = [(*batch, *shape) for shape in function.shapes.values()]
-        values = [self._broadcast(value, shape) for value, shape in zip(named.values(), shapes, strict=True)]
-        return PlanArrays(*self._plans(function, values))
+        values = [self.broadcast(value, shape) for value, shape in zip(named.values(), shapes, strict=True)]
+        return PlanArrays(*self.plans(function, *values))
 
     def _arrays(self, parameters: Mapping[str, Any] | None) -> dict[str, Any]:
-        return {name: self._array(value) for name, value in (parameters or {}).items()}
+        return {name: self.array(value) for name, value in (parameters or {}).items()}
 
     def _full(
         self, function: RolloutFunction, x0: Any, us: Any, named: Mapping[str, Any], ndim: int = 2
@@ -131,37 +141,9 @@ class Functions(ABC):
         shape = us.shape if ndim == 2 else (*us.shape[:-1], 1, *us.shape[-1:])
         batch = function.leading(x0.shape, shape, [value.shape for value in named.values()])
         columns = [v[..., None] if size == 1 else v for v, size in zip(named.values(), function.sizes, strict=True)]
-        values = [self._broadcast(column, (*batch, *column.shape[-1:])) for column in columns]
+        values = [self.broadcast(column, (*batch, *column.shape[-1:])) for column in columns]
         return (
-            self._broadcast(x0, (*batch, *x0.shape[-1:])),
-            self._broadcast(us, (*batch, *us.shape[-ndim:])),
-            self._concatenate(values) if values else self._broadcast(self._array([]), (*batch, 0)),
+            self.broadcast(x0, (*batch, *x0.shape[-1:])),
+            self.broadcast(us, (*batch, *us.shape[-ndim:])),
+            self.concatenate(values) if values else self.broadcast(self.array([]), (*batch, 0)),
         )
-
-    @abstractmethod
-    def _array(self, value: Any) -> Any:
-        """Return a value as an array of float64."""
-
-    @abstractmethod
-    def _broadcast(self, array: Any, shape: tuple[int, ...]) -> Any:
-        """Return an array of a larger shape."""
-
-    @abstractmethod
-    def _concatenate(self, columns: list[Any]) -> Any:
-        """Concatenate arrays (..., n) along the last dimension."""
-
-    @abstractmethod
-    def _states(self, function: RolloutFunction, x0: Any, us: Any, values: Any) -> Any:
-        """Return the states (..., N+1, nx) of rollouts with equal leading dimensions."""
-
-    @abstractmethod
-    def _end(self, function: RolloutFunction, x: Any, u: Any, named: Mapping[str, Any]) -> Any:
-        """Return the end states (..., nx) of single steps."""
-
-    @abstractmethod
-    def _loop(self, advance: Callable[[Any, Any], tuple[Any, Any]], x0: Any, count: int) -> tuple[Any, Any]:
-        """Return the states and inputs of `count` steps by `advance(x, k)`, which returns the next state and u."""
-
-    @abstractmethod
-    def _plans(self, function: PlanFunction, values: list[Any]) -> Any:
-        """Return the arrays of a plan for values with equal leading dimensions."""
