@@ -43,8 +43,7 @@ class _States(torch.autograd.Function):  # type: ignore[misc]  # PyTorch is an o
         device, by_xs = by_states.device, _numbers(by_states)
         x0, us, values, xs = map(_numbers, ctx.saved_tensors)
         if ctx.single:
-            xs, by_xs = np.stack([x0, xs], -2), np.stack([np.zeros_like(by_xs), by_xs], -2)
-            us = us[..., None, :]
+            xs, by_xs, us = np.stack([x0, xs], -2), np.stack([np.zeros_like(by_xs), by_xs], -2), us[..., None, :]
         by_x0, by_us, by_values = ctx.function.pull_back(xs, us, ctx.touching, values, by_xs)
         gradients = by_x0, by_us[..., 0, :] if ctx.single else by_us, by_values
         return None, None, *(torch.from_numpy(gradient).to(device) for gradient in gradients)

@@ -357,3 +357,16 @@ def test_the_tossed_cube_has_its_published_size_and_is_predicted_better_than_by_
     assert record.inputs.motion == "impacts"
     assert record.verdict == "fail"  # no cube of rigid spheres explains real impacts to the noise of the cameras
     assert dd.verify(tmp_path / "artifacts" / "tossed_cube" / "fall").holds
+
+
+@pytest.mark.slow
+def test_a_network_in_pytorch_pushes_a_ball_to_targets_that_it_was_not_trained_on():
+    torch = pytest.importorskip("torch", reason="pip install 'drake-diff[torch]'")
+    module = example("torch_push_policy")
+    model, net = dd.load_model(module.MODEL, time_step=module.TIME_STEP), module.network()
+    module.certify(model, net)  # raises if the derivative of a step does not agree
+    losses = module.train(model, net)
+    assert losses[-1] < 0.02 * losses[0]
+    with torch.no_grad():
+        xs, _ = module.push(model, net, module.UNSEEN)
+    assert (xs[:, -1, module.BALL] - module.UNSEEN).abs().max() < 0.02  # m
