@@ -8,6 +8,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 from helpers.robots import example_robot, state_in_range
+from helpers.table import slow_after
 
 import drake_diff as dd
 from drake_diff.bridges import rollouts
@@ -84,7 +85,6 @@ def test_the_librarys_own_check_passes_in_free_motion(library, name):
     library.check(lambda x0, us: library.functions.rollout(model, x0, us)[0], (x0, us), 1e-6)
 
 
-@pytest.mark.slow
 def test_the_librarys_own_check_passes_for_a_standing_robot(library):
     """Differences of Drake's steps contain the residual of its solver, 1e-6 of the momentum."""
     model = example_robot("go2.urdf", 0.002, feet=True, approximation="sap", leg=(0.0, 0.8, -1.6))
@@ -173,8 +173,7 @@ def reach(load, **changes):
     return dd.Problem(load("pendulum.urdf", time_step=0.05), **given | changes)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["collocation", "shooting"])
+@pytest.mark.parametrize("method", slow_after(1, ["collocation", "shooting"]))
 def test_a_plans_gradients_are_its_sensitivities(library, load, method):
     problem, masses = reach(load), np.array([1.0, 1.2])
     x0, goal = np.array([0.1, 0.0]), np.array([0.5, 0.0])
