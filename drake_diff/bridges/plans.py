@@ -84,7 +84,7 @@ class PlanFunction:
             of_plan = [array[i] for array in by_plans]
             for gradient, (name, value) in zip(gradients, self._gradient(row, of_plan).items(), strict=True):
                 gradient[i] = value.reshape(self.shapes[name])
-        return tuple(g.reshape(*batch, *g.shape[1:]) for g in gradients)
+        return tuple(g.reshape((*batch, *g.shape[1:])) for g in gradients)
 
     def _rows(self, values: Sequence[Any]) -> tuple[list[tuple[Array, ...]], Shape]:
         """Return the values of each problem, and the leading dimensions."""

@@ -192,6 +192,10 @@ def test_a_plans_gradients_are_its_sensitivities(library, load, method):
             of_plans.append(s.cost + s.xs[10, 0] + 2 * s.us[3, 0])
     assert value == pytest.approx(sum(values), rel=1e-12)
     assert_same(found, [sum(rows["x0"]), sum(rows["goal"]), np.concatenate(rows["pole.mass"])])
+    _, (by_mass,) = library.gradients(
+        lambda mass: library.functions.solve(problem, {"pole.mass": mass}, method=method).cost, 1.2
+    )
+    assert by_mass == pytest.approx(s.cost[0], rel=SAME)  # of the last solution
 
 
 def test_a_plan_at_a_corner_warns_and_an_unsolved_problem_is_refused(library):

@@ -370,3 +370,20 @@ def test_a_network_in_pytorch_pushes_a_ball_to_targets_that_it_was_not_trained_o
     with torch.no_grad():
         xs, _ = module.push(model, net, module.UNSEEN)
     assert (xs[:, -1, module.BALL] - module.UNSEEN).abs().max() < 0.02  # m
+
+
+@pytest.mark.slow
+def test_jax_improves_the_gears_of_a_leg_by_the_slopes_of_its_optimal_motion():
+    """The slopes are those of the heat of plans at other gears."""
+    jax = pytest.importorskip("jax", reason="pip install 'drake-diff[jax]'")
+    before = jax.config.jax_enable_x64
+    try:
+        module = example("jax_leg_design")  # sets double precision
+        swing, first = module.problem(), np.log(module.FIRST)
+        value, slopes = jax.value_and_grad(lambda logarithms: module.heat(swing, logarithms))(first)
+        for i in range(2):
+            ahead, behind = (module.heat(swing, first + sign * 1e-3 * np.eye(2)[i]) for sign in (1, -1))
+            assert float(slopes[i]) == pytest.approx(float(ahead - behind) / 2e-3, rel=1e-4)
+        assert float(module.heat(swing, np.log(module.improve(swing)))) < 0.25 * float(value)
+    finally:
+        jax.config.update("jax_enable_x64", before)
