@@ -47,17 +47,20 @@ def network() -> nn.Module:
 
 
 def train(model: dd.Model, net: nn.Module, xs: Tensor, us: Tensor) -> list[float]:
-    """Train by Adam on the differences from the measured states, relative to the noise, and return the losses."""
-    optimizer, losses = torch.optim.Adam(net.parameters(), lr=0.02), []
-    for _ in range(ITERATIONS):
+    """Train by L-BFGS on the differences from the measured states, relative to the noise, and return the losses."""
+    optimizer, losses = torch.optim.LBFGS(net.parameters(), max_iter=ITERATIONS, line_search_fn="strong_wolfe"), []
+
+    def evaluate() -> Tensor:
         optimizer.zero_grad()
         simulated, _ = rollout(
             model, xs[:, 0], policy=lambda x, t: us[:, round(t / TIME_STEP)] + net(x[:, 1:]), num_steps=NUM_STEPS
         )
         loss = (((simulated - xs) / torch.from_numpy(NOISE)) ** 2).mean()
         loss.backward()
-        optimizer.step()
         losses.append(loss.item())
+        return loss
+
+    optimizer.step(evaluate)
     return losses
 
 

@@ -387,3 +387,13 @@ def test_jax_improves_the_gears_of_a_leg_by_the_slopes_of_its_optimal_motion():
         assert float(module.heat(swing, np.log(module.improve(swing)))) < 0.25 * float(value)
     finally:
         jax.config.update("jax_enable_x64", before)
+
+
+@pytest.mark.slow
+def test_a_network_in_pytorch_learns_the_torque_that_a_model_does_not_have():
+    torch = pytest.importorskip("torch", reason="pip install 'drake-diff[torch]'")
+    module = example("torch_residual_force")
+    model, net = dd.load_model(module.MODEL, time_step=module.TIME_STEP), module.network()
+    losses = module.train(model, net, *map(torch.from_numpy, module.recordings(model)))
+    assert losses[-1] < 4  # of the noise's square; the noise of the first state moves the whole motion
+    assert np.abs(module.errors(net)).max() < 0.15  # N m, of 2.7
