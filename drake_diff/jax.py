@@ -32,12 +32,12 @@ def _like(shape: tuple[int, ...], kind: type = float) -> Any:
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _pure_states(function: RolloutFunction, x0: Any, us: Any, values: Any) -> Any:
+def _pure_states(function: RolloutFunction, x0: Any, us: Any, *values: Any) -> Any:
     """Return the states (..., N+1, nx) of rollouts with equal leading dimensions."""
-    return _states_and_saved(function, x0, us, values)[0]
+    return _states_and_saved(function, x0, us, *values)[0]
 
 
-def _states_and_saved(function: RolloutFunction, x0: Any, us: Any, values: Any) -> tuple[Any, Any]:
+def _states_and_saved(function: RolloutFunction, x0: Any, us: Any, *values: Any) -> tuple[Any, Any]:
     (*batch, nx), count = x0.shape, us.shape[-2]
     xs, touching = _call(
         function.states, (_like((*batch, count + 1, nx)), _like((*batch, count), bool)), x0, us, values
@@ -46,8 +46,9 @@ def _states_and_saved(function: RolloutFunction, x0: Any, us: Any, values: Any) 
 
 
 def _pull_back_states(function: RolloutFunction, saved: tuple[Any, ...], by_xs: Any) -> tuple[Any, ...]:
-    (*batch, _, nx), us, values = saved[0].shape, saved[1], saved[3]
-    return tuple(_call(function.pull_back, tuple(map(_like, ((*batch, nx), us.shape, values.shape))), *saved, by_xs))
+    xs, us, _, values = saved
+    shapes = (*xs.shape[:-2], xs.shape[-1]), us.shape, *(value.shape for value in values)
+    return tuple(_call(function.pull_back, tuple(map(_like, shapes)), *saved, by_xs))
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -57,7 +58,7 @@ def _plans(function: PlanFunction, *values: Any) -> Any:
 
 
 def _plans_and_saved(function: PlanFunction, *values: Any) -> tuple[Any, Any]:
-    batch = function.leading([value.shape for value in values])
+    batch = values[0].shape[: values[0].ndim - len(next(iter(function.shapes.values())))]
     return _call(function.plans, tuple(map(_like, function.sizes(batch))), values), values
 
 
@@ -70,10 +71,10 @@ _plans.defvjp(_plans_and_saved, _pull_back_plans)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _states(function: RolloutFunction, single: bool, x0: Any, us: Any, values: Any) -> Any:
+def _states(function: RolloutFunction, single: bool, x0: Any, us: Any, *values: Any) -> Any:
     if single:
-        return _pure_states(function, x0, us[..., None, :], values)[..., 1, :]
-    return _pure_states(function, x0, us, values)
+        return _pure_states(function, x0, us[..., None, :], *values)[..., 1, :]
+    return _pure_states(function, x0, us, *values)
 
 
 def _array(value: Any) -> Any:
@@ -81,10 +82,6 @@ def _array(value: Any) -> Any:
         expected = 'double precision: jax.config.update("jax_enable_x64", True)'
         raise InputError("jax_enable_x64", got="False, single precision", expected=expected)
     return jnp.asarray(value, dtype=float)
-
-
-def _concatenate(columns: list[Any]) -> Any:
-    return jnp.concatenate(columns, axis=-1)
 
 
 def _loop(advance: Callable[[Any, Any], Any], x0: Any, count: int) -> tuple[Any, Any]:
@@ -96,5 +93,5 @@ def _loop(advance: Callable[[Any, Any], Any], x0: Any, count: int) -> tuple[Any,
     return jnp.moveaxis(jnp.concatenate([x0[None], ends]), 0, -2), jnp.moveaxis(us, 0, -2)
 
 
-_FUNCTIONS = Functions(_array, jnp.broadcast_to, _concatenate, _states, _loop, _plans)
+_FUNCTIONS = Functions(_array, jnp.broadcast_to, _states, _loop, _plans)
 step, rollout, solve = _FUNCTIONS.step, _FUNCTIONS.rollout, _FUNCTIONS.solve

@@ -27,13 +27,13 @@ class _States(torch.autograd.Function):  # type: ignore[misc]  # PyTorch is an o
     """The states of rollouts, or the end state of a `single` step, and the pull-back of their gradients."""
 
     @staticmethod
-    def forward(ctx: Any, function: RolloutFunction, single: bool, x0: Tensor, us: Tensor, values: Tensor) -> Tensor:
+    def forward(ctx: Any, function: RolloutFunction, single: bool, x0: Tensor, us: Tensor, *values: Tensor) -> Tensor:
         """Return the states (..., N+1, nx), or (..., nx) for inputs (..., nu) of a single step."""
         inputs = _numbers(us)[..., None, :] if single else _numbers(us)
-        xs, touching = function.states(_numbers(x0), inputs, _numbers(values))
+        xs, touching = function.states(_numbers(x0), inputs, [*map(_numbers, values)])
         states = torch.from_numpy(xs[..., 1, :] if single else xs).to(x0.device)
         ctx.function, ctx.single, ctx.touching = function, single, touching
-        ctx.save_for_backward(x0, us, values, states)
+        ctx.save_for_backward(x0, us, states, *values)
         return states
 
     @staticmethod
@@ -41,11 +41,11 @@ class _States(torch.autograd.Function):  # type: ignore[misc]  # PyTorch is an o
         """Return the gradients by x0, us and the parameters' values."""
         _refuse_a_graph()
         device, by_xs = by_states.device, _numbers(by_states)
-        x0, us, values, xs = map(_numbers, ctx.saved_tensors)
+        x0, us, xs, *values = map(_numbers, ctx.saved_tensors)
         if ctx.single:
             xs, by_xs, us = np.stack([x0, xs], -2), np.stack([np.zeros_like(by_xs), by_xs], -2), us[..., None, :]
-        by_x0, by_us, by_values = ctx.function.pull_back(xs, us, ctx.touching, values, by_xs)
-        gradients = by_x0, by_us[..., 0, :] if ctx.single else by_us, by_values
+        by_x0, by_us, *by_values = ctx.function.pull_back(xs, us, ctx.touching, values, by_xs)
+        gradients = by_x0, by_us[..., 0, :] if ctx.single else by_us, *by_values
         return None, None, *(torch.from_numpy(gradient).to(device) for gradient in gradients)
 
 
@@ -85,10 +85,6 @@ def _broadcast(array: Tensor, shape: tuple[int, ...]) -> Tensor:
     return array if array.shape == shape else array.expand(shape)  # `expand` takes as long as a small step
 
 
-def _concatenate(columns: list[Tensor]) -> Tensor:
-    return torch.cat(columns, -1)
-
-
 def _loop(advance: Callable[[Any, Any], Any], x0: Tensor, count: int) -> tuple[Tensor, Tensor]:
     xs, us = [x0], []
     for k in range(count):
@@ -98,5 +94,5 @@ def _loop(advance: Callable[[Any, Any], Any], x0: Tensor, count: int) -> tuple[T
     return torch.stack(xs, -2), torch.stack(us, -2)
 
 
-_FUNCTIONS = Functions(_array, _broadcast, _concatenate, _States.apply, _loop, _Plans.apply)
+_FUNCTIONS = Functions(_array, _broadcast, _States.apply, _loop, _Plans.apply)
 step, rollout, solve = _FUNCTIONS.step, _FUNCTIONS.rollout, _FUNCTIONS.solve

@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from drake_diff._base.arrays import number_of_steps
+from drake_diff._base.arrays import Entries, broadcast_shapes, number_of_steps
 from drake_diff.bridges.plans import PlanArrays, PlanFunction
-from drake_diff.bridges.rollouts import RolloutFunction, rollout_function
+from drake_diff.bridges.rollouts import rollout_function
 from drake_diff.exceptions import InputError
 from drake_diff.model.model import Model
 from drake_diff.optimize.problem.problem import Problem
@@ -25,9 +25,8 @@ class Functions:
 
     array: Callable[[Any], Any]  # a value as an array of float64
     broadcast: Callable[[Any, tuple[int, ...]], Any]
-    concatenate: Callable[[list[Any]], Any]  # along the last dimension
-    # The states (..., N+1, nx) of rollouts, or the end (..., nx) of single steps, for x0, us and values (..., np).
-    states: Callable[[RolloutFunction, bool, Any, Any, Any], Any]
+    # The states (..., N+1, nx) of rollouts, or if True the ends (..., nx) of single steps, for x0, us and parameters.
+    states: Callable[..., Any]
     loop: Callable[[Callable[[Any, Any], tuple[Any, Any]], Any, int], tuple[Any, Any]]  # xs and us by (x, k) -> (x, u)
     plans: Callable[..., Any]  # the arrays of plans for a PlanFunction and the values
 
@@ -52,7 +51,7 @@ class Functions:
         named = self._arrays(parameters)
         function = rollout_function(model, tuple(named), method, bool(certify))
         u = self.array([] if u is None and model.nu == 0 else u)
-        return self.states(function, True, *self._full(function, self.array(x), u, named, ndim=1))
+        return self.states(function, True, *self._full(function.of_step, self.array(x), u, *named.values()))
 
     def rollout(
         self,
@@ -92,17 +91,17 @@ class Functions:
         function = rollout_function(model, tuple(named), method, bool(certify))
         if policy is None:
             us = self.array([[]] * number_of_steps(num_steps) if us is None and model.nu == 0 else us)
-            return self.states(function, False, *self._full(function, x0, us, named)), us
+            return self.states(function, False, *self._full(function.of_rollout, x0, us, *named.values())), us
         if us is not None:
             raise InputError("rollout", got="us and policy", expected="one of them")
         h = named.get("model.time_step", model.time_step)
 
         def advance(x: Any, k: Any) -> tuple[Any, Any]:
             u = self.array(policy(x, k * h))
-            return self.states(function, True, *self._full(function, x, u, named, ndim=1)), u
+            return self.states(function, True, *self._full(function.of_step, x, u, *named.values())), u
 
-        batch = function.leading(x0.shape, (1, model.nu), [value.shape for value in named.values()])
-        return self.loop(advance, self.broadcast(x0, (*batch, model.nx)), number_of_steps(num_steps))
+        start, *_ = self._full({"x0": (model.nx,), **function.parameters}, x0, *named.values())
+        return self.loop(advance, start, number_of_steps(num_steps))
 
     def solve(
         self, problem: Problem, parameters: Mapping[str, Any], *, certify: bool = False, **options: Any
@@ -126,24 +125,12 @@ class Functions:
         """
         named = self._arrays(parameters)
         function = PlanFunction(problem, tuple(named), options, certify)
-        batch = function.leading([value.shape for value in named.values()])
-        shapes = [(*batch, *shape) for shape in function.shapes.values()]
-        values = [self.broadcast(value, shape) for value, shape in zip(named.values(), shapes, strict=True)]
-        return PlanArrays(*self.plans(function, *values))
+        return PlanArrays(*self.plans(function, *self._full(function.shapes, *named.values())))
 
     def _arrays(self, parameters: Mapping[str, Any] | None) -> dict[str, Any]:
         return {name: self.array(value) for name, value in (parameters or {}).items()}
 
-    def _full(
-        self, function: RolloutFunction, x0: Any, us: Any, named: Mapping[str, Any], ndim: int = 2
-    ) -> tuple[Any, Any, Any]:
-        """Return x0 (..., nx), us (of which `ndim` dimensions are not leading) and values (..., np), broadcast."""
-        shape = us.shape if ndim == 2 else (*us.shape[:-1], 1, *us.shape[-1:])
-        batch = function.leading(x0.shape, shape, [value.shape for value in named.values()])
-        columns = [v[..., None] if size == 1 else v for v, size in zip(named.values(), function.sizes, strict=True)]
-        values = [self.broadcast(column, (*batch, *column.shape[-1:])) for column in columns]
-        return (
-            self.broadcast(x0, (*batch, *x0.shape[-1:])),
-            self.broadcast(us, (*batch, *us.shape[-ndim:])),
-            self.concatenate(values) if values else self.broadcast(self.array([]), (*batch, 0)),
-        )
+    def _full(self, entries: Entries, *values: Any) -> list[Any]:
+        """Return the named arrays with equal leading dimensions."""
+        shapes = broadcast_shapes(entries, [tuple(value.shape) for value in values])
+        return [self.broadcast(value, shape) for value, shape in zip(values, shapes, strict=True)]

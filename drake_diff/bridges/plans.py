@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drake_diff._base.arrays import Array
-from drake_diff.exceptions import GradientError, GradientWarning, InputError, ShapeError
+from drake_diff._base.arrays import Array, Shape
+from drake_diff.exceptions import GradientError, GradientWarning, InputError
 from drake_diff.model.parameters import select
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.sensitivity import ENDS, Sensitivity, sensitivity
@@ -20,8 +20,6 @@ from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.solve import solve
 
 REMEMBERED = 256  # solutions between a forward and a backward pass; JAX passes only arrays from one to the other
-
-Shape = tuple[int, ...]
 
 
 class PlanArrays(NamedTuple):
@@ -49,18 +47,6 @@ class PlanFunction:
         for parameter in vector.parameters if vector else ():
             self.shapes[parameter.name] = (len(parameter.value),) if len(parameter.value) > 1 else ()
         self._solutions: OrderedDict[bytes, Solution] = OrderedDict()
-
-    def leading(self, shapes: Sequence[Shape]) -> Shape:
-        """Return the leading dimensions of values with these shapes. Raises ShapeError if they do not fit."""
-        batches = []
-        for (name, size), shape in zip(self.shapes.items(), shapes, strict=True):
-            if shape[len(shape) - len(size) :] != size:
-                raise ShapeError(name, got=shape, expected=("...", *size))
-            batches.append(shape[: len(shape) - len(size)])
-        try:
-            return np.broadcast_shapes(*batches)
-        except ValueError as error:
-            raise InputError("parameters", got=f"leading dimensions {batches}", expected="equal ones") from error
 
     def sizes(self, batch: Shape) -> tuple[Shape, ...]:
         """Return the shapes of a plan's arrays for values with the leading dimensions `batch`."""

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, Indices, finite_array
+from drake_diff._base.arrays import Array, Entries, Indices, finite_array
 from drake_diff.certificates.certify import certify_steps
 from drake_diff.derivatives.sources import check_method
 from drake_diff.derivatives.step import linearize_steps
 from drake_diff.derivatives.steps import Flags, Steps, take_steps
-from drake_diff.exceptions import GradientWarning, ShapeError
+from drake_diff.exceptions import GradientWarning
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
 from drake_diff.motion.gradient import CONTINUOUS, differentiate_rollout
@@ -24,11 +24,9 @@ from drake_diff.motion.loss import accumulate
 MOST_NUMBERS = 2**24  # of Jacobians at the same time: 128 MiB
 NAMED = 3  # steps that a warning lists
 
-Shape = tuple[int, ...]
-
 
 class RolloutFunction:
-    """The states (..., N+1, nx) of rollouts from x0 (..., nx) under us (..., N, nu) with parameter values (..., np).
+    """The states (..., N+1, nx) of rollouts from x0 (..., nx) under us (..., N, nu) with values of parameters.
 
     All arrays have the same leading dimensions. `names` are those of the parameters. With `certify`, the steps whose
     derivatives are used are screened, and a GradientWarning names those that are not certified.
@@ -39,25 +37,12 @@ class RolloutFunction:
             check_method(method)
         self.model, self.method, self.certify = model, method, certify
         self.vector = select(model, names)
-        self.sizes = [len(parameter.value) for parameter in self.vector.parameters]
+        sizes = {parameter.name: len(parameter.value) for parameter in self.vector.parameters}
+        self.parameters = {name: (size,) if size > 1 else () for name, size in sizes.items()}
+        self.of_rollout: Entries = {"x0": (model.nx,), "us": ("N", model.nu), **self.parameters}
+        self.of_step: Entries = {"x": (model.nx,), "u": (model.nu,), **self.parameters}
 
-    def leading(self, x0: Shape, us: Shape, parameters: Sequence[Shape]) -> Shape:
-        """Return the leading dimensions of the results for these shapes. Raises ShapeError if they do not fit."""
-        if x0[-1:] != (self.model.nx,):
-            raise ShapeError("x0", got=x0, expected=("...", self.model.nx))
-        if len(us) < 2 or us[-1] != self.model.nu or us[-2] < 1:
-            raise ShapeError("us", got=us, expected=("...", "N", self.model.nu))
-        shapes = [x0[:-1], us[:-2]]
-        for parameter, shape, size in zip(self.vector.parameters, parameters, self.sizes, strict=True):
-            if size > 1 and shape[-1:] != (size,):
-                raise ShapeError(parameter.name, got=shape, expected=("...", size))
-            shapes.append(shape[:-1] if size > 1 else shape)
-        try:
-            return shapes[0] if all(shape == shapes[0] for shape in shapes) else np.broadcast_shapes(*shapes)
-        except ValueError as error:
-            raise ShapeError("us", got=us, expected=(*x0[:-1], "N", self.model.nu)) from error
-
-    def states(self, x0: Any, us: Any, values: Any) -> tuple[Array, Flags]:
+    def states(self, x0: Any, us: Any, values: Sequence[Any]) -> tuple[Array, Flags]:
         """Return the states (..., N+1, nx), and whether a contact acts in each step (..., N)."""
         batch, (count, nu), nx = np.shape(x0)[:-1], np.shape(us)[-2:], self.model.nx
         size = math.prod(batch)
@@ -75,8 +60,8 @@ class RolloutFunction:
                         xs[i, 1:], touching[i] = steps.x_next, steps.touching
         return xs.reshape(*batch, count + 1, nx), touching.reshape(*batch, count)
 
-    def pull_back(self, xs: Any, us: Any, touching: Any, values: Any, by_xs: Any) -> tuple[Array, Array, Array]:
-        """Return a loss's gradients by x0, us and values (..., np) from its gradient `by_xs` by the states.
+    def pull_back(self, xs: Any, us: Any, touching: Any, values: Sequence[Any], by_xs: Any) -> tuple[Array, ...]:
+        """Return a loss's gradients by x0, us and each of the values from its gradient `by_xs` by the states.
 
         The Jacobians of the steps are computed from the states for some rollouts at a time, and only for the steps
         before the last state on which the loss depends.
@@ -97,7 +82,9 @@ class RolloutFunction:
                 jacobians = self._jacobians(vector, xs[some, : last + 1], us[some, :last], touching[some, :last])
                 totals = accumulate(jacobians, by_xs[some, : last + 1], by_us[some, :last])
                 by_x0[some], by_us[some, :last], by_values[some] = totals.states[:, 0], totals.inputs, totals.parameters
-        return by_x0.reshape(*batch, nx), by_us.reshape(*batch, count, nu), by_values.reshape(*batch, -1)
+        columns = zip(values, self.vector.slices, strict=True)
+        by_parameters = [by_values[:, columns_of].reshape(np.shape(value)) for value, columns_of in columns]
+        return by_x0.reshape(*batch, nx), by_us.reshape(*batch, count, nu), *by_parameters
 
     def _pull_back_flow(self, vector: ParameterVector, x0: Array, us: Array, by_xs: Array) -> tuple[Array, ...]:
         """Pull back along one motion in continuous time; `differentiate_rollout` warns of columns without a slope."""
@@ -134,19 +121,20 @@ class RolloutFunction:
             text = f"{len(doubtful)} of {len(certificates)} steps have no certified derivative: {named}{more}"
             warnings.warn(text, GradientWarning, stacklevel=2)
 
-    def _groups(self, values: Any, size: int) -> Iterator[tuple[ParameterVector, Indices]]:
+    def _groups(self, values: Sequence[Any], size: int) -> Iterator[tuple[ParameterVector, Indices]]:
         """Yield parameters, and the indices of the rollouts that have them."""
-        if not self.sizes:
+        if not values:
             yield self.vector, np.arange(size)
             return
-        rows, group = np.unique(np.asarray(values).reshape(size, -1), axis=0, return_inverse=True)
+        table = np.hstack([np.asarray(value).reshape(size, -1) for value in values])
+        rows, group = np.unique(table, axis=0, return_inverse=True)
         for i, row in enumerate(rows):
             given = {p.name: row[s] for p, s in self.vector.pairs}
             yield select(self.model, given), np.flatnonzero(group.ravel() == i)
 
     def _parts(self, rows: Indices, count: int) -> list[Indices]:
         """Split the indices of rollouts of `count` steps into parts whose Jacobians fit into memory."""
-        width = self.model.nx + self.model.nu + sum(self.sizes)
+        width = self.model.nx + self.model.nu + len(self.vector.values)
         most = max(1, MOST_NUMBERS // (count * self.model.nx * width))
         return [rows] if len(rows) <= most else np.split(rows, range(most, len(rows), most))
 

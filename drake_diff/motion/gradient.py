@@ -148,7 +148,7 @@ def differentiate_rollout(
     if us is not None and policy is not None:
         raise InputError("differentiate_rollout", got="us and policy", expected="one of them")
     vector = select(model, parameters)
-    if batch := batch_of(x0, us):
+    if batch := batch_of(model, x0, us):
         more: Any = {"policy": policy, "parameters": vector, "num_steps": num_steps, "method": method}
         rows = rows_of_batch(model, batch, x0, us)
         return _batch_of_gradients([differentiate_rollout(model, x, u, loss, **more) for x, u in rows], batch)

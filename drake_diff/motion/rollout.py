@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_diff._base.arrays import Array, finite_array, frozen, number_of_steps
+from drake_diff._base.arrays import Array, broadcast_shapes, finite_array, frozen, number_of_steps
 from drake_diff._base.autodiff import called
 from drake_diff._base.values import ShowsItsRepr, stacked
-from drake_diff.exceptions import InputError, ShapeError, SimulationError, UnknownNameError
+from drake_diff.exceptions import InputError, SimulationError, UnknownNameError
 from drake_diff.model.contact import ContactPoint, contacts_of_the_step, penetration
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
@@ -147,7 +147,7 @@ def rollout(
         raise UnknownNameError("method", got=method, known=MOTIONS)
     if us is not None and policy is not None:
         raise InputError("rollout", got="us and policy", expected="one of them")
-    if batch := batch_of(x0, us):
+    if batch := batch_of(model, x0, us):
         rows = rows_of_batch(model, batch, x0, us)
         more: Any = {"policy": policy, "num_steps": num_steps, "parameters": parameters, "method": method}
         rollouts = [rollout(model, x, u, **more) for x, u in rows]
@@ -235,31 +235,28 @@ def check_inputs(model: Model, us: ArrayLike | None, num_steps: int | None = Non
     return checked
 
 
-def batch_of(x0: Any, us: Any) -> tuple[int, ...]:
+def batch_of(model: Model, x0: Any, us: Any) -> tuple[int, ...]:
     """Return the leading dimensions that x0 (..., nx) and us (..., N, nu) share, () for a single rollout."""
     try:
-        shapes = np.shape(x0)[:-1], () if us is None else np.shape(us)[:-2]
+        shapes = [np.shape(values) for values in (x0, us) if values is not None]
     except ValueError:  # rows of different lengths, which the checks of a single rollout refuse
         return ()
-    try:
-        batch = np.broadcast_shapes(*shapes)
-    except ValueError as error:
-        raise ShapeError("us", got=np.shape(us), expected=(*shapes[0], "N", "nu")) from error
+    if all(len(shape) <= i + 1 for i, shape in enumerate(shapes)):
+        return ()
+    batch = broadcast_shapes({"x0": (model.nx,), "us": ("N", model.nu)}, shapes)[0][:-1]
     if 0 in batch:
         raise InputError("x0, us", got=f"a batch of {batch} rollouts", expected="at least one rollout")
     return batch
 
 
 def rows_of_batch(model: Model, batch: tuple[int, ...], x0: Any, us: Any) -> Iterator[tuple[Array, Array | None]]:
-    """Yield the initial state (nx,) and the inputs (N, nu) of each rollout of a batch."""
+    """Return the initial state (nx,) and the inputs (N, nu) of each rollout of a batch."""
     count = math.prod(batch)
-    x0 = finite_array("x0", x0, (*np.shape(x0)[:-1], model.nx))
-    starts = np.broadcast_to(x0, (*batch, model.nx)).reshape(count, model.nx)
+    starts = np.broadcast_to(finite_array("x0", x0, np.shape(x0)), (*batch, model.nx)).reshape(count, model.nx)
     if us is None:
-        yield from ((x, None) for x in starts)
-        return
-    us = finite_array("us", us, (*np.shape(us)[:-1], model.nu))
-    yield from zip(starts, np.broadcast_to(us, (*batch, *us.shape[-2:])).reshape(count, *us.shape[-2:]), strict=True)
+        return ((x, None) for x in starts)
+    us = finite_array("us", us, np.shape(us))
+    return zip(starts, np.broadcast_to(us, (*batch, *us.shape[-2:])).reshape(count, *us.shape[-2:]), strict=True)
 
 
 def roll_states(model: Model, x0: Array, us: Array) -> Array:
