@@ -79,13 +79,13 @@ def test_what_is_broadcast_has_the_sum_of_the_gradients(library, load):
 
 
 @pytest.mark.parametrize("name", ["ur5_robot.urdf", "solo12.urdf"])
-def test_the_librarys_own_check_passes_in_free_motion(library, name):
+def test_the_check_of_the_library_passes_in_free_motion(library, name):
     model = example_robot(name)
     x0, us = motions(model, steps=3)
     library.check(lambda x0, us: library.functions.rollout(model, x0, us)[0], (x0, us), 1e-6)
 
 
-def test_the_librarys_own_check_passes_for_a_standing_robot(library):
+def test_the_check_of_the_library_passes_for_a_standing_robot(library):
     """Differences of Drake's steps contain the residual of its solver, 1e-6 of the momentum."""
     model = example_robot("go2.urdf", 0.002, feet=True, approximation="sap", leg=(0.0, 0.8, -1.6))
     x0 = dd.rollout(model, model.default_state, np.zeros((20, model.nu))).xs[-1]
@@ -94,7 +94,7 @@ def test_the_librarys_own_check_passes_for_a_standing_robot(library):
     library.check(lambda x0, us: library.functions.rollout(model, x0, us)[0], (x0, us), 1e-4, eps=1e-6)
 
 
-def test_a_policys_gradient_is_that_of_a_parametric_policy(library, load):
+def test_the_gradient_of_a_policy_is_that_of_a_parametric_policy(library, load):
     model = load("cart_pole.urdf")
     x0, _ = motions(model, 3)
     weights = np.array([0.5, -1.0, 0.3, 0.2])
