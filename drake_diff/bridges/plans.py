@@ -96,6 +96,9 @@ class PlanFunction:
             solution = solve(replace(self.problem, **changes), **self.options)
             if not solution.success:
                 raise GradientError(f"the plan has no derivative: {solution.status.value}: {solution.message}")
+            if len(solution.us) != self.problem.num_steps:
+                counts = f"from {self.problem.num_steps} to {len(solution.us)} intervals"
+                raise GradientError(f"the mesh was refined {counts}: use more steps, or Options(refine=False)")
             self._solutions[key] = solution
             if len(self._solutions) > REMEMBERED:
                 self._solutions.popitem(last=False)

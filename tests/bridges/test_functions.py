@@ -214,6 +214,15 @@ def test_a_plan_at_a_corner_warns_and_an_unsolved_problem_is_refused(library):
     assert library.name == "jax" or isinstance(caught.value, GradientError)
 
 
+def test_a_plan_whose_mesh_was_refined_is_refused(library, load):
+    options = dd.optimize.Options(refine=True, error_tolerance=1e-12)
+    with pytest.raises(Exception, match="the mesh was refined from 20 to "):
+        library.gradients(
+            lambda x0: library.functions.solve(reach(load), {"x0": x0}, method="collocation", options=options).cost,
+            np.array([0.1, 0.0]),
+        )
+
+
 # ---- what is refused -------------------------------------------------------------------------------------------------
 
 
