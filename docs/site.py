@@ -55,6 +55,9 @@ def reference() -> dict[str, str]:
             pages[f"reference/{package}.md"] = _page(f"dd.{package}", first, f"dd.{package}", names)
     errors = "# dd.exceptions\n\n::: drake_diff.exceptions\n    options: {show_root_heading: false}\n"
     pages["reference/exceptions.md"] = errors
+    functions = "::: drake_diff.bridges.functions.Functions\n    options: {heading: step, rollout and solve}\n"
+    first = "`step`, `rollout` and `solve` for PyTorch, in `drake_diff.torch`, and for JAX, in `drake_diff.jax`."
+    pages["reference/bridges.md"] = f"# drake_diff.torch and drake_diff.jax\n\n{first}\n\n{functions}"
     packages = ", ".join(f"[`dd.{Path(page).stem}`]({Path(page).name})" for page in pages)
     intro = f"The names of `import drake_diff as dd`. Packages with further names: {packages}."
     return {"reference/index.md": _page("drake_diff", intro, "dd", root), **pages}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import accumulate, pairwise
 from math import hypot, isfinite
 from numbers import Real
@@ -15,6 +15,8 @@ from drake_diff.exceptions import InputError, NonFiniteError, ShapeError
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+Shape = tuple[int, ...]
+Entries = Mapping[str, tuple[int | str, ...]]  # the last dimensions of named arrays
 FLOAT = np.dtype(float)
 NUMBERS = "fiub"  # NumPy's kinds of numeric types: floats, integers, booleans
 LARGEST, LARGEST_COUNT = float(np.finfo(float).max), 2**31 - 1  # the largest double; the largest int of the solvers
@@ -68,6 +70,27 @@ def _of_numbers(subject: str, values: Any) -> Array:
         return frozen(array)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(subject, got=f"{values!r:.80}", expected="an array of numbers") from error
+
+
+def broadcast_shapes(entries: Entries, shapes: Sequence[Shape]) -> list[Shape]:
+    """Return shapes with equal leading dimensions for named arrays, of which `entries` are the last dimensions.
+
+    A dimension "N" has any size of at least 1. Raises ShapeError or InputError if a shape does not fit.
+    """
+    batches, ends = [], []
+    for (name, entry), shape in zip(entries.items(), shapes, strict=False):  # inputs may be omitted
+        split = max(0, len(shape) - len(entry))
+        batches.append(shape[:split])
+        ends.append(shape[split:])
+        sizes = zip(ends[-1], entry, strict=False)
+        if len(ends[-1]) < len(entry) or any(n < 1 if m == "N" else n != m for n, m in sizes):
+            raise ShapeError(name, got=shape, expected=("...", *entry))
+    try:
+        batch = batches[0] if all(b == batches[0] for b in batches) else np.broadcast_shapes(*batches)
+    except ValueError as error:
+        got, expected = f"leading dimensions {batches}", "dimensions that can be broadcast"
+        raise InputError(", ".join(entries), got=got, expected=expected) from error
+    return [(*batch, *end) for end in ends]
 
 
 def count(subject: str, value: Any, least: int, most: int = LARGEST_COUNT) -> int:

@@ -2,13 +2,16 @@
 
 import math
 import pickle
+from collections.abc import Sequence
 from contextvars import ContextVar
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from html import escape
 from typing import Any, TypeVar
 
 import cloudpickle
+import numpy as np
 
+from drake_diff._base.arrays import frozen
 from drake_diff.exceptions import DrakeDiffError, InputError
 
 Made = TypeVar("Made")
@@ -69,6 +72,20 @@ BETWEEN_WORDS = "white-space: pre-wrap; word-break: normal; overflow-wrap: anywh
 def preformatted(text: str) -> str:
     """Return `text` as HTML that keeps its lines; lines that are too long for the page wrap."""
     return f'<pre style="{BETWEEN_WORDS}">{escape(text)}</pre>'
+
+
+def stacked(results: Sequence[Made], batch: tuple[int, ...], **others: Any) -> Made:
+    """Return dataclasses of equal sizes in one, whose arrays and numbers have the leading dimensions `batch`.
+
+    Fields in `others` have these values; fields of other types are those of the first result.
+    """
+    first: Any = results[0]
+    stacks = {}
+    for name in (f.name for f in fields(first)):
+        if name not in others and isinstance(getattr(first, name), (float, np.ndarray)):
+            values = np.stack([getattr(result, name) for result in results])
+            stacks[name] = frozen(values.reshape(*batch, *values.shape[1:]))
+    return replace(first, **stacks, **others)
 
 
 class ShowsItsRepr:

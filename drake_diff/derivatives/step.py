@@ -145,17 +145,24 @@ def linearize(
 def step_jacobians(model: Model, vector: ParameterVector, x: Array, u: Array, method: str) -> StepDerivatives:
     """Compute `differentiate_step` on a model with `vector` applied, without checks of the shapes."""
     steps = take_step(model, vector, x, u)
-    reason = OF_ONE_SMOOTH_STEP.get(method)
-    if reason is not None and not vector.parameters and not steps.some_touch:
-        jacobian = one_smooth_step(model, steps)
-        if jacobian is not None:
-            _check_derivatives(model, jacobian[None])
-            jacobian.setflags(write=False)
-            x_next = steps.x_next[0]
-            x_next.setflags(write=False)
-            A, B, C = jacobian[:, : model.nx], jacobian[:, model.nx :], jacobian[:, len(x) + len(u) :]
-            return StepDerivatives(x_next, A, B, C, (), (), ANALYTIC.name, reason)
+    jacobian = _smooth_jacobian(steps, method)
+    if jacobian is not None:
+        jacobian.setflags(write=False)
+        x_next = steps.x_next[0]
+        x_next.setflags(write=False)
+        A, B, C = jacobian[:, : model.nx], jacobian[:, model.nx :], jacobian[:, len(x) + len(u) :]
+        return StepDerivatives(x_next, A, B, C, (), (), ANALYTIC.name, OF_ONE_SMOOTH_STEP[method])
     return _derivatives_of(steps, choose(steps, method, single=True))[0]
+
+
+def _smooth_jacobian(steps: Steps, method: str) -> Array | None:
+    """Return the checked Jacobian (nx, nx + nu) of one smooth step without parameters, or None for other steps."""
+    if method not in OF_ONE_SMOOTH_STEP or steps.vector.parameters or steps.some_touch:
+        return None
+    jacobian = one_smooth_step(steps.model, steps)
+    if jacobian is not None:
+        _check_derivatives(steps.model, jacobian[None])
+    return jacobian
 
 
 def derivatives_along(
@@ -175,6 +182,37 @@ def derivatives_along(
     return _derivatives_of(steps, choose(steps, method))
 
 
+@dataclass(frozen=True, eq=False)
+class Linearization:
+    """The Jacobians of N steps, one after the other or of several motions."""
+
+    x_next: Array  # (N, nx)
+    jacobians: Array  # (N, nx, nx + nu + np)
+    parameters: tuple[str, ...]  # (np,)
+    sources: tuple[str, ...]  # (np,) of the first step
+    methods: tuple[str, ...]  # of all steps, each once
+
+
+def linearize_steps(steps: Steps, method: str, *, single: bool = False) -> Linearization:
+    """Return the checked Jacobians of steps whose parameters are applied."""
+    jacobian = _smooth_jacobian(steps, method) if single else None
+    if jacobian is not None:
+        return Linearization(steps.x_next, jacobian[None], (), (), (ANALYTIC.name,))
+    chosen = choose(steps, method, single=single)
+    _check_derivatives(steps.model, chosen.values)
+    sources = _column_sources(steps.vector, chosen.methods[0])
+    return Linearization(steps.x_next, chosen.values, steps.vector.names, sources, tuple(sorted({*chosen.methods})))
+
+
+def _column_sources(vector: ParameterVector, used: str) -> tuple[str, ...]:
+    """Return the method of each parameter's column (np,) of a step that is differentiated by `used`."""
+    if used in OF_ONE_KIND:
+        return (used,) * len(vector.names)
+    if used == IMPLICIT.name and vector.step_entry is not None:
+        return (*vector.sources[: vector.step_entry], used, *vector.sources[vector.step_entry + 1 :])
+    return vector.sources
+
+
 def _derivatives_of(steps: Steps, chosen: Chosen) -> list[StepDerivatives]:
     model, vector = steps.model, steps.vector
     _check_derivatives(model, chosen.values)
@@ -183,10 +221,7 @@ def _derivatives_of(steps: Steps, chosen: Chosen) -> list[StepDerivatives]:
     derivatives, rows = [], zip(x_next, values, chosen.methods, chosen.reasons, strict=True)
     for end_state, jacobian, used, reason in rows:
         A, B, C = jacobian[:, :nx], jacobian[:, nx:end], jacobian[:, end:]
-        sources = (used,) * len(names) if used in OF_ONE_KIND else vector.sources
-        if used == IMPLICIT.name and vector.step_entry is not None:
-            sources = (*sources[: vector.step_entry], used, *sources[vector.step_entry + 1 :])
-        derivatives.append(StepDerivatives(end_state, A, B, C, names, sources, used, reason))
+        derivatives.append(StepDerivatives(end_state, A, B, C, names, _column_sources(vector, used), used, reason))
     return derivatives
 
 

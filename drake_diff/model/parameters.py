@@ -522,24 +522,38 @@ def _check_value(p: Parameter, given: Any) -> Array:
 
 @contextmanager
 def applied(vector: ParameterVector) -> Iterator[Model]:
-    """Yield the vector's model with the values set, or a model with another time step; reset the values at the end."""
+    """Yield the vector's model with the values set, or a model with another time step; reset the values at the end.
+
+    Values that an outer block has set stay, unless the vector has other values for them.
+    """
     if not vector.parameters:
         yield vector.model
         return
     h = vector.time_step(vector.values)
     model = vector.model if h == vector.model.time_step else vector.model.at_time_step(h)
     model.contract  # noqa: B018  the model's own, so it is read before anything else is set
+    outer, outer_quantities = model.applied, model.other_quantities
+    quantities = frozenset(p.kind.quantity for p in vector.parameters if p.name != TIME_STEP)
     of_plant = ", ".join(p.name for p in vector.parameters if p.kind.on_plant)
     with model.shared.changed(of_plant) if of_plant else nullcontext():
         try:
             vector.write(model.double, vector.values)
-            model.set_applied(vector, frozenset(p.kind.quantity for p in vector.parameters if p.name != TIME_STEP))
+            model.set_applied(vector if outer is None else _joined(outer, vector), quantities | outer_quantities)
             yield model
         finally:
-            model.set_applied(None, frozenset())
+            model.set_applied(outer, outer_quantities)
             vector.restore(model.double)
+            if outer is not None:
+                outer.write(model.double, outer.values)
             if model.has_autodiff:  # created in this block, or before it
                 vector.restore(model.autodiff)
+
+
+def _joined(outer: ParameterVector, inner: ParameterVector) -> ParameterVector:
+    """Return the parameters of both vectors, with the values of `inner` for those of both."""
+    pairs = {p.name: (p, vector.values[s]) for vector in (outer, inner) for p, s in vector.pairs}
+    parameters, values = zip(*pairs.values(), strict=True)
+    return ParameterVector(inner.model, parameters, frozen(np.concatenate(values)))
 
 
 def write_autodiff(vector: ParameterVector, model: Model, variables: Any) -> None:

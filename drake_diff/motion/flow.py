@@ -27,7 +27,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, frozen
 from drake_diff.derivatives.contact.laws import QUANTITIES, material_change
-from drake_diff.derivatives.step import StepDerivatives
+from drake_diff.derivatives.step import Linearization, StepDerivatives
 from drake_diff.exceptions import GradientError, ModelError, SimulationError
 from drake_diff.model.contact import ContactPoint
 from drake_diff.model.model import Model
@@ -251,22 +251,30 @@ class FlowSteps:
 
     def differentiate(self, flow: Flow) -> list[StepDerivatives]:
         """Return the derivatives of a flow's intervals."""
+        nx, nu, linearization, derivatives = self.model.nx, self.model.nu, self.linearize(flow), []
+        for steps, total in zip(flow.intervals, linearization.jacobians, strict=True):
+            A, B, C = (frozen(block) for block in np.split(total, [nx, nx + nu], axis=1))
+            reason = f"the flow by {len(steps)} steps"
+            names, sources = linearization.parameters, linearization.sources
+            derivatives.append(StepDerivatives(frozen(steps[-1].ahead), A, B, C, names, sources, METHOD, reason))
+        return derivatives
+
+    def linearize(self, flow: Flow) -> Linearization:
+        """Return the Jacobians of a flow's intervals."""
         nx, nu, names = self.model.nx, self.model.nu, self.vector.names
         by_parameters = np.zeros((4 * self.plant.num_pairs, len(names)))
         if names:
             change = material_change(self.plant.pairs, self.material, self.vector, self.model.double)
             by_parameters = numbers_of(self.plant, change)
         changes = iter(self._changes(flow, by_parameters))
-        derivatives = []
-        for steps in flow.intervals:
+        totals = np.empty((len(flow.intervals), nx, nx + nu + len(names)))
+        for i, steps in enumerate(flow.intervals):
             total = np.hstack([np.eye(nx), np.zeros((nx, nu + len(names)))])
             for change in (next(changes) for _ in steps):
                 total = change[:, :nx] @ total
                 total[:, nx:] += change[:, nx:]
-            A, B, C = (frozen(block) for block in np.split(total, [nx, nx + nu], axis=1))
-            reason, sources = f"the flow by {len(steps)} steps", (METHOD,) * len(names)
-            derivatives.append(StepDerivatives(frozen(steps[-1].ahead), A, B, C, names, sources, METHOD, reason))
-        return derivatives
+            totals[i] = total
+        return Linearization(flow.xs[1:], totals, names, (METHOD,) * len(names), (METHOD,))
 
     def _changes(self, flow: Flow, by_parameters: Array) -> Array:
         """Return all steps' derivatives (M, nx, nx + nu + n) with respect to (x, u, parameters), events included."""

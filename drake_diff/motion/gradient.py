@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_diff._base.arrays import Array, frozen, number_of_steps
-from drake_diff._base.values import ShowsItsRepr
+from drake_diff._base.values import ShowsItsRepr, stacked
 from drake_diff.derivatives.sources import check_method
-from drake_diff.derivatives.step import StepDerivatives, derivatives_along
+from drake_diff.derivatives.step import Linearization, linearize_steps
+from drake_diff.derivatives.steps import take_steps
 from drake_diff.exceptions import GradientWarning, InputError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import Parameters, ParameterVector, applied, select
@@ -21,7 +21,7 @@ from drake_diff.model.step import advance
 from drake_diff.motion.integrate import TOLERANCE
 from drake_diff.motion.loss import Loss, Totals, total_gradients
 from drake_diff.motion.policy import Feedback, recording_choice
-from drake_diff.motion.rollout import Policy, check_inputs
+from drake_diff.motion.rollout import Policy, batch_of, check_inputs, rows_of_batch
 
 if TYPE_CHECKING:
     from drake_diff.motion.undefined import Undefined
@@ -35,7 +35,8 @@ NAMED = 3  # maximum number of columns listed in a warning
 class RolloutGradient(ShowsItsRepr):
     """The loss of a rollout and its gradient, returned by `differentiate_rollout`. Arrays are read-only.
 
-    Under a policy, `us` are the inputs that the policy returned, and all gradients are those of the closed loop.
+    Under a policy, `us` are the inputs that the policy returned, and all gradients are those of the closed loop. For a
+    batch, the loss and all arrays have its leading dimensions: each rollout has its own loss and gradients.
 
     Example:
         >>> model = dd.load_model("models/pendulum.urdf", time_step=0.01)
@@ -45,7 +46,7 @@ class RolloutGradient(ShowsItsRepr):
           |d loss / d x_k| from 0.648 at the start to 1 at the end, a factor of 0.979 a step
     """
 
-    loss: float
+    loss: Any  # a float, or (...) of a batch
     by_x0: Array  # (nx,)
     by_us: Array  # (N, nu)
     by_parameters: Array  # (np,)
@@ -58,13 +59,19 @@ class RolloutGradient(ShowsItsRepr):
     xs: Array  # (N+1, nx) the trajectory
     us: Array  # (N, nu) the applied inputs
     methods: tuple[str, ...]  # the methods of the step Jacobians: one name, or more if a fallback was used
-    loss_method: str  # the method that differentiated the loss: "autograd", or "autodiff" if autograd cannot
+    loss_method: str  # the method that differentiated the loss: "autograd", "autodiff" if autograd cannot, or "jax"
     # For method="continuous": the columns in which the loss has no slope. Their derivative is valid at the point only.
     undefined: tuple[Undefined, ...] = ()
 
     def __repr__(self) -> str:
         sizes = [f"|by x0| {np.linalg.norm(self.by_x0):.3g}", f"|by us| {np.linalg.norm(self.by_us):.3g}"]
         sizes += [f"|by the policy| {np.linalg.norm(self.by_policy):.3g}"] if self.by_policy.size else []
+        if self.xs.ndim > 2:
+            mean = f"mean loss {np.mean(self.loss):.6g}"
+            return (
+                f"RolloutGradient of {self.xs.shape[:-2]} rollouts of {self.us.shape[-2]} steps by "
+                f"{' and '.join(self.methods)}: {mean}\n  {', '.join(sizes)}"
+            )
         named = zip(self.parameter_names, self.by_parameters, strict=True)
         sizes += [f"by {name} {value:.3g}" for name, value in named]
         first, last = self.state_gradient_norms[[0, -1]]
@@ -77,15 +84,14 @@ class RolloutGradient(ShowsItsRepr):
         )
 
     @property
-    def growth_rate(self) -> float:
+    def growth_rate(self) -> Any:
         """The factor by which |d loss / d x_k| grows per step back in time, as a geometric mean; 1 is neutral.
 
         NaN if the norm is zero at either end.
         """
-        first, last = self.state_gradient_norms[0], self.state_gradient_norms[-1]
-        if first == 0 or last == 0:
-            return float("nan")
-        return float((first / last) ** (1 / (len(self.state_gradient_norms) - 1)))
+        norms = self.state_gradient_norms
+        first, last = (np.where(norms[..., k] == 0, np.nan, norms[..., k]) for k in (0, -1))
+        return (first / last)[()] ** (1 / (norms.shape[-1] - 1))
 
 
 def differentiate_rollout(
@@ -107,10 +113,12 @@ def differentiate_rollout(
 
     Args:
         model: The discrete model.
-        x0: (nx,) the initial state.
-        us: (N, nu) the inputs [N or N m]; None with a policy, or if the model has no actuators.
+        x0: (nx,) the initial state, or (..., nx) those of a batch of rollouts.
+        us: (N, nu) the inputs [N or N m], or (..., N, nu), with leading dimensions that are broadcast with those of
+            `x0`; None with a policy, or if the model has no actuators.
         loss: `loss(xs, us)` of the states (N+1, nx) and the inputs, or `loss(x_final)` if it takes one argument. It
-            returns a scalar and is written with ordinary arithmetic and NumPy functions that AutoDiffXd supports.
+            returns a scalar and is written with ordinary arithmetic and NumPy functions that AutoDiffXd supports, or in
+            JAX with double precision.
         policy: u = policy(x, t), written likewise (see `drake_diff.motion.policy`), in place of `us`.
         parameters: Names of the model's parameters for the gradient, or a mapping of the names to values.
         num_steps: N, if `us` is not given.
@@ -137,17 +145,21 @@ def differentiate_rollout(
     """
     if method != CONTINUOUS:
         check_method(method)
-    x0 = model.finite_state("x0", x0)
     if us is not None and policy is not None:
         raise InputError("differentiate_rollout", got="us and policy", expected="one of them")
     vector = select(model, parameters)
+    if batch := batch_of(model, x0, us):
+        more: Any = {"policy": policy, "parameters": vector, "num_steps": num_steps, "method": method}
+        rows = rows_of_batch(model, batch, x0, us)
+        return _batch_of_gradients([differentiate_rollout(model, x, u, loss, **more) for x, u in rows], batch)
+    x0 = model.finite_state("x0", x0)
     if method == CONTINUOUS:
         return _in_continuous_time(model, x0, us, policy, loss, vector, num_steps)
     feedback: list[Feedback] = []
     with applied(vector) as set_model:
         if policy is None:
             inputs = check_inputs(model, us, num_steps)
-            linearization = derivatives_along(set_model, x0, inputs, vector=vector, method=method)
+            linearization = linearize_steps(take_steps(set_model, vector, x0, inputs), method)
         else:
             steps = number_of_steps(num_steps)
             linearization, feedback, inputs = _close_the_loop(set_model, x0, policy, steps, vector, method)
@@ -155,12 +167,23 @@ def differentiate_rollout(
     return _collected(value, totals, x0, inputs, linearization)
 
 
+def _batch_of_gradients(gradients: list[RolloutGradient], batch: tuple[int, ...]) -> RolloutGradient:
+    """Return the gradients of rollouts in one, with leading dimensions."""
+    return stacked(
+        gradients,
+        batch,
+        methods=tuple(sorted({method for g in gradients for method in g.methods})),
+        loss_method=" and ".join(sorted({g.loss_method for g in gradients})),
+        undefined=tuple(column for g in gradients for column in g.undefined),
+    )
+
+
 def _collected(
     value: float,
     totals: Totals,
     x0: Array,
     inputs: Array,
-    linearization: Sequence[StepDerivatives],
+    linearization: Linearization,
 ) -> RolloutGradient:
     """Make the RolloutGradient from the loss, its total gradients and the linearized steps."""
     return RolloutGradient(
@@ -168,13 +191,13 @@ def _collected(
         by_x0=frozen(totals.states[0]),
         by_us=frozen(totals.inputs),
         by_parameters=frozen(totals.parameters),
-        parameter_names=linearization[0].parameters,
-        parameter_sources=linearization[0].sources,
+        parameter_names=linearization.parameters,
+        parameter_sources=linearization.sources,
         by_policy=frozen(totals.policy),
         state_gradient_norms=frozen(np.linalg.norm(totals.states, axis=1)),
-        xs=frozen(np.vstack([x0, [d.x_next for d in linearization]])),
+        xs=frozen(np.vstack([x0, linearization.x_next])),
         us=frozen(inputs),
-        methods=tuple(sorted({d.method for d in linearization})),
+        methods=linearization.methods,
         loss_method=totals.loss_method,
     )
 
@@ -217,7 +240,7 @@ def _in_continuous_time(
 
 def _close_the_loop(
     model: Model, x0: Array, policy: Policy, count: int, vector: ParameterVector, method: str
-) -> tuple[list[StepDerivatives], list[Feedback], Array]:
+) -> tuple[Linearization, list[Feedback], Array]:
     """Roll out under the policy, then compute the derivatives of all steps at once."""
     feedback = list[Feedback]()
     choose = recording_choice(policy, model, feedback)
@@ -225,4 +248,4 @@ def _close_the_loop(
     for k in range(count):
         xs[k], inputs[k] = x, choose(x, k)
         x = advance(model.double, x, inputs[k])
-    return derivatives_along(model, x0, inputs, vector=vector, method=method, xs=xs), feedback, inputs
+    return linearize_steps(take_steps(model, vector, x0, inputs, xs), method), feedback, inputs

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_diff._base.arrays import Array, finite_array, frozen, number_of_steps
+from drake_diff._base.arrays import Array, broadcast_shapes, finite_array, frozen, number_of_steps
 from drake_diff._base.autodiff import called
-from drake_diff._base.values import ShowsItsRepr
+from drake_diff._base.values import ShowsItsRepr, stacked
 from drake_diff.exceptions import InputError, SimulationError, UnknownNameError
 from drake_diff.model.contact import ContactPoint, contacts_of_the_step, penetration
 from drake_diff.model.model import Model
@@ -30,6 +30,8 @@ class Rollout(ShowsItsRepr):
     """N steps of the double plant and the quantities measured along them, returned by `rollout`. Arrays are read-only.
 
     With method="continuous", these are states and measurements of the continuous motion at the ends of N intervals.
+    For a batch, all arrays except `times` and the results of the properties have its leading dimensions. `contacts` has
+    an entry for each rollout, in the order of `xs.reshape(-1, N+1, nx)`.
 
     The energy balance of the discrete plant is `energy_error` = energy - energy[0] - work + dissipation
     - contact_work - limit_work. The work of a force f in a step is h f (v + v') / 2, which is exact if M is constant.
@@ -58,12 +60,14 @@ class Rollout(ShowsItsRepr):
     contacts: tuple[tuple[ContactPoint, ...], ...]  # N tuples: the contacts of each step
 
     def __repr__(self) -> str:
-        energy, error = self.energy, float(np.abs(self.energy_error).max())
+        energy, error, batch = self.energy, float(np.abs(self.energy_error).max()), self.xs.shape[:-2]
+        times = f"{len(self.times) - 1} steps, {self.times[-1]:g} s"
+        changes = f"energy {energy[0]:.4g} to {energy[-1]:.4g} J, of which {error:.2g} J" if not batch else ""
+        steps = [step for rollout in self.contacts for step in rollout] if batch else self.contacts
         return (
-            f"Rollout of {len(self.us)} steps, {self.times[-1]:g} s: energy {energy[0]:.4g} to {energy[-1]:.4g} J, of "
-            f"which {error:.2g} J are unaccounted for\n"
-            f"  deepest penetration {np.max(self.penetration):.3g} m, largest constraint violation "
-            f"{np.max(self.constraint_violation):.3g}, {sum(map(bool, self.contacts))} steps with contact"
+            (f"{batch} rollouts of {times}: up to {error:.2g} J" if batch else f"Rollout of {times}: {changes}")
+            + f" are unaccounted for\n  deepest penetration {np.max(self.penetration):.3g} m, largest constraint "
+            f"violation {np.max(self.constraint_violation):.3g}, {sum(map(bool, steps))} steps with contact"
         )
 
     @property
@@ -75,25 +79,25 @@ class Rollout(ShowsItsRepr):
     def energy_error(self) -> Array:
         """Energy (N+1,) [J] not accounted for by inputs, systems, damping, contact or limits."""
         given = self.work - self.dissipation + self.contact_work + self.limit_work
-        return frozen(self.energy - self.energy[0] - given)
+        return frozen(self.energy - self.energy[..., :1] - given)
 
     @property
-    def energy_drift(self) -> float:
+    def energy_drift(self) -> Any:
         """The drift of `energy_error` [J] without its oscillation (see `drift`)."""
         return drift(self.energy_error)
 
     @property
-    def energy_exchanged(self) -> float:
+    def energy_exchanged(self) -> Any:
         """The sum of the ranges [J] of kinetic and potential energy and of the work of each type of force."""
         flows = (self.work, self.dissipation, self.contact_work, self.limit_work)
-        return sum(float(np.ptp(flow)) for flow in (self.kinetic_energy, self.potential_energy, *flows))
+        return sum(np.ptp(flow, axis=-1) for flow in (self.kinetic_energy, self.potential_energy, *flows))
 
     @property
-    def energy_oscillation(self) -> float:
+    def energy_oscillation(self) -> Any:
         """The largest distance [J] of `energy_error` from its drift line."""
-        error = self.energy_error
-        line = self.energy_drift * np.linspace(-0.5, 0.5, len(error))
-        return float(np.abs(error - smooth_mean(error) - line).max())
+        error, drift = self.energy_error, np.asarray(self.energy_drift)[..., None]
+        line = drift * np.linspace(-0.5, 0.5, error.shape[-1])
+        return np.abs(error - np.asarray(smooth_mean(error))[..., None] - line).max(axis=-1)
 
 
 def rollout(
@@ -110,8 +114,9 @@ def rollout(
 
     Args:
         model: The discrete model.
-        x0: (nx,) the initial state.
-        us: (N, nu) the inputs [N or N m]; may be omitted if the model has no actuators.
+        x0: (nx,) the initial state, or (..., nx) those of a batch of rollouts.
+        us: (N, nu) the inputs [N or N m], or (..., N, nu); may be omitted if the model has no actuators. Leading
+            dimensions of `x0` and `us` are broadcast.
         policy: `policy(x, t)` (nu,) of the state and the time [s], in place of `us`.
         num_steps: N, if `us` is not given.
         parameters: Names (see `list_parameters`) and values that replace the model's own.
@@ -121,7 +126,7 @@ def rollout(
             since the previous end, and `contacts` are those of largest depth in each interval.
 
     Returns:
-        The states `xs` (N+1, nx), and the quantities measured at each state.
+        The states `xs` (N+1, nx), and the quantities measured at each state. Those of a batch have its dimensions.
 
     Raises:
         ShapeError, NonFiniteError, InputError: An argument or an output of the policy is invalid.
@@ -142,6 +147,12 @@ def rollout(
         raise UnknownNameError("method", got=method, known=MOTIONS)
     if us is not None and policy is not None:
         raise InputError("rollout", got="us and policy", expected="one of them")
+    if batch := batch_of(model, x0, us):
+        rows = rows_of_batch(model, batch, x0, us)
+        more: Any = {"policy": policy, "num_steps": num_steps, "parameters": parameters, "method": method}
+        rollouts = [rollout(model, x, u, **more) for x, u in rows]
+        contacts: Any = tuple(motion.contacts for motion in rollouts)
+        return stacked(rollouts, batch, times=rollouts[0].times, contacts=contacts)
     inputs = check_inputs(model, us, num_steps) if policy is None else policy
     count = len(inputs) if policy is None else number_of_steps(num_steps)  # type: ignore[arg-type]
     vector = select(model, parameters or ())
@@ -222,6 +233,30 @@ def check_inputs(model: Model, us: ArrayLike | None, num_steps: int | None = Non
     if num_steps is not None and num_steps != len(checked):
         raise InputError("num_steps", got=num_steps, expected=f"{len(checked)}, the length of us")
     return checked
+
+
+def batch_of(model: Model, x0: Any, us: Any) -> tuple[int, ...]:
+    """Return the leading dimensions that x0 (..., nx) and us (..., N, nu) share, () for a single rollout."""
+    try:
+        shapes = [np.shape(values) for values in (x0, us) if values is not None]
+    except ValueError:  # rows of different lengths, which the checks of a single rollout refuse
+        return ()
+    if all(len(shape) <= i + 1 for i, shape in enumerate(shapes)):
+        return ()
+    batch = broadcast_shapes({"x0": (model.nx,), "us": ("N", model.nu)}, shapes)[0][:-1]
+    if 0 in batch:
+        raise InputError("x0, us", got=f"a batch of {batch} rollouts", expected="at least one rollout")
+    return batch
+
+
+def rows_of_batch(model: Model, batch: tuple[int, ...], x0: Any, us: Any) -> Iterator[tuple[Array, Array | None]]:
+    """Return the initial state (nx,) and the inputs (N, nu) of each rollout of a batch."""
+    count = math.prod(batch)
+    starts = np.broadcast_to(finite_array("x0", x0, np.shape(x0)), (*batch, model.nx)).reshape(count, model.nx)
+    if us is None:
+        return ((x, None) for x in starts)
+    us = finite_array("us", us, np.shape(us))
+    return zip(starts, np.broadcast_to(us, (*batch, *us.shape[-2:])).reshape(count, *us.shape[-2:]), strict=True)
 
 
 def roll_states(model: Model, x0: Array, us: Array) -> Array:
@@ -348,25 +383,26 @@ def _single(model: Model) -> list[tuple[int, int]]:
     return [(q.start, v.start) for q, v in places if len(q) == len(v) == 1]
 
 
-def smooth_mean(series: Array) -> float:
-    """Return the mean of `series` (n,) with the weight exp(-1 / (s (1 - s))), s from 0 to 1 along the series.
+def smooth_mean(series: Array) -> Any:
+    """Return the mean of `series` (..., n) with the weight exp(-1 / (s (1 - s))), s from 0 to 1 along the series.
 
     The weight vanishes with all its derivatives at both ends, so the contribution of an oscillation of more than a few
     periods is negligible (Das, Saiki, Sander and Yorke, "Quantitative quasiperiodicity", 2017).
     """
-    s = (np.arange(len(series)) + 0.5) / len(series)
+    s = (np.arange(series.shape[-1]) + 0.5) / series.shape[-1]
     weight = np.exp(-1 / (s * (1 - s)))
-    return float(weight @ series / weight.sum())
+    return series @ weight / weight.sum()
 
 
-def drift(series: Array) -> float:
-    """Return the change of `series` (n,) from its start to its end without its oscillation.
+def drift(series: Array) -> Any:
+    """Return the change of `series` (..., n) from its start to its end without its oscillation.
 
     This is twice the difference between the smooth means of the second and the first half. It is exact for a straight
     line and negligible for an oscillation of many periods. For fewer than four values, it is the last minus the first.
     """
-    if len(series) < 4:
-        return float(series[-1] - series[0])
-    half = len(series) // 2
-    rise = smooth_mean(series[-half:]) - smooth_mean(series[:half])
-    return rise * (len(series) - 1) / (len(series) - half)
+    count = series.shape[-1]
+    if count < 4:
+        return series[..., -1] - series[..., 0]
+    half = count // 2
+    rise = smooth_mean(series[..., -half:]) - smooth_mean(series[..., :half])
+    return rise * (count - 1) / (count - half)

@@ -27,7 +27,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, positive_int
 from drake_diff._base.values import ShowsItsRepr
-from drake_diff.derivatives.step import StepDerivatives
+from drake_diff.derivatives.step import Linearization
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied
@@ -187,7 +187,7 @@ class Beside:
         touches = any(step.pushing or step.events for step, _ in flow.steps)
         return evaluate_loss(self.loss, flow.xs, flow.us), touches
 
-    def linearize(self, displacement: Array, tolerance: float) -> tuple[list[StepDerivatives], list[Feedback], Array]:
+    def linearize(self, displacement: Array, tolerance: float) -> tuple[Linearization, list[Feedback], Array]:
         """Return derivatives of intervals and of the policy, and the inputs, for the motion at a displacement (n,)."""
         x0, us, policy, vector = self._moved(displacement)
         choose, feedback = (lambda x, k: us[k]), list[Feedback]()
@@ -196,7 +196,7 @@ class Beside:
         steps = self._steps(vector, tolerance)
         with applied(vector):
             flow = steps.roll(x0, choose, len(us))
-            return steps.differentiate(flow), feedback, flow.us
+            return steps.linearize(flow), feedback, flow.us
 
     def slope(self, displacement: Array, way: Array) -> tuple[float, float]:
         """Return the loss at a displacement (n,), and its directional derivative along `way` (n,)."""

@@ -229,11 +229,10 @@ def _change(solution: Solution, by: Any) -> Change:
     if not problem.has_model:
         raise UnknownNameError("by", got=by, known=ENDS)
     vector = select(problem.model, by)
+    settings = problem.parameters.to_dict()
+    vector = select(problem.model, {name: settings.get(name, value) for name, value in vector.to_dict().items()})
     if not vector.parameters:
         raise InputError("by", got=repr(by), expected='"x0", "goal", or names of parameters')
-    if problem.parameters.parameters and solution.transcribed is not None:
-        expected = '"x0" or "goal", as the problem has parameters of its own'
-        raise InputError("by", got=repr(by), expected=expected)
     if any(isinstance(goal, TerminalSet) for goal in problem.goals):
         raise InputError("by", got=repr(by), expected='"x0", as a TerminalSet does not depend on the other parameters')
     if problem.horizon is not None and solution.transcribed is None:
@@ -241,7 +240,7 @@ def _change(solution: Solution, by: Any) -> Change:
     chosen = {p.name for p in problem.parameters.parameters} & {p.name for p in vector.parameters}
     if chosen and problem.optimizes_parameters:
         raise InputError("by", got=sorted(chosen), expected="parameters that are not optimized")
-    return Change(vector.names, np.array(vector.values), None, parameters=by)
+    return Change(vector.names, np.array(vector.values), None, parameters=vector)
 
 
 def _differences(plan: _Plan, held: HeldPlan, change: Change, response: Held) -> tuple[Array, list[str]]:

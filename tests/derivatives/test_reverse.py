@@ -9,7 +9,7 @@ from pydrake import math as drake_math
 
 import drake_diff as dd
 from drake_diff._base.autodiff import UntraceableError, traced_gradient
-from drake_diff.exceptions import GradientError
+from drake_diff.exceptions import GradientError, InputError
 from drake_diff.motion.loss import _by_autodiff, differentiate_loss
 
 Q = np.random.default_rng(0).standard_normal((3, 3))
@@ -125,3 +125,38 @@ def test_a_long_motions_loss_is_differentiated_in_time_that_grows_with_it(load):
         for m in (dd.rollout(model, [0.1, 0.0], us + s * move) for s in (1, -1))
     ]
     assert (ends[0] - ends[1]) / 2 == pytest.approx((found.by_us * move).sum(), rel=1e-4)  # two sums of 20,000 terms
+
+
+def test_a_loss_in_jax_has_the_gradient_of_the_same_loss_in_numpy_and_is_traced_once(load):
+    jax = pytest.importorskip("jax", reason="pip install 'drake-diff[jax]'")
+    model, traced = load("pendulum.urdf"), []
+    x0, us = [0.3, 0.1], 0.1 * np.ones((6, 1))
+
+    def loss(xs, us):
+        traced.append(isinstance(xs, jax.core.Tracer))
+        return jax.numpy.sin(xs).sum() + (us**2).sum()
+
+    numpys = dd.differentiate_rollout(model, x0, us, lambda xs, us: np.sin(xs).sum() + (us**2).sum())
+    with jax.enable_x64(True):
+        for _ in range(3):
+            g = dd.differentiate_rollout(model, x0, us, loss)
+        final = dd.differentiate_rollout(model, x0, us, lambda x: jax.numpy.cos(x[0]))
+    assert g.loss_method == final.loss_method == "jax"
+    assert sum(traced) == 1
+    assert g.loss == pytest.approx(numpys.loss, rel=1e-14)
+    np.testing.assert_allclose(g.by_x0, numpys.by_x0, rtol=1e-13)
+    np.testing.assert_allclose(g.by_us, numpys.by_us, rtol=1e-13)
+    expected = dd.differentiate_rollout(model, x0, us, lambda x: np.cos(x[0]))
+    np.testing.assert_allclose(final.by_us, expected.by_us, rtol=1e-13)
+
+
+def test_a_loss_in_jax_with_single_precision_or_without_a_gradient_is_refused_by_name(load):
+    jax = pytest.importorskip("jax", reason="pip install 'drake-diff[jax]'")
+    model, point = load("pendulum.urdf"), ([0.3, 0.1], np.ones((2, 1)))
+    with jax.enable_x64(False), pytest.raises(InputError, match="loss: expected double precision"):
+        dd.differentiate_rollout(model, *point, lambda x: jax.numpy.sin(x[0]))
+    with jax.enable_x64(True):
+        with pytest.raises(GradientError, match="not finite"):
+            dd.differentiate_rollout(model, *point, lambda x: jax.numpy.linalg.norm(0 * x))
+        with pytest.raises(GradientError, match=r"loss <lambda> .* lost its derivatives"):
+            dd.differentiate_rollout(model, *point, lambda x: jax.numpy.asarray(float(x[0])))

@@ -896,3 +896,19 @@ def test_the_list_states_what_a_mass_changes_beside_itself(load):
         inertia = body.CalcSpatialInertiaInBodyFrame(model.double.context).CalcRotationalInertia().get_moments()
     before = body.default_spatial_inertia().CalcRotationalInertia().get_moments()
     np.testing.assert_allclose(inertia, 2 * before, rtol=1e-12)
+
+
+def test_an_inner_block_of_other_parameters_keeps_the_values_of_the_outer_one(load):
+    model = load("pendulum.urdf")
+    point, both = ([0.5, 1.0], [0.2]), {"pole.mass": 1.3, "hinge.damping": 0.4, "model.gravity": [0, 0, -5.0]}
+    outer = select(model, {name: both[name] for name in ("pole.mass", "model.gravity")})
+    inner = select(model, {"hinge.damping": 0.4})
+    expected = dd.differentiate_step(model, *point, parameters=both, method="autodiff")
+    with applied(outer):
+        with applied(inner):
+            d = dd.differentiate_step(model, *point, method="autodiff")
+        after = dd.step(model, *point)
+    assert np.array_equal(d.x_next, expected.x_next)
+    np.testing.assert_allclose(d.A, expected.A, rtol=1e-14)
+    assert np.array_equal(after, dd.step(model, *point, parameters=outer.to_dict()))
+    assert model.applied is None

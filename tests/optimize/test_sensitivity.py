@@ -240,3 +240,23 @@ def test_a_plan_that_is_no_optimum_has_no_derivative(write_urdf):
     whole = replace(problem, trajectory_cost=lambda xs, us: (us**2).sum() + xs[-1, 0] ** 2, **other_cost)
     with pytest.raises(InputError, match="trajectory_cost"):
         dd.sensitivity(dd.solve(whole, method="shooting"))
+
+
+@pytest.mark.solve
+@pytest.mark.parametrize("method", ["shooting", "collocation"])
+@pytest.mark.parametrize("by", ["pole.mass", "hinge.damping"])
+def test_the_sensitivity_of_a_problem_with_parameters_is_that_at_their_values(load, method, by):
+    """The cost's slope is that of plans at other values, for a parameter that the problem sets and for another one."""
+    model, values = load("pendulum.urdf", time_step=0.05), {"pole.mass": 1.3, "hinge.damping": 0.1}
+
+    def solved(**parameters):
+        effort = dd.QuadraticCost(R=[[1.0]])
+        return dd.solve(
+            dd.Problem(model, x0=[0, 0], x_goal=[0.5, 0], num_steps=20, running_cost=effort, parameters=parameters),
+            method=method,
+        )
+
+    result = dd.sensitivity(solved(**{"pole.mass": 1.3}), by)
+    ahead, behind = (solved(**values | {by: values[by] + sign * 1e-3}).cost for sign in (1, -1))
+    assert result.verdict == "agree"
+    assert result.cost == pytest.approx([(ahead - behind) / 2e-3], rel=1e-6)  # error of the difference: 1e-6

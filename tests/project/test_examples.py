@@ -357,3 +357,43 @@ def test_the_tossed_cube_has_its_published_size_and_is_predicted_better_than_by_
     assert record.inputs.motion == "impacts"
     assert record.verdict == "fail"  # no cube of rigid spheres explains real impacts to the noise of the cameras
     assert dd.verify(tmp_path / "artifacts" / "tossed_cube" / "fall").holds
+
+
+@pytest.mark.slow
+def test_a_network_in_pytorch_pushes_a_ball_to_targets_that_it_was_not_trained_on():
+    torch = pytest.importorskip("torch", reason="pip install 'drake-diff[torch]'")
+    module = example("torch_push_policy")
+    model, net = dd.load_model(module.MODEL, time_step=module.TIME_STEP), module.network()
+    module.certify(model, net)  # raises if the derivative of a step does not agree
+    losses = module.train(model, net)
+    assert losses[-1] < 0.02 * losses[0]
+    with torch.no_grad():
+        xs, _ = module.push(model, net, module.UNSEEN)
+    assert (xs[:, -1, module.BALL] - module.UNSEEN).abs().max() < 0.02  # m
+
+
+@pytest.mark.slow
+def test_jax_improves_the_gears_of_a_leg_by_the_slopes_of_its_optimal_motion():
+    """The slopes are those of the heat of plans at other gears."""
+    jax = pytest.importorskip("jax", reason="pip install 'drake-diff[jax]'")
+    before = jax.config.jax_enable_x64
+    try:
+        module = example("jax_leg_design")  # sets double precision
+        swing, first = module.problem(), np.log(module.FIRST)
+        value, slopes = jax.value_and_grad(lambda logarithms: module.heat(swing, logarithms))(first)
+        for i in range(2):
+            ahead, behind = (module.heat(swing, first + sign * 1e-3 * np.eye(2)[i]) for sign in (1, -1))
+            assert float(slopes[i]) == pytest.approx(float(ahead - behind) / 2e-3, rel=1e-4)
+        assert float(module.heat(swing, np.log(module.improve(swing)))) < 0.25 * float(value)
+    finally:
+        jax.config.update("jax_enable_x64", before)
+
+
+@pytest.mark.slow
+def test_a_network_in_pytorch_learns_the_torque_that_a_model_does_not_have():
+    torch = pytest.importorskip("torch", reason="pip install 'drake-diff[torch]'")
+    module = example("torch_residual_force")
+    model, net = dd.load_model(module.MODEL, time_step=module.TIME_STEP), module.network()
+    losses = module.train(model, net, *map(torch.from_numpy, module.recordings(model)))
+    assert losses[-1] < 4  # of the noise's square; the noise of the first state moves the whole motion
+    assert np.abs(module.errors(net)).max() < 0.15  # N m, of 2.7

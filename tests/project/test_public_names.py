@@ -55,8 +55,8 @@ def test_every_public_class_has_a_readable_repr(room):
 
 
 HEAVY = (
-    "numpy pydrake casadi pydantic matplotlib mcap google.protobuf foxglove_schemas_protobuf mujoco pinocchio jax ray "
-    "typer rich"
+    "numpy pydrake casadi pydantic matplotlib mcap google.protobuf foxglove_schemas_protobuf mujoco pinocchio jax "
+    "torch ray typer rich"
 ).split()
 LOADED = f"""
 import sys

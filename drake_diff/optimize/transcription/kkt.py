@@ -54,8 +54,11 @@ class Change:
         if self.ends is None:
             values = np.array(self.values)
             values[column] += step
-            with applied(select(problem.model, self.parameters).at(values)) as model:
-                yield replace(problem, system=model)
+            moved, settings = select(problem.model, self.parameters).at(values).to_dict(), problem.parameters.to_dict()
+            others = {name: value for name, value in moved.items() if name not in settings}
+            with applied(select(problem.model, others)) as model:
+                given = {name: moved.get(name, value) for name, value in settings.items()}
+                yield replace(problem, system=model, parameters=given)
             return
         first = self.end == "x0"
         state = np.array(problem.x0 if first else problem.x_goal)
