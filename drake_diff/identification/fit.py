@@ -352,7 +352,7 @@ class Fit:
         for m in range(M):
             along[:, m + 1] = branch.by_x[:, m] @ along[:, m]
             along[:, m + 1][..., moving] += branch.by_z[:, m]
-            if rates is not None:
+            if rates is not None and delay is not None:
                 along[:, m + 1, :, n + int(np.searchsorted(columns, delay))] += rates[:, m, states]
         read = self._read_slopes(z, s, xs) if self.sensors.count else []
         entries = seen_in[: n + self.sensors.count]
@@ -386,7 +386,8 @@ class Fit:
             if self.law.kinks:
                 ridge[n // 2 :, n // 2 : n] = np.diag(1 / (reach * NEAR * scale[n // 2 :]))
             R = _triangle(np.vstack([*rows, ridge]))
-            parts.blocks[p][np.ix_(tangent, [*tangent, *(nt + columns), -1])] = R[:n]
+            last = np.array([*tangent, *(nt + columns), -1], dtype=np.intp)
+            parts.blocks[p][np.ix_(tangent, last)] = R[:n]
             free = np.zeros((len(columns) + 1, nz + 1))
             free[:, [*columns, -1]] = R[n:, n:]
             parts.rows[p].append(free)
