@@ -53,6 +53,7 @@ TURNED, SHIFTED, LOWERED = 0.1, 0.06, 0.12  # of the base: [rad], and fractions 
 MOVED = 0.1  # fraction of a joint's range, for joints outside the legs
 ARRIVED, SLOW_ENOUGH = 0.01, 0.02  # [rad or m] largest distance from the target rest, [rad/s or m/s] largest velocity
 FEET_STAY, STILL = 1e-3, 1e-7  # [m] largest distance of a foot from its stance, and between knots (4 mm/s^2)
+FIRM = 0.25  # least depth of a foot, as a fraction of its depth at rest; motors would drive a lifted foot down
 FREE_BASE, FREE_JOINT, ALONG = 0.1, 0.3, 0.05  # [rad or m] deviations that cost 1; ALONG applies on the way
 BASE_TURN, BASE_PLACE = 0.003, 0.001  # the same for a base whose pose is required
 OVER_FEET = 0.02  # [m] the same for the centre of mass
@@ -450,10 +451,11 @@ def _regulated(legs: Legs, xs: Array, us: Array) -> Shift | Refusal:
     Q = np.diag(np.concatenate([np.full(nv, NEAR**-2.0), np.full(nv, SLOW**-2.0)]))
     try:
         policy = TVLQR(model, xs, us, Q, np.diag(size**-2.0))
-        states, inputs = [xs[0]], list[Array]()
+        states, inputs, depths = [xs[0]], list[Array](), list[Array]()
         for k in range(len(us)):
             inputs.append(np.clip(policy(states[-1], k * model.time_step), lower, upper))
             states.append(np.array(advance(model.double, states[-1], inputs[-1])))
+            depths.append(_depths(legs))
     except (SimulationError, GradientError) as error:
         return Refusal(f"Drake cannot take the steps of the motion: {error}")
     terms = [*model.contract.positions, *model.contract.velocities]
@@ -461,4 +463,15 @@ def _regulated(legs: Legs, xs: Array, us: Array) -> Shift | Refusal:
     beyond = (low < high) & np.any((np.array(states) < low) | (np.array(states) > high), axis=0)
     if np.any(beyond):
         return Refusal(f"{model.state_names[int(np.argmax(beyond))]} would leave its limits")
+    lifted = np.min(depths, axis=0) < FIRM * depths[0]
+    if np.any(lifted):
+        return Refusal(f"foot {legs.feet[int(np.argmax(lifted))].name} would lift off")
     return Shift(np.array(states), np.array(inputs))
+
+
+def _depths(legs: Legs) -> Array:
+    """Return (feet,) [m] the depth of each foot in the ground in the last step."""
+    deepest = dict[str, float]()
+    for contact in contacts_of_the_step(legs.model):
+        deepest[contact.body_a] = max(contact.depth, deepest.get(contact.body_a, 0.0))
+    return np.array([max(deepest.get(body, 0.0) for body in foot.bodies) for foot in legs.feet])

@@ -152,6 +152,18 @@ def test_a_frame_and_a_joint_go_where_they_are_asked_to(on_feet):
     assert isinstance(sideways, Refusal)  # legs of two joints about y keep the trunk in its plane
 
 
+def test_no_foot_lifts_off_in_a_fast_motion(on_feet):
+    """A step of h adds h^2 w^2 l / 2 to the height of a foot of a leg l that turns by w, more than light feet sink."""
+    model = on_feet(effort=500, trunk=1.0)
+    robot, rest = stand(model, *ranges(model))
+    lower = rest.x[robot.base_q + 4 : robot.base_q + 7] - np.array([0.01, 0.0, 0.14])
+    found = shift_to(robot, rest, {"trunk": lower}, {})
+    assert isinstance(found, Shift), found
+    for x, u in zip(found.xs[:-1], found.us, strict=True):
+        advance(model.double, x, u)
+        assert {contact.body_a for contact in contacts_of_the_step(model)} == {f"{leg}_shank" for leg in HIPS}
+
+
 @pytest.mark.parametrize("name", slow_after(1, ["panda.urdf", "iris.urdf", "allegro_left_hand.urdf", "kinova.urdf"]))
 def test_an_arm_a_hand_and_a_drone_have_no_feet(name):
     model = dd.load_model(robot_file(name), time_step=0.005, actuators="all", mimic="reduce", **ON_FEET, **GROUND)
