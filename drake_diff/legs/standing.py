@@ -61,6 +61,7 @@ FRAME_TOLERANCE = 1e-2  # [m] of a frame's goal; a plan aims at the middle 0.1 /
 CORRECTIONS, FRAME_MISS, JOINT_MISS = 3, 5.5e-4, 1e-3  # [m], [rad or m] errors that need no further correction
 NEAR, SLOW = 0.02, 0.5  # [rad or m], [rad/s or m/s] deviations that cost 1 in a regulator
 EFFORT_SHARE = 0.2  # the same for an input, as a fraction of its holding effort (at least a tenth of the largest)
+AT_END = 100.0  # weight of the last state relative to a step: without it, a fall begins as the gains vanish at the end
 
 
 @dataclass(frozen=True, eq=False)
@@ -450,7 +451,7 @@ def _regulated(legs: Legs, xs: Array, us: Array) -> Shift | Refusal:
     size = EFFORT_SHARE * np.maximum(effort, 0.1 * float(np.max(effort))) / model.servo_gains[0]
     Q = np.diag(np.concatenate([np.full(nv, NEAR**-2.0), np.full(nv, SLOW**-2.0)]))
     try:
-        policy = TVLQR(model, xs, us, Q, np.diag(size**-2.0))
+        policy = TVLQR(model, xs, us, Q, np.diag(size**-2.0), AT_END * Q)
         states, inputs, depths = [xs[0]], list[Array](), list[Array]()
         for k in range(len(us)):
             inputs.append(np.clip(policy(states[-1], k * model.time_step), lower, upper))

@@ -16,8 +16,8 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.values import Refusal
 from drake_diff.derivatives.analytic import analytic_of
 from drake_diff.exceptions import DrakeDiffError, ModelError, ModelWarning, SimulationError
-from drake_diff.legs.feet import Legs
-from drake_diff.legs.standing import Rest, stand
+from drake_diff.legs.feet import Legs, find_feet
+from drake_diff.legs.standing import Rest, stand, with_soft_feet
 from drake_diff.model.assembly import assembled
 from drake_diff.model.contact import overlaps
 from drake_diff.model.inputs import BodyForce
@@ -247,6 +247,9 @@ def _standing(read: _Draft, seed: int) -> Robot | Refusal:
         model = draft.model
         if model.nv > MANY and isinstance(derivatives, Refusal):
             return Refusal(f"the derivatives of {model.nv} velocities in contact would take minutes: {derivatives}")
+        feet = find_feet(model, model.default_state[: model.nq])
+        if not isinstance(feet, Refusal):
+            model = with_soft_feet(model, len(feet))
         lower, upper = ranges(model)
         stance = stand(model, *ranges(model, np.pi))  # legs may bend further than random postures
         if isinstance(stance, Refusal):
@@ -258,7 +261,8 @@ def _standing(read: _Draft, seed: int) -> Robot | Refusal:
     except DrakeDiffError as error:
         return Refusal(f"a model for standing cannot be loaded: {error}")
     ground = "on an added ground (base='free', ground=True), with contact at spheres in its shapes"
-    draft.repairs.append(f"it stands on {_few(foot.name for foot in stance[0].feet)}, {ground}")
+    soft = f"of {model.options['stiffness']:.2g} N/m" if model.options and model.options["stiffness"] else ""
+    draft.repairs.append(f"it stands on {_few(foot.name for foot in stance[0].feet)}, {ground} {soft}".rstrip())
     if besides:
         pairs = _few(map(" and ".join, sorted(besides)))
         draft.repairs.append(f"{pairs} overlap in the initial posture, which the search ignores")

@@ -164,6 +164,16 @@ def test_no_foot_lifts_off_in_a_fast_motion(on_feet):
         assert {contact.body_a for contact in contacts_of_the_step(model)} == {f"{leg}_shank" for leg in HIPS}
 
 
+def test_a_standing_robot_is_regulated_until_its_motion_ends(on_feet):
+    """A regulator without a weight on the last state lets go in the last tenth of a second, and the robot falls."""
+    model = on_feet()
+    robot, rest = stand(model, *ranges(model))
+    found = shift_to(robot, rest, {"trunk": rest.x[robot.base_q + 4 : robot.base_q + 7] - [0.01, 0.0, 0.1]}, {})
+    assert isinstance(found, Shift), found
+    speeds = np.max(np.abs(found.xs[:, model.nq :]), axis=1)
+    assert speeds[-1] < 2 * speeds[-20]
+
+
 @pytest.mark.parametrize("name", slow_after(1, ["panda.urdf", "iris.urdf", "allegro_left_hand.urdf", "kinova.urdf"]))
 def test_an_arm_a_hand_and_a_drone_have_no_feet(name):
     model = dd.load_model(robot_file(name), time_step=0.005, actuators="all", mimic="reduce", **ON_FEET, **GROUND)
