@@ -427,9 +427,10 @@ def shift_to(legs: Legs, start: Rest, frames: Mapping[str, Array], joints: Mappi
     wish = Wish(q0, unit, [*np.mean(feet[:, :2], axis=0), np.nan], OVER_FEET)
     plant, indices, asked = model.double.plant, list(joints), np.array(list(joints.values()))
     origins = {n: plant.get_frame(frame_named(model.plant, "goal", n).index()) for n in frames}
+    margin = _margin(legs, INSIDE / 2)
     aimed, places = asked.copy(), {name: np.array(position) for name, position in frames.items()}
     for _ in range(CORRECTIONS + 1):
-        lower, upper = legs.lower.copy(), legs.upper.copy()
+        lower, upper = legs.lower + margin, legs.upper - margin  # for the regulator
         lower[indices] = upper[indices] = aimed
         targets = [PointTarget(origins[name], np.zeros(3), position, ON_GROUND) for name, position in places.items()]
         shift = _shift_to(legs, start, wish, lower, upper, targets)
