@@ -1,5 +1,6 @@
 from . import engines as engines
 from . import exceptions as exceptions
+from . import legs as legs
 from . import loop as loop
 from . import model as model
 from . import optimize as optimize

@@ -13,7 +13,7 @@ import numpy as np
 from pydrake.solvers import ClarabelSolver, MathematicalProgram
 
 from drake_diff._base.arrays import Array, Indices
-from drake_diff._base.values import Refusal
+from drake_diff._base.values import Refusal, ShowsItsRepr
 from drake_diff.derivatives.step import linearize
 from drake_diff.exceptions import GradientError, InputError, SimulationError
 from drake_diff.legs.feet import GRAVITY, Legs, find_feet
@@ -38,6 +38,8 @@ INSIDE = 0.08  # distance of a posture from joint limits, as a fraction of a joi
 DEEP = 5e-5  # [m] depth of the feet in the ground
 STARTS, SPREAD = 6, 0.5  # random first postures, and their largest distance [rad or m] from the file's posture
 ROUNDS = 3  # iterations to find the lowest points of round feet
+# Of a joint without limits: the range on each side of 0 [rad], [m]; a wider range counts as unlimited.
+ANGLE, LENGTH, WIDEST = 1.0, 0.2, 4 * np.pi
 # A state at rest. Units of a rotation, a height, any coordinate, and an input, as a fraction of the weight times 1 m.
 TURN, HEIGHT, ANY, EFFORT = 1e-2, 1e-3, 1e-3, 1e-3
 ITERATIONS, HALVINGS, FARTHEST = 40, 8, 5e-3  # [rad or m] largest change per iteration
@@ -53,6 +55,7 @@ TURNED, SHIFTED, LOWERED = 0.1, 0.06, 0.12  # of the base: [rad], and fractions 
 MOVED = 0.1  # fraction of a joint's range, for joints outside the legs
 ARRIVED, SLOW_ENOUGH = 0.01, 0.02  # [rad or m] largest distance from the target rest, [rad/s or m/s] largest velocity
 FEET_STAY, STILL = 1e-3, 1e-7  # [m] largest distance of a foot from its stance, and between knots (4 mm/s^2)
+FIRM = 0.25  # least depth of a foot, as a fraction of its depth at rest; motors would drive a lifted foot down
 FREE_BASE, FREE_JOINT, ALONG = 0.1, 0.3, 0.05  # [rad or m] deviations that cost 1; ALONG applies on the way
 BASE_TURN, BASE_PLACE = 0.003, 0.001  # the same for a base whose pose is required
 OVER_FEET = 0.02  # [m] the same for the centre of mass
@@ -60,6 +63,7 @@ FRAME_TOLERANCE = 1e-2  # [m] of a frame's goal; a plan aims at the middle 0.1 /
 CORRECTIONS, FRAME_MISS, JOINT_MISS = 3, 5.5e-4, 1e-3  # [m], [rad or m] errors that need no further correction
 NEAR, SLOW = 0.02, 0.5  # [rad or m], [rad/s or m/s] deviations that cost 1 in a regulator
 EFFORT_SHARE = 0.2  # the same for an input, as a fraction of its holding effort (at least a tenth of the largest)
+AT_END = 100.0  # weight of the last state relative to a step: without it, a fall begins as the gains vanish at the end
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +84,26 @@ class Rest:
     u: Array
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class Standing(ShowsItsRepr):
+    """A robot at rest on its feet.
+
+    Attributes:
+        model: The model, with soft feet.
+        x0: (nx,) the state.
+        u: (nu,) the inputs under which a step of the model preserves the state.
+        feet: The names of the feet's bodies, as for a `ContactSchedule`.
+    """
+
+    model: Model
+    x0: Array
+    u: Array
+    feet: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        return f"Standing({self.model.name} on {', '.join(self.feet)})"
+
+
 @dataclass(frozen=True, eq=False)
 class Shift:
     """A motion xs (N+1, nx) under us (N, nu) of the model's own steps, from rest to rest."""
@@ -88,7 +112,65 @@ class Shift:
     us: Array
 
 
-def stand(model: Model, lower: Array, upper: Array) -> tuple[Legs, Rest] | Refusal:
+def stand(model: Model) -> Standing:
+    """Find a posture on bent legs in which a robot is at rest on its feet, and the inputs that hold it.
+
+    The feet are the lowest limbs in the file's posture that end in spheres or boxes. The result's model has the
+    softness of `ContactSchedule.with_soft_feet`, unless the file gives one.
+
+    Args:
+        model: A model with a floating base and a ground at z = 0, upright in its default state, such as
+            `load_model(file, base="free", ground=True, contact="ground", actuators="all", meshes="spheres",
+            contact_geometry="corner_spheres", time_step=0.01)`.
+
+    Returns:
+        The model, the state x0, the inputs and the feet.
+
+    Raises:
+        InputError: The model cannot stand; the message gives the reason.
+
+    Example:
+        >>> options = {"base": "free", "ground": True, "contact": "ground", "actuators": "all"}
+        >>> robot = dd.legs.stand(dd.load_model("models/quadruped.urdf", time_step=0.02, **options))
+        >>> robot.feet
+        ('FL_foot', 'FR_foot', 'RL_foot', 'RR_foot')
+        >>> round(float(robot.x0[robot.model.state_names.index("trunk_z")]), 3)
+        0.329
+    """
+    result = stand_softly(model)
+    if isinstance(result, Refusal):
+        raise InputError("legs.stand: model", got=str(result), expected="a robot on feet that its motors can hold")
+    legs, rest = result
+    return Standing(legs.model, rest.x, rest.u, tuple(foot.name for foot in legs.feet))
+
+
+def stand_softly(model: Model) -> tuple[Legs, Rest] | Refusal:
+    """Return the legs of the model with soft feet, and the state in which it stands at rest, or a Refusal."""
+    feet = find_feet(model, model.default_state[: model.nq])
+    if isinstance(feet, Refusal):
+        return feet
+    soft = with_soft_feet(model, len(feet))
+    return stand_at_rest(soft, *ranges(soft, np.pi))  # legs may bend further than random postures
+
+
+def ranges(model: Model, turn: float = ANGLE) -> tuple[Array, Array]:
+    """Return (lower, upper) (nq,): each coordinate's limits, or a range around 0 if it is unlimited or very wide.
+
+    That range is `turn` [rad] to each side for an angle.
+    """
+    lower = np.array([p.lower for p in model.contract.positions], dtype=float)
+    upper = np.array([p.upper for p in model.contract.positions], dtype=float)
+    reach = np.array([LENGTH if p.unit == "m" else turn for p in model.contract.positions])
+    wide = upper - lower > WIDEST  # true also without limits
+    low = np.where(wide, np.maximum(lower, -reach), lower)
+    high = np.where(wide, np.minimum(upper, reach), upper)
+    beyond = low > high  # a single limit on the other side of 0
+    low = np.where(beyond & np.isfinite(upper), upper - 2 * reach, low)
+    high = np.where(beyond & np.isfinite(lower), lower + 2 * reach, high)
+    return low, high
+
+
+def stand_at_rest(model: Model, lower: Array, upper: Array) -> tuple[Legs, Rest] | Refusal:
     """Return the legs of a robot and the state in which it stands at rest, within lower and upper (nq,), or a Refusal.
 
     The base floats, z is up, and the ground is at z = 0.
@@ -345,9 +427,10 @@ def shift_to(legs: Legs, start: Rest, frames: Mapping[str, Array], joints: Mappi
     wish = Wish(q0, unit, [*np.mean(feet[:, :2], axis=0), np.nan], OVER_FEET)
     plant, indices, asked = model.double.plant, list(joints), np.array(list(joints.values()))
     origins = {n: plant.get_frame(frame_named(model.plant, "goal", n).index()) for n in frames}
+    margin = _margin(legs, INSIDE / 2)
     aimed, places = asked.copy(), {name: np.array(position) for name, position in frames.items()}
     for _ in range(CORRECTIONS + 1):
-        lower, upper = legs.lower.copy(), legs.upper.copy()
+        lower, upper = legs.lower + margin, legs.upper - margin  # for the regulator
         lower[indices] = upper[indices] = aimed
         targets = [PointTarget(origins[name], np.zeros(3), position, ON_GROUND) for name, position in places.items()]
         shift = _shift_to(legs, start, wish, lower, upper, targets)
@@ -449,11 +532,12 @@ def _regulated(legs: Legs, xs: Array, us: Array) -> Shift | Refusal:
     size = EFFORT_SHARE * np.maximum(effort, 0.1 * float(np.max(effort))) / model.servo_gains[0]
     Q = np.diag(np.concatenate([np.full(nv, NEAR**-2.0), np.full(nv, SLOW**-2.0)]))
     try:
-        policy = TVLQR(model, xs, us, Q, np.diag(size**-2.0))
-        states, inputs = [xs[0]], list[Array]()
+        policy = TVLQR(model, xs, us, Q, np.diag(size**-2.0), AT_END * Q)
+        states, inputs, depths = [xs[0]], list[Array](), list[Array]()
         for k in range(len(us)):
             inputs.append(np.clip(policy(states[-1], k * model.time_step), lower, upper))
             states.append(np.array(advance(model.double, states[-1], inputs[-1])))
+            depths.append(_depths(legs))
     except (SimulationError, GradientError) as error:
         return Refusal(f"Drake cannot take the steps of the motion: {error}")
     terms = [*model.contract.positions, *model.contract.velocities]
@@ -461,4 +545,15 @@ def _regulated(legs: Legs, xs: Array, us: Array) -> Shift | Refusal:
     beyond = (low < high) & np.any((np.array(states) < low) | (np.array(states) > high), axis=0)
     if np.any(beyond):
         return Refusal(f"{model.state_names[int(np.argmax(beyond))]} would leave its limits")
+    lifted = np.min(depths, axis=0) < FIRM * depths[0]
+    if np.any(lifted):
+        return Refusal(f"foot {legs.feet[int(np.argmax(lifted))].name} would lift off")
     return Shift(np.array(states), np.array(inputs))
+
+
+def _depths(legs: Legs) -> Array:
+    """Return (feet,) [m] the depth of each foot in the ground in the last step."""
+    deepest = dict[str, float]()
+    for contact in contacts_of_the_step(legs.model):
+        deepest[contact.body_a] = max(contact.depth, deepest.get(contact.body_a, 0.0))
+    return np.array([max(deepest.get(body, 0.0) for body in foot.bodies) for foot in legs.feet])

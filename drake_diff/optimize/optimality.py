@@ -233,6 +233,7 @@ class _Plan:
         self.linked = len(set(self.trees.of_states)) < 2 or problem.optimizes_parameters or _is_coupled(self.model)
         self.moved, self.reached = self._follow()
 
+    @np.errstate(over="ignore", invalid="ignore")  # the effect of an early variable may exceed every number
     def _follow(self) -> tuple[Mask, set[int]]:
         """Return the coordinates that some variable moves at some knot, and the trees that the variables reach."""
         problem, random = self.problem, np.random.default_rng(0)

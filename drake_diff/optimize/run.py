@@ -398,6 +398,9 @@ class Run:
             with until_set(interrupted):
                 xs, us, before, blindness = self._look_at(variables, variables.pack(xs[0], us, values), solved=False)
         except (GradientError, SimulationError) as error:
+            if isinstance(error, SimulationError) and not around and self.problem.motion == STEPS:
+                options = {"may_be_blind": may_be_blind, "around": True}  # from the guess's own states, step by step
+                return self._searched(first_states, us, search, guess, interrupted, after_search, **options)
             return refused(self._draft(xs, us), error)
         xs = first_states if around else xs
         if blindness and not may_be_blind:

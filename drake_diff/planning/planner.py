@@ -18,7 +18,7 @@ from drake_diff.certificates.finding import Finding
 from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, ModelWarning, WriteError
 from drake_diff.legs.feet import Legs
-from drake_diff.legs.standing import FRAME_TOLERANCE, Rest, random_shift, shift_to
+from drake_diff.legs.standing import FRAME_TOLERANCE, SLOW_ENOUGH, Rest, random_shift, shift_to
 from drake_diff.model.assembly import single_coordinates
 from drake_diff.model.model import Model
 from drake_diff.optimize.options import Options
@@ -122,8 +122,7 @@ class Plan(ShowsItsRepr):
         severe = [f for f in self.findings if f.severity in ("error", "warning")]
         certificates = [c.verdict for c in s.certificates]
         agreeing = f"{certificates.count('agree')} of {len(certificates)} agree"
-        moved = s.problem.x_goal
-        far = np.nanmax(np.abs(moved - s.problem.x0)[: m.nq]) if moved is not None else np.nan
+        far = np.max(np.abs(s.xs[-1] - s.problem.x0)[: m.nq])
         path = self.directory
         return (
             f"robot     {m.name}: {m.nq} positions, {m.nv} velocities, {m.nu} motors",
@@ -420,7 +419,12 @@ def _collocated(robot: Robot, task: Goals, guess: MotionGuess, least: str | None
 
 def _feasible(robot: Robot, task: Goals, guess: MotionGuess) -> _Attempt:
     """Find any motion to the end of the guess within all limits; the guess itself if it is feasible."""
-    problem = _problem(robot, task, guess, guess.xs[-1])
+    x_goal, asked, nq = guess.xs[-1].copy(), dict[str, Any](), guess.model.nq
+    if robot.standing is not None and not task.is_free:  # nobody asked for the posture of other joints
+        x_goal[[i for i in range(nq) if i not in task.joints]] = np.nan
+        still = np.full(guess.model.nv, SLOW_ENOUGH)  # a share of the range of an arm that hardly moves is nothing
+        asked["goal_tolerance"] = np.concatenate([np.full(nq, np.nan), still])
+    problem = _problem(robot, task, guess, x_goal, **asked)
     options = {"method": "shooting", "time_limit": BUDGET if robot.standing is None else LONG_BUDGET}
     return _Attempt(guess.name, robot, problem, guess, options)
 

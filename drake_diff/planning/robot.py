@@ -18,7 +18,7 @@ from drake_diff._base.values import Refusal
 from drake_diff.derivatives.analytic import analytic_of
 from drake_diff.exceptions import DrakeDiffError, ModelError, ModelWarning, SimulationError
 from drake_diff.legs.feet import Legs
-from drake_diff.legs.standing import Rest, stand
+from drake_diff.legs.standing import Rest, ranges, stand_softly
 from drake_diff.model.assembly import assembled, closed, loop_velocities
 from drake_diff.model.contact import overlaps
 from drake_diff.model.inputs import BodyForce
@@ -33,8 +33,6 @@ SMALLEST_DRIVE = 1e-9  # of the largest singular value: a velocity with a smalle
 NAMED = 4  # names shown of a long list
 # Start postures.
 INSIDE = 0.05  # of a joint's range: minimum distance of a start from both limits
-TURN, SHIFT = 1.0, 0.2  # [rad], [m] range on each side of 0 for a joint without limits
-WIDEST = 4 * np.pi  # a wider range counts as unlimited
 TOUCHING = 1e-4  # [m] tolerance of overlap
 HOLD_SHARE = 0.63  # of the effort limits: maximum effort for holding a start
 SEEN = 16  # postures in which a pair of shapes must overlap to count as always overlapping
@@ -255,10 +253,11 @@ def _standing(read: _Draft, seed: int) -> Robot | Refusal:
         model = draft.model
         if model.nv > MANY and isinstance(derivatives, Refusal):
             return Refusal(f"the derivatives of {model.nv} velocities in contact would take minutes: {derivatives}")
-        lower, upper = ranges(model)
-        stance = stand(model, *ranges(model, np.pi))  # legs may bend further than random postures
+        stance = stand_softly(model)
         if isinstance(stance, Refusal):
             return Refusal(f"it cannot stand: {stance}")
+        model = stance[0].model
+        lower, upper = ranges(model)
         shapes = draft.read(ground=None, contact=True)
         q, is_joint = stance[1].x[: model.nq], of_joints(model)
         overlapping = pairs_always([np.where(is_joint, random.uniform(lower, upper), q) for _ in range(DRAWN)], shapes)
@@ -266,7 +265,8 @@ def _standing(read: _Draft, seed: int) -> Robot | Refusal:
     except DrakeDiffError as error:
         return Refusal(f"a model for standing cannot be loaded: {error}")
     ground = "on an added ground (base='free', ground=True), with contact at spheres in its shapes"
-    draft.repairs.append(f"it stands on {_few(foot.name for foot in stance[0].feet)}, {ground}")
+    soft = f"of {model.options['stiffness']:.2g} N/m" if model.options and model.options["stiffness"] else ""
+    draft.repairs.append(f"it stands on {_few(foot.name for foot in stance[0].feet)}, {ground} {soft}".rstrip())
     if besides:
         pairs = _few(map(" and ".join, sorted(besides)))
         draft.repairs.append(f"{pairs} overlap in the initial posture, which the search ignores")
@@ -502,23 +502,6 @@ def shares(model: Model, efforts: Array) -> Array:
     """Return efforts (..., nu) as shares of the effort limits, and 0 for inputs without a limit."""
     limits = model.effort_limits
     return np.asarray(np.abs(efforts) / np.where((limits > 0) & np.isfinite(limits), limits, np.inf))
-
-
-def ranges(model: Model, turn: float = TURN) -> tuple[Array, Array]:
-    """Return (lower, upper) (nq,): each coordinate's limits, or a range around 0 if it is unlimited or very wide.
-
-    That range is `turn` [rad] to each side for an angle.
-    """
-    lower = np.array([p.lower for p in model.contract.positions], dtype=float)
-    upper = np.array([p.upper for p in model.contract.positions], dtype=float)
-    reach = np.array([SHIFT if p.unit == "m" else turn for p in model.contract.positions])
-    wide = upper - lower > WIDEST  # true also without limits
-    low = np.where(wide, np.maximum(lower, -reach), lower)
-    high = np.where(wide, np.minimum(upper, reach), upper)
-    beyond = low > high  # a single limit on the other side of 0
-    low = np.where(beyond & np.isfinite(upper), upper - 2 * reach, low)
-    high = np.where(beyond & np.isfinite(lower), lower + 2 * reach, high)
-    return low, high
 
 
 def of_joints(model: Model) -> NDArray[np.bool_]:

@@ -76,9 +76,9 @@ def main() -> int:
         for name in asked.robots:
             results, seconds, reasons = [], [], []
             for seed in range(asked.seeds):
-                start = time.process_time()
                 try:
                     trunk, goal, feet = goal_of(robot_file(ROBOTS[name]), seed)
+                    start = time.process_time()
                     done = plan(robot_file(ROBOTS[name]), goals={trunk: goal.tolist()}, out=f"{folder}/{name}_{seed}")
                 except dd.exceptions.DrakeDiffError as error:
                     results.append(False)

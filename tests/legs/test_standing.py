@@ -11,14 +11,14 @@ import drake_diff as dd
 from drake_diff._base.values import Refusal
 from drake_diff.exceptions import InputError, ModelError
 from drake_diff.legs.feet import Legs, find_feet
-from drake_diff.legs.standing import Shift, hold, shift_to, stand, standing_posture
+from drake_diff.legs.standing import Shift, hold, ranges, shift_to, stand_at_rest, standing_posture
 from drake_diff.model.contact import contacts_of_the_step
 from drake_diff.model.step import advance
 from drake_diff.model.tangent import tangent_space
 from drake_diff.motion import TVLQR
 from drake_diff.optimize.guess import first_guess
 from drake_diff.planning import plan
-from drake_diff.planning.robot import GROUND, ON_FEET, load_robot, ranges
+from drake_diff.planning.robot import GROUND, ON_FEET, load_robot
 
 pytestmark = [pytest.mark.filterwarnings("ignore::drake_diff.exceptions.ModelWarning"), pytest.mark.solve]
 G = 9.81
@@ -117,7 +117,7 @@ def test_the_centre_of_mass_has_to_be_over_the_feet(on_feet):
 )
 def test_what_cannot_stand_is_refused_with_the_reason(change, why, on_feet):
     model = on_feet(**change)
-    found = stand(model, *ranges(model))
+    found = stand_at_rest(model, *ranges(model))
     assert isinstance(found, Refusal)
     assert any(part in found.reason for part in why.split("|")), found.reason
 
@@ -125,7 +125,7 @@ def test_what_cannot_stand_is_refused_with_the_reason(change, why, on_feet):
 def test_at_rest_the_step_changes_nothing_and_drake_carries_the_weight(on_feet):
     """Check that a step keeps the robot at rest and that Drake's own contact forces carry the weight."""
     model = on_feet()
-    robot, rest = stand(model, *ranges(model))
+    robot, rest = stand_at_rest(model, *ranges(model))
     x = np.array(advance(model.double, rest.x, rest.u))
     forces = sum(contact.force for contact in contacts_of_the_step(model))
     assert forces == pytest.approx([0.0, 0.0, 14 * G], abs=0.05)  # 1e-4 m/s per step of 5 ms is 14 kg * 0.02 m/s^2
@@ -137,7 +137,7 @@ def test_at_rest_the_step_changes_nothing_and_drake_carries_the_weight(on_feet):
 def test_a_frame_and_a_joint_go_where_they_are_asked_to(on_feet):
     """Check by Drake's kinematics of the last state. A shift that legs with fixed feet cannot make is refused."""
     model = on_feet()
-    robot, rest = stand(model, *ranges(model))
+    robot, rest = stand_at_rest(model, *ranges(model))
     frame, context = model.plant.GetFrameByName("trunk"), model.plant.CreateDefaultContext()
     lower = rest.x[robot.base_q + 4 : robot.base_q + 7] - np.array([0.01, 0.0, 0.01])
     found = shift_to(robot, rest, {"trunk": lower}, {})
@@ -150,6 +150,41 @@ def test_a_frame_and_a_joint_go_where_they_are_asked_to(on_feet):
     assert found.xs[-1][knee] == pytest.approx(rest.x[knee] + 0.05, abs=2e-3)
     sideways = shift_to(robot, rest, {"trunk": lower + np.array([0.0, 0.1, 0.0])}, {})
     assert isinstance(sideways, Refusal)  # legs of two joints about y keep the trunk in its plane
+
+
+def test_a_robot_stands_by_one_call_on_soft_feet(on_feet):
+    """Drake's own contact carries the weight, at a depth of 0.0625 m/s times the step."""
+    robot = dd.legs.stand(on_feet())
+    after = np.array(advance(robot.model.double, robot.x0, robot.u))
+    contacts = contacts_of_the_step(robot.model)
+    assert after == pytest.approx(robot.x0, abs=1e-7)
+    assert {contact.body_a for contact in contacts} == set(robot.feet)
+    assert sum(contact.force for contact in contacts) == pytest.approx([0.0, 0.0, 14 * G], abs=1e-3)
+    assert np.mean([contact.depth for contact in contacts]) == pytest.approx(0.0625 * 0.005, rel=1e-3)
+    with pytest.raises(InputError, match=r"legs.stand: model.*no contact forces"):
+        dd.legs.stand(on_feet(effort=0.5))
+
+
+def test_no_foot_lifts_off_in_a_fast_motion(on_feet):
+    """A step of h adds h^2 w^2 l / 2 to the height of a foot of a leg l that turns by w, more than light feet sink."""
+    model = on_feet(effort=500, trunk=1.0)
+    robot, rest = stand_at_rest(model, *ranges(model))
+    lower = rest.x[robot.base_q + 4 : robot.base_q + 7] - np.array([0.01, 0.0, 0.14])
+    found = shift_to(robot, rest, {"trunk": lower}, {})
+    assert isinstance(found, Shift), found
+    for x, u in zip(found.xs[:-1], found.us, strict=True):
+        advance(model.double, x, u)
+        assert {contact.body_a for contact in contacts_of_the_step(model)} == {f"{leg}_shank" for leg in HIPS}
+
+
+def test_a_standing_robot_is_regulated_until_its_motion_ends(on_feet):
+    """A regulator without a weight on the last state lets go in the last tenth of a second, and the robot falls."""
+    model = on_feet()
+    robot, rest = stand_at_rest(model, *ranges(model))
+    found = shift_to(robot, rest, {"trunk": rest.x[robot.base_q + 4 : robot.base_q + 7] - [0.01, 0.0, 0.1]}, {})
+    assert isinstance(found, Shift), found
+    speeds = np.max(np.abs(found.xs[:, model.nq :]), axis=1)
+    assert speeds[-1] < 2 * speeds[-20]
 
 
 @pytest.mark.parametrize("name", slow_after(1, ["panda.urdf", "iris.urdf", "allegro_left_hand.urdf", "kinova.urdf"]))

@@ -397,3 +397,23 @@ def test_an_arm_that_starts_beside_a_joint_limit_leaves_it(name, approximation):
     solution = dd.solve(dd.Problem(model, x0=x0, num_steps=40, running_cost=cost), method="ilqr", max_iterations=100)
     assert solution.success, solution.message
     assert solution.xs[-1, j] > lower[j] + 0.05
+
+
+def test_a_search_begins_where_the_rollout_of_its_guess_is_not_finite(tmp_path):
+    """A step of a spring of 5000 N/m multiplies a deviation by 23, so that 260 steps without force overflow.
+
+    With free forces, the deviation x moves by h v. Its least cost h p x^2 solves p = 1 + p / (1 + p h^2).
+    """
+    text = (MODELS / "mass_spring_damper.sdf").read_text()
+    text = text.replace("<spring_stiffness>50<", "<spring_stiffness>5000<").replace("<effort>1000<", "<effort>1e9<")
+    path = tmp_path / "stiff.sdf"
+    path.write_text(text)
+    model, h = dd.load_model(path, time_step=0.1), 0.1
+    cost = dd.QuadraticCost(Q=np.eye(2), R=[[1e-14]], x_ref=[0.1, 0.0])
+    problem = dd.Problem(model, x0=[0.2, 0.0], num_steps=260, running_cost=cost)
+    with pytest.raises(SimulationError):
+        dd.rollout(model, problem.x0, np.zeros((260, 1)))
+    solution = dd.solve(problem, method="ilqr")
+    p = (1 + np.sqrt(1 + 4 / h**2)) / 2
+    assert len(solution.iterations) > 1
+    assert solution.cost == pytest.approx(h * p * 0.1**2, rel=1e-6)

@@ -191,6 +191,7 @@ class ShootingVariables:
             return roll(intervals, x0, us)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # the effect of an early variable may exceed every number
 def final_sensitivity(variables: ShootingVariables, z: Array) -> Array:
     """Return d x_n / d z (nx, size) by a backward recursion from the last step, in time and memory that grow as n.
 

@@ -1,0 +1,2 @@
+from .standing import Standing as Standing
+from .standing import stand as stand
