@@ -538,18 +538,21 @@ def _inputs(model: Model, x: Array, wanted: Array, steered: NDArray[np.bool_] | 
     The inputs correct only `steered` velocities, all by default.
     """
     twin, nq, per_input = model.double, model.nq, model.servo_gains[0]
-    counted = slice(None) if steered is None else steered
+    counted = np.ones(model.nv, dtype=bool) if steered is None else steered
     # The step's equation with implicit damping; numerical probing of the step would meet joint limits.
-    efforts = efforts_for(model, x, wanted - x[nq:])
+    efforts = efforts_for(model, x, np.where(counted, wanted - x[nq:], 0.0))
     effect, u = drive(model, x[:nq]) * per_input, model.commands(x, wanted, efforts)
     for i in range(CORRECTIONS + 1):
+        if not counted.all():  # an input beyond its limits has no effect
+            u = np.clip(u, model.inputs.lower, model.inputs.upper)
         x_next = np.array(advance(twin, x, u))
         off = (wanted - x_next[nq:])[counted]
         if i == CORRECTIONS or np.max(np.abs(off), initial=0.0) < EXACT:
             break
-        if i == 1:  # the equation lacks the plant's controllers and the rotation of body-fixed thrusters
+        if i == 1 or not counted.all():  # the equation lacks controllers, limits, and the rotation of thrusters
             reach = np.max(np.abs(effect), axis=0)
             sizes = np.divide(PROBED, reach, out=1 / per_input, where=reach > 0)
+            sizes = np.where(u + sizes > model.inputs.upper, -sizes, sizes)
             probes = [np.array(advance(twin, x, u + d))[nq:] - x_next[nq:] for d in np.diag(sizes)]
             effect = np.array(probes).T / sizes
         u = u + np.linalg.lstsq(effect[counted], off, rcond=None)[0]

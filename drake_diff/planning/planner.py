@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -385,10 +385,13 @@ def _check_that_limits_bound_time(model: Model) -> None:
 
 def _guesses(space: Space, target: Array, seed: int) -> list[MotionGuess]:
     """Return guesses to `target` (nq,), first without overlaps, then within the effort limits."""
-    robot, paths = space.robot, lines(space, target, seed)
-    guesses = [along(robot, line) for line in paths]
-    if len(paths) == 1:
-        guesses.append(along(robot, paths[0], slower=2.0))
+    robot, paths, guesses = space.robot, lines(space, target, seed), list[MotionGuess]()
+    for line, slower in [*((line, 1.0) for line in paths), *([(paths[0], 2.0)] if len(paths) == 1 else [])]:
+        with suppress(ModelError):  # on the way, loops cannot be closed
+            guesses.append(along(robot, line, slower=slower))
+    counted = coordinates_of(robot.model, robot.steered) if has_passive_loops(robot) else slice(None)
+    # The loops may end on the other side of a dead point.
+    guesses = [g for g in guesses if np.max(np.abs(g.xs[-1][: len(target)] - target)[counted]) < BESIDE]
     return sorted(guesses, key=lambda guess: (_touched(space, guess), max(guess.effort, OF_EFFORT)))
 
 
@@ -432,12 +435,11 @@ def _feasible(robot: Robot, task: Goals, guess: MotionGuess) -> _Attempt:
 def _problem(robot: Robot, task: Goals, guess: MotionGuess, x_goal: Array, **asked: Any) -> Problem:
     tolerance = {} if robot.standing is None else {"tolerance": FRAME_TOLERANCE}
     goals = [FrameGoal(name, position=position, **tolerance) for name, position in task.frames.items()]
-    if robot.steered is not None and guess.model.file_facts.held_points:
-        named = coordinates_of(guess.model, None)
-        named[list(task.joints)] = True
+    if robot.steered is not None:
         counted = independent(guess.model, x_goal[: guess.model.nq], list(task.joints))
-        counted &= robot.steered | named[places_of_velocities(guess.model)]
+        counted &= robot.steered | np.isin(places_of_velocities(guess.model), list(task.joints))
         x_goal = np.where(np.concatenate([coordinates_of(guess.model, counted), counted]), x_goal, np.nan)
+        x_goal[list(task.joints)] = list(task.joints.values())  # the guess may have missed them
     asked = {"num_steps": guess.num_steps, **asked}
     return Problem(
         guess.model, x0=guess.xs[0], x_goal=x_goal, goals=[*goals, *task.avoid], bounds=_bounds(guess.model), **asked
