@@ -88,7 +88,6 @@ CHOICES = {
     "mimic": (None, "reduce", "fix"),
     "inputs": (None, "position", "effort"),
 }
-CONTINUOUS_PLANT = object()  # a time step for `Model.changed`: the plant is continuous, for Drake's `Simulator` alone
 OTHERS_KEPT = 128  # maximum number of cached variants of a model; a certificate for the time step needs 91
 NAMES_SHOWN = 12  # in repr, enough for the whole state of a robot arm
 
@@ -590,7 +589,7 @@ def load_model(
     """
     options = {option: value for option, value in locals().items() if option not in ("path", "isolated")}
     warn_of_newer_versions()
-    time_step = 0.0 if time_step is CONTINUOUS_PLANT else seconds("time_step [s]", time_step)
+    time_step = seconds("time_step [s]", time_step)
     for option in CHOICES:
         _check_choice(option, options[option])
     check_contact(contact)
@@ -873,7 +872,7 @@ def _check_plant(model: Model) -> None:
     where = f"{model.source}: " if model.source else ""
     if not plant.is_finalized():
         raise ModelError("the plant is not finalized: call plant.Finalize() before building the diagram")
-    if plant.time_step() == 0 and not model.can_rebuild:
+    if plant.time_step() == 0:
         raise ModelError("the plant is continuous (time_step 0): build it with a time_step above 0")
     if plant.has_sampled_output_ports():
         raise ModelError(

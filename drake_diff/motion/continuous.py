@@ -14,13 +14,11 @@ from typing import Any
 import numpy as np
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable, MultibodyForces
-from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 
 from drake_diff._base.arrays import Array, finite_array, frozen
-from drake_diff._base.clock import check_time
 from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.model.contact import ContactPoint, body_of
-from drake_diff.model.model import CONTINUOUS_PLANT, Model
+from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators
 from drake_diff.model.step import set_state
 from drake_diff.motion import compliance
@@ -28,8 +26,6 @@ from drake_diff.motion.integrate import TOLERANCE, Flags, Integrator, Pairs, Ste
 from drake_diff.motion.rollout import Policy, Rollout, continuous_rollout
 
 NUDGE = 1e-9  # relative finite-difference step of the state for the Jacobian of the rates: a millionth of v_s
-ACCURACY = 1e-4  # of a step of Drake's integrator, relative to the states' sizes; replays end within 1e-3 of them
-SHORTEST_PART = 0.02  # of a model's step; motions that need shorter integration steps are stiff
 LOOK, LOOKS = 1e-3, 8  # [s] interval of contact checks within a step without contact, and their maximum number
 Chooser = Callable[[Array, int], Array]  # the state (nx,) and the number of the step -> the input (nu,)
 Vector = tuple[float, float, float]
@@ -285,67 +281,6 @@ def _cross(a: Any, b: Any) -> Vector:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-class SimulatedMotion(ContinuousMotion):
-    """The motion of a model without contact and added forces, by Drake's `Simulator` on the model's continuous plant.
-
-    Drake evaluates the equations without Python. If they are stiff, the remaining motion is that of `ContinuousMotion`.
-    """
-
-    def __init__(self, model: Model, sizes: Any = 1.0):
-        super().__init__(model, sizes=sizes)
-        self.plant = model.changed(time_step=CONTINUOUS_PLANT).double
-        self.simulator = Simulator(self.plant.diagram, self.plant.root_context)
-        ResetIntegratorFromFlags(self.simulator, "runge_kutta3", self.time_step)
-        integrator = self.simulator.get_mutable_integrator()
-        per_size = np.sqrt(np.mean(1 / np.square(np.broadcast_to(sizes, model.nx))))
-        integrator.set_target_accuracy(ACCURACY / max(1.0, per_size))  # Drake's errors have the states' units
-        integrator.set_requested_minimum_step_size(SHORTEST_PART * self.time_step)
-
-    @staticmethod
-    def supports(model: Model) -> bool:
-        """Return whether Drake's continuous plant has all forces of the model, and the model's own parameters."""
-        others = model.contract.contact.collision_pairs or model.double.forces or model.coupling is not None
-        return model.can_rebuild and not model.has_other_parameters and not others
-
-    def intervals(
-        self, x0: Array, choose: Chooser, count: int, tolerance: float = ACCURACY, deadline: float = np.inf
-    ) -> Iterator[tuple[Array, list[Step]]]:
-        plant, x = self.plant, x0[: self.model.nx]
-        most = np.where(self.model.inputs.actuator >= 0, self.limits, np.inf)
-        plant.set_state(x)
-        for k in range(count):
-            check_time()
-            u = choose(x, k)
-            plant.set_input(np.minimum(np.maximum(u, -most), most))
-            try:
-                self.simulator.AdvanceTo(plant.root_context.get_time() + self.time_step)
-            except RuntimeError:
-
-                def rest(x: Array, j: int, first: Array = u, k: int = k) -> Array:
-                    return choose(x, k + j) if j else first
-
-                yield from super().intervals(x, rest, count - k, tolerance, deadline)
-                return
-            ahead = plant.state()
-            self.check(ahead)
-            yield u, [Step(x, ahead, self.time_step, (), ())]
-            x = ahead
-
-    def work(self, xs: Array, us: Array) -> Array:
-        """Return the work (N+1, 3) [J] of inputs, damping and contact along xs (N+1, nx), by the trapezoidal rule."""
-        driven = np.stack([np.clip(us, -self.limits, self.limits) @ self.model.actuation.T] * 2)  # at both ends
-        work, nq = np.zeros((len(xs), 3)), self.model.nq
-        for end in range(2):
-            vs = xs[end : len(us) + end, nq:]
-            for k, u in enumerate(us if self.model.inputs.fed else ()):
-                self.twin.set_input(u)
-                set_state(self.twin, xs[k + end])
-                driven[end, k] += self.twin.systems_force()
-            work[1:, 0] += np.sum(vs * driven[end], axis=1)
-            work[1:, 1] += np.sum(vs * vs * self.damping, axis=1)
-        return np.asarray(self.time_step / 2 * np.cumsum(work, axis=0))
-
-
 def replayed(
     model: Model,
     x0: Array,
@@ -353,29 +288,26 @@ def replayed(
     count: int,
     tolerance: float = TOLERANCE,
     evaluations: int | None = None,
-    sizes: Any = 1.0,
+    sizes: Array | None = None,
 ) -> Rollout:
     """Return the motion over `count` of the model's steps under us (N, nu) or a policy; raise as `ContinuousMotion`.
 
     The motion is too stiff if it needs more than `evaluations` of the equations of motion at the given `tolerance`.
     """
-    nx, nu = model.nx, model.nu
+    all_sizes = 1.0 if sizes is None else np.append(sizes, np.ones(3))  # 1 J for the work states
+    motion, nx = ContinuousMotion(model, works=True, sizes=all_sizes), model.nx
+    motion.most = evaluations or motion.most
 
     def choose(x: Array, k: int) -> Array:
-        return finite_array("u", inputs(x.copy(), k * model.time_step), (nu,)) if callable(inputs) else inputs[k]
+        if callable(inputs):
+            return finite_array("u", inputs(x.copy(), k * model.time_step), (model.nu,))
+        return inputs[k]
 
-    us, states, contacts = np.empty((count, nu)), np.zeros((count + 1, nx + 3)), []
+    us, states, contacts = np.empty((count, model.nu)), np.zeros((count + 1, nx + 3)), []
     states[0, :nx] = x0
-    if tolerance > TOLERANCE and SimulatedMotion.supports(model):
-        motion: ContinuousMotion = SimulatedMotion(model, sizes)
-    else:  # the sizes of the work states are 1 J
-        motion = ContinuousMotion(model, works=True, sizes=np.append(np.broadcast_to(sizes, nx), np.ones(3)))
-    motion.most = evaluations or motion.most
     for k, (u, steps) in enumerate(motion.intervals(states[0], choose, count, tolerance)):
-        us[k], states[k + 1, : len(steps[-1].ahead)] = u, steps[-1].ahead
+        us[k], states[k + 1] = u, steps[-1].ahead
         contacts.append(deepest_contacts(motion, steps))
-    if isinstance(motion, SimulatedMotion):
-        states[:, nx:] = motion.work(states[:, :nx], us)
     return continuous_rollout(
         model, states[:, :nx], us, np.clip(us, -motion.limits, motion.limits), states[:, nx:], contacts
     )

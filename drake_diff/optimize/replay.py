@@ -32,7 +32,7 @@ from drake_diff.model.model import Model
 from drake_diff.model.parameters import ParameterVector, applied, select
 from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
-from drake_diff.motion.continuous import ContinuousMotion, SimulatedMotion, replayed
+from drake_diff.motion.continuous import ContinuousMotion, replayed
 from drake_diff.motion.intervals import DrakeSteps, intervals_of, roll
 from drake_diff.motion.policy import TVLQR
 from drake_diff.motion.rollout import CONTINUOUS, Policy, Rollout, rollout
@@ -355,8 +355,7 @@ class PlanFollower:
         us = [np.tile(u, (max(1, self.pieces), 1)) for u in self.us]
         with self.plan.applied_to(self.plant) as plant:
             steps = DrakeSteps(plant, self.plan.vector)
-            kind = SimulatedMotion if SimulatedMotion.supports(plant) else ContinuousMotion
-            states = partial(roll, steps) if self.pieces else kind(plant, sizes=self.plan.scale).states
+            states = partial(roll, steps) if self.pieces else ContinuousMotion(plant, sizes=self.plan.scale).states
             return [states(x, held_us)[-1] for x, held_us in zip(self.xs, us, strict=False)]
 
     def law(self, control: str = FEEDBACK, pieces: int = 1) -> Policy:

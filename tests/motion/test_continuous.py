@@ -12,7 +12,7 @@ from pydrake.multibody.plant import MultibodyPlant
 import drake_diff as dd
 from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.model.equations import EquationsOfMotion
-from drake_diff.motion.continuous import ContinuousMotion, SimulatedMotion, replayed
+from drake_diff.motion.continuous import replayed
 
 
 def test_kellys_cart_pole(load):
@@ -87,42 +87,3 @@ def test_an_oscillator_is_followed_in_any_unit(tmp_path, unit):
     sizes = unit * np.array([1.0, 10.0])
     motion = replayed(model, np.array([unit, 0.0]), np.zeros((20, model.nu)), 20, 1e-6, sizes=sizes)
     assert motion.xs[-1, 0] / unit == pytest.approx(np.cos(30), abs=1e-4)
-
-
-@pytest.mark.solve
-@each_row("name", ("cart_pole.urdf", "double_pendulum.urdf", "projectile.sdf", "quadrotor"))
-def test_drakes_simulator_moves_like_the_accurate_integration(load, name):
-    """States agree to 1e-3 of their ranges, and the works of inputs and damping to 1e-3 of the energy exchanged."""
-    engine = dd.model.BodyForce("engine", "body", point=[0.1, 0.0, 0.0], upper=30.0)
-    model = load("quadrotor.urdf", body_forces=[engine]) if name == "quadrotor" else load(name)
-    random, x0 = np.random.default_rng(0), model.default_state
-    us = 3.0 + random.standard_normal((40, model.nu))
-    accurate = replayed(model, x0, us, len(us))
-    sizes = np.maximum(np.ptp(accurate.xs, axis=0), 1e-2)
-    assert SimulatedMotion.supports(model)
-    fast = replayed(model, x0, us, len(us), 1e-6, sizes=sizes)
-    assert np.max(np.abs(fast.xs - accurate.xs) / sizes) < 1e-3
-    for flow in ("work", "dissipation", "kinetic_energy"):
-        assert np.max(np.abs(getattr(fast, flow) - getattr(accurate, flow))) < 1e-3 * accurate.energy_exchanged + 1e-9
-
-
-@pytest.mark.parametrize(("damping", "is_stiff"), [(0.1, False), (1e6, True)])
-def test_a_stiff_motion_is_integrated_without_drakes_simulator(tmp_path, monkeypatch, damping, is_stiff):
-    """The speed of a damped slide of 1 kg is g / b (1 - exp(-b t))."""
-    calls, plain = [], ContinuousMotion.intervals
-
-    def counted(self, *args):
-        calls.append(args)
-        return plain(self, *args)
-
-    monkeypatch.setattr(ContinuousMotion, "intervals", counted)
-    path = tmp_path / "slide.sdf"
-    path.write_text(
-        '<sdf version="1.7"><model name="m"><link name="b"/><joint name="j" type="prismatic"><parent>world</parent>'
-        f"<child>b</child><axis><xyz>0 0 -1</xyz><dynamics><damping>{damping}</damping></dynamics></axis></joint>"
-        "</model></sdf>"
-    )
-    model = dd.load_model(path, time_step=0.05)
-    end = SimulatedMotion(model).states(np.zeros(2), np.zeros((4, model.nu)))[-1]
-    assert end[1] == pytest.approx(9.81 / damping * (1 - np.exp(-damping * 0.2)), rel=1e-3)
-    assert bool(calls) == is_stiff
