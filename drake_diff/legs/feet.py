@@ -121,7 +121,7 @@ class Legs:
         shapes, fixed = _shapes(self.model), plant.GetBodiesWeldedTo(plant.world_body())
         ground = [geometry for body in fixed for geometry in shapes.get(int(body.index()), ())]
         if not ground:
-            raise InputError("the model", got="no ground", expected="one: ground=True")
+            raise InputError("the model", got="no ground", expected="a ground: load_model(..., ground=True)")
         least = min(proximity_property(inspector, shape, "friction") or 0.0 for shape in ground)
         coefficients = np.array([foot.friction for foot in self.feet])
         return np.asarray(2 * coefficients * least / np.maximum(coefficients + least, 1e-12))

@@ -137,6 +137,8 @@ def stand(model: Model) -> Standing:
         >>> round(float(robot.x0[robot.model.state_names.index("trunk_z")]), 3)
         0.329
     """
+    if not isinstance(model, Model):
+        raise InputError("legs.stand: model", got=repr(model)[:80], expected="a model")
     result = stand_softly(model)
     if isinstance(result, Refusal):
         raise InputError("legs.stand: model", got=str(result), expected="a robot on feet that its motors can hold")

@@ -14,6 +14,7 @@ from drake_diff.motion.rollout import STEPS, Rollout
 from drake_diff.optimize.goal_markers import colours_of, drawn_goals, meaning_of
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.optimize.program import Iterate, Iteration, Report
+from drake_diff.optimize.replay import OPEN_LOOP, judged_replay
 from drake_diff.optimize.solution import Solution, Status
 from drake_diff.pages.live import LivePage, live_page
 from drake_diff.pages.meshcat import stills_of
@@ -165,7 +166,9 @@ class LiveSearch:
 
 def _shown(solution: Solution) -> Rollout | None:
     """Return the motion that decides the verdict, else the open-loop motion, without starting the replays."""
-    judged = solution.judged_replay if "deciding_replays" in vars(solution) else None
+    known = vars(solution)
+    rows = known.get("replays", [r for r in known.get("deciding_replays", ()) if r.control == OPEN_LOOP])
+    judged = judged_replay(solution.plan, rows) if rows else None
     return solution.replay if judged is None or judged.motion is None else judged.motion
 
 

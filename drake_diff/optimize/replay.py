@@ -288,7 +288,7 @@ class FollowedPlant(NamedTuple):
     """A plant in which a plan is replayed: a function that moves it, and the model whose contact is like the plant's.
 
     The plant takes `pieces` steps for each step of the controller. `time_step` [s] is the model's by default. `wider`
-    is a factor on tolerances.
+    is a factor on tolerances. A replay in a plant of Drake's (`is_drake`) is known after the first call.
     """
 
     variant: str
@@ -297,6 +297,7 @@ class FollowedPlant(NamedTuple):
     pieces: int = 1
     time_step: float | None = None
     wider: float = 1.0
+    is_drake: bool = True
 
 
 class PlanFollower:
@@ -455,13 +456,15 @@ class PlanFollower:
     def replay(self, plant: FollowedPlant, control: str) -> Replay:
         """Return the replay of the plan in a plant under one controller, which may be known."""
         key = plant.variant, control
+        if not plant.is_drake:
+            return self._replay(plant, control)
         if key not in self.known:
             self.known[key] = self._replay(plant, control)
         return self.known[key]
 
     def _replay(self, plant: FollowedPlant, control: str) -> Replay:
         """Replay the plan in a plant under one controller."""
-        plan, (variant, model, move, pieces, time_step, wider) = self.plan, plant
+        plan, (variant, model, move, pieces, time_step, wider, _) = self.plan, plant
         every = pieces * self.parts
         try:
             motion, checks = move(control)

@@ -550,7 +550,10 @@ class Solution(PicklesItsFields, ShowsItsRepr):
     @property
     def judged_replay(self) -> Replay | None:
         """The replay that decides success: open loop if that holds, else under TVLQR, or None if both fail."""
-        return judged_replay(self.plan, self.replays) if self.problem.has_model else None
+        if not self.problem.has_model:
+            return None
+        open_loop = [r for r in self.deciding_replays if r.control == OPEN_LOOP]
+        return judged_replay(self.plan, open_loop) or judged_replay(self.plan, self.replays)
 
     @property
     def half_step_error(self) -> float:
@@ -561,7 +564,7 @@ class Solution(PicklesItsFields, ShowsItsRepr):
         if self.problem.motion != STEPS:
             return float("nan")
         half = f"in steps of {self.time_step / 2:.4g} s"
-        motions = [r.motion for r in self.replays if (r.variant, r.control) == (half, OPEN_LOOP)]
+        motions = [r.motion for r in self.deciding_replays if (r.variant, r.control) == (half, OPEN_LOOP)]
         if self.replay is None or not motions or motions[0] is None:
             return float("inf")
         return _largest(np.abs(motions[0].xs[-1] - self.xs[-1]))

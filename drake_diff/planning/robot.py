@@ -353,7 +353,7 @@ def steered(model: Model, q: Array) -> NDArray[np.bool_] | None:
         for _, v in map(model.places, joints(model.plant)):  # a rod between two balls also spins freely
             in_loops[v] = np.any(in_loops[v])
         chosen &= ~in_loops | np.any(model.actuation != 0, axis=1)
-    if model.nq != model.nv or model.nu < np.sum(chosen):
+    if model.nq != model.nv or not chosen.any() or model.nu < np.sum(chosen):
         return None
     # The forces along velocities in which only one of the chosen is not 0, and the others are as small as possible.
     size = np.linalg.svd((ways @ np.linalg.pinv(ways[chosen])).T @ model.actuation, compute_uv=False)

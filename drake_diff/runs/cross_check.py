@@ -138,7 +138,9 @@ def replays_in(follower: PlanFollower, engine: Engine) -> list[Replay]:
             return _Moved(np.asarray(h * np.arange(count + 1)), xs, us, _overlaps(set_model, xs)), checks
 
     variant = f"in {engine.name} {engine.version} in steps of {h:.4g} s"
-    return follower.replays(FollowedPlant(variant, follower.model, move, pieces, h, WIDER), sufficient=FEEDBACK)
+    return follower.replays(
+        FollowedPlant(variant, follower.model, move, pieces, h, WIDER, is_drake=False), sufficient=FEEDBACK
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -98,6 +98,18 @@ def test_the_share_to_hold_a_loop_counts_the_weight_of_all_its_bars(tmp_path):
     np.testing.assert_allclose(share, torque / 0.05, rtol=1e-9)  # the decomposition of the loop's Jacobian
 
 
+def test_a_truss_has_nothing_to_move(tmp_path):
+    """Two hinges whose bodies meet in a point form a triangle."""
+    bar = '<inertial pos="0.1 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>'
+    text = (
+        '<mujoco><worldbody><body name="a"><joint name="a" axis="0 1 0"/>'
+        f'{bar}</body><body name="c" pos="0.4 0 0"><joint name="c" axis="0 1 0"/>{bar}</body></worldbody>'
+        '<equality><connect body1="a" body2="c" anchor="0.2 0 0.1"/></equality>'
+        '<actuator><motor joint="a" ctrlrange="-5 5"/></actuator></mujoco>'
+    )
+    assert load_robot(written(tmp_path, text), 0).steered is None
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("goal", [{"driver": (0.3, 0.0, -0.25)}, {"finger": 0.5}, {"inner": 0.6, "shoulder": 0.5}])
 def test_a_servo_arm_with_a_loop_reaches_goals_here_and_in_mujoco(goal, tmp_path):
