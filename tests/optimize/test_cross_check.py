@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 import drake_diff as dd
 import drake_diff.runs.save as evidence
 from drake_diff.cli.main import app
+from drake_diff.engines.drake import DrakeEngine
 from drake_diff.engines.load import load_engine
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.optimize import replay
@@ -204,6 +205,23 @@ def test_a_simulator_that_is_not_installed_is_undecided(write_urdf, monkeypatch)
     (row,) = in_plant(cross_check(solution), "mujoco")
     assert not row.holds
     assert "it is not installed: this engine needs MuJoCo" in str(row)
+
+
+def test_another_simulator_of_the_same_name_is_simulated_again(load):
+    """The second one ends every step at the upright, so that the plan does not hold there."""
+    model = load("pendulum.urdf", time_step=0.02)
+    plan = dd.solve(
+        dd.Problem(model, x0=[0, 0], x_goal=[0.1, 0], num_steps=20, running_cost=lambda x, u: u[0] ** 2)
+    ).plan
+    follower = follower_of(plan)
+    model = model.at_time_step(follower.period)
+
+    class Stuck(DrakeEngine):
+        def step(self, x, u):
+            return np.array([np.pi, 0.0])
+
+    assert any(row.holds for row in replays_in(follower, DrakeEngine(model)))
+    assert not any(row.holds for row in replays_in(follower, Stuck(model)))
 
 
 def test_bad_input_is_refused(write_urdf):
