@@ -7,8 +7,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import Any
+from weakref import WeakValueDictionary
 
 from drake_diff.bridges.functions import Functions
 from drake_diff.bridges.plans import PlanFunction
@@ -24,6 +26,8 @@ except ImportError as error:
 
 def _call(function: Callable[..., Any], shapes: Any, *arguments: Any) -> Any:
     """Call a function of NumPy arrays, whose results have the `shapes`, for all entries of a batch at once."""
+    if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arguments)):
+        return jax.tree.map(jnp.asarray, function(*arguments))
     return jax.pure_callback(function, shapes, *arguments, vmap_method="broadcast_all")
 
 
@@ -93,5 +97,16 @@ def _loop(advance: Callable[[Any, Any], Any], x0: Any, count: int) -> tuple[Any,
     return jnp.moveaxis(jnp.concatenate([x0[None], ends]), 0, -2), jnp.moveaxis(us, 0, -2)
 
 
-_FUNCTIONS = Functions(_array, jnp.broadcast_to, _states, _loop, _plans)
+_KNOWN: WeakValueDictionary[tuple[Any, ...], PlanFunction] = WeakValueDictionary()
+
+
+def _known_plans(function: PlanFunction, *values: Any) -> Any:
+    """Return the arrays of a plan by the same function for equal arguments, since JAX never releases a function."""
+    key = (function.problem, function.names, function.certify, *sorted(function.options.items()))
+    with suppress(TypeError):  # an option that has no hash, such as an array
+        function = _KNOWN.setdefault(key, function)
+    return _plans(function, *values)
+
+
+_FUNCTIONS = Functions(_array, jnp.broadcast_to, _states, _loop, _known_plans)
 step, rollout, solve = _FUNCTIONS.step, _FUNCTIONS.rollout, _FUNCTIONS.solve

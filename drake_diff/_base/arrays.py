@@ -90,6 +90,8 @@ def broadcast_shapes(entries: Entries, shapes: Sequence[Shape]) -> list[Shape]:
     except ValueError as error:
         got, expected = f"leading dimensions {batches}", "dimensions that can be broadcast"
         raise InputError(", ".join(entries), got=got, expected=expected) from error
+    if 0 in batch:
+        raise InputError(", ".join(entries), got=f"a batch of {batch}", expected="at least one entry in a batch")
     return [(*batch, *end) for end in ends]
 
 

@@ -6,11 +6,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from drake_diff._base.arrays import Entries, broadcast_shapes, number_of_steps
+from drake_diff._base.arrays import Entries, broadcast_shapes, finite_array, number_of_steps
 from drake_diff.bridges.plans import PlanArrays, PlanFunction
 from drake_diff.bridges.rollouts import rollout_function
-from drake_diff.exceptions import InputError
+from drake_diff.exceptions import InputError, ShapeError
 from drake_diff.model.model import Model
+from drake_diff.motion.rollout import check_inputs
 from drake_diff.optimize.problem.problem import Problem
 
 
@@ -50,7 +51,7 @@ class Functions:
         """
         named = self._arrays(parameters)
         function = rollout_function(model, tuple(named), method, bool(certify))
-        u = self.array([] if u is None and model.nu == 0 else u)
+        u = self.array(finite_array("u", [], (model.nu,)).copy() if u is None else u)
         return self.states(function, True, *self._full(function.of_step, self.array(x), u, *named.values()))
 
     def rollout(
@@ -90,15 +91,19 @@ class Functions:
         named, x0 = self._arrays(parameters), self.array(x0)
         function = rollout_function(model, tuple(named), method, bool(certify))
         if policy is None:
-            us = self.array([[]] * number_of_steps(num_steps) if us is None and model.nu == 0 else us)
-            return self.states(function, False, *self._full(function.of_rollout, x0, us, *named.values())), us
+            us = self.array(check_inputs(model, None, num_steps).copy() if us is None else us)
+            full = self._full(function.of_rollout, x0, us, *named.values())
+            return self.states(function, False, *full), full[1]
         if us is not None:
             raise InputError("rollout", got="us and policy", expected="one of them")
         h = named.get("model.time_step", model.time_step)
 
         def advance(x: Any, k: Any) -> tuple[Any, Any]:
             u = self.array(policy(x, k * h))
-            return self.states(function, True, *self._full(function.of_step, x, u, *named.values())), u
+            full = self._full(function.of_step, x, u, *named.values())
+            if full[0].shape != x.shape:
+                raise ShapeError("policy", got=tuple(u.shape), expected=(*x.shape[:-1], model.nu))
+            return self.states(function, True, *full), full[1]
 
         start, *_ = self._full({"x0": (model.nx,), **function.parameters}, x0, *named.values())
         return self.loop(advance, start, number_of_steps(num_steps))
@@ -120,7 +125,7 @@ class Functions:
             The states `xs` (..., N+1, nx), the inputs `us` (..., N, nu), the `cost` (...) and the `horizon` (...) [s].
 
         Raises:
-            InputError, UnknownNameError, ShapeError: An argument is invalid.
+            InputError, UnknownNameError, ShapeError, NonFiniteError: An argument is invalid, such as NaN in "goal".
             GradientError: A problem was not solved, or its plan has no derivative.
         """
         named = self._arrays(parameters)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drake_diff._base.arrays import Array, Shape
+from drake_diff._base.arrays import Array, Shape, finite_array
 from drake_diff.exceptions import GradientError, GradientWarning, InputError
 from drake_diff.model.parameters import select
 from drake_diff.optimize.problem.problem import Problem
@@ -39,6 +39,8 @@ class PlanFunction:
 
     def __init__(self, problem: Problem, names: tuple[str, ...], options: Mapping[str, Any], certify: bool):
         self.problem, self.names, self.options, self.certify = problem, names, options, certify
+        if not names:
+            raise InputError("parameters", got="none", expected="at least one value")
         parameters = [name for name in names if name not in ENDS]
         vector = select(problem.model, parameters) if parameters else None
         if "goal" in names and problem.x_goal is None:
@@ -56,7 +58,9 @@ class PlanFunction:
     def plans(self, values: Sequence[Any]) -> tuple[Array, ...]:
         """Return the arrays of the plan for values (..., n) in the order of `names`, with equal leading dimensions."""
         rows, batch = self._rows(values)
-        solutions = [self._solution(row) for row in rows]
+        for row in rows:  # what the problem's costs read may differ from the last call
+            self._solutions.pop(_key(row), None)
+        solutions = [self._solution(*row) for row in enumerate(rows)]
         columns = zip(*((s.xs, s.us, s.cost, s.times[-1]) for s in solutions), strict=True)
         arrays = [np.array(column, dtype=float) for column in columns]
         return tuple(array.reshape(size) for array, size in zip(arrays, self.sizes(batch), strict=True))
@@ -66,9 +70,9 @@ class PlanFunction:
         rows, batch = self._rows(values)
         by_plans = [np.asarray(array).reshape(len(rows), -1) for array in by]
         gradients = [np.zeros((len(rows), *self.shapes[name])) for name in self.names]
-        for i, row in enumerate(rows):
+        for i, row in reversed([*enumerate(rows)]):  # the last solutions are remembered
             of_plan = [array[i] for array in by_plans]
-            for gradient, (name, value) in zip(gradients, self._gradient(row, of_plan).items(), strict=True):
+            for gradient, (name, value) in zip(gradients, self._gradient(i, row, of_plan).items(), strict=True):
                 gradient[i] = value.reshape(self.shapes[name])
         return tuple(g.reshape((*batch, *g.shape[1:])) for g in gradients)
 
@@ -81,32 +85,36 @@ class PlanFunction:
         flat = [a.reshape(count, *self.shapes[name]) for name, a in zip(self.names, arrays, strict=True)]
         return list(zip(*flat, strict=True)), batch
 
-    def _solution(self, row: tuple[Array, ...]) -> Solution:
-        """Return the solution for values; equal values have the same solution."""
-        key = b"".join(value.tobytes() for value in row)
+    def _solution(self, i: int, row: tuple[Array, ...]) -> Solution:
+        """Return the solution for values, those of problem `i`; equal values have the same solution."""
+        key = _key(row)
         if key not in self._solutions:
             given = dict(zip(self.names, row, strict=True))
             changes: dict[str, Any] = {}
             if "x0" in given:
                 changes["x0"] = given.pop("x0")
             if "goal" in given:
-                changes["x_goal"] = np.where(np.isnan(self.problem.x_goal), np.nan, given.pop("goal"))
+                free, goal = np.isnan(self.problem.x_goal), given.pop("goal")
+                finite_array("goal", np.where(free, 0.0, goal), goal.shape)  # NaN would free an entry
+                changes["x_goal"] = np.where(free, np.nan, goal)
             if given:
                 changes["parameters"] = self.problem.parameters.to_dict() | given
             solution = solve(replace(self.problem, **changes), **self.options)
             if not solution.success:
-                raise GradientError(f"the plan has no derivative: {solution.status.value}: {solution.message}")
+                why = f"{solution.status.value}: {solution.message}"
+                raise GradientError(f"problem {i} of the batch was not solved: {why}")
             if len(solution.us) != self.problem.num_steps:
                 counts = f"from {self.problem.num_steps} to {len(solution.us)} intervals"
                 raise GradientError(f"the mesh was refined {counts}: use more steps, or Options(refine=False)")
             self._solutions[key] = solution
             if len(self._solutions) > REMEMBERED:
                 self._solutions.popitem(last=False)
+        self._solutions.move_to_end(key)
         return self._solutions[key]
 
-    def _gradient(self, row: tuple[Array, ...], by_plan: list[Array]) -> dict[str, Array]:
+    def _gradient(self, i: int, row: tuple[Array, ...], by_plan: list[Array]) -> dict[str, Array]:
         """Return the gradients by each value; warn if the plan has no derivative, or one that is not certified."""
-        solution = self._solution(row)
+        solution = self._solution(i, row)
         parameters = tuple(name for name in self.names if name not in ENDS)
         gradients = {}
         for by in [name for name in self.names if name in ENDS] + [parameters] * bool(parameters):
@@ -124,6 +132,10 @@ class PlanFunction:
                 sizes = [math.prod(self.shapes[name]) for name in parameters]
                 gradients |= dict(zip(parameters, np.split(gradient, np.cumsum(sizes)[:-1]), strict=True))
         return {name: gradients[name] for name in self.names}
+
+
+def _key(row: tuple[Array, ...]) -> bytes:
+    return b"".join(value.tobytes() for value in row)
 
 
 def _pulled(s: Sensitivity, by_plan: list[Array]) -> Array:

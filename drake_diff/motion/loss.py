@@ -4,7 +4,6 @@ import inspect
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -104,7 +103,9 @@ def differentiate_loss(loss: Loss, xs: Array, us: Array) -> tuple[float, Array, 
 
 def _by_jax(loss: Loss, arguments: tuple[Array, ...], xs: Array, us: Array) -> tuple[float, Array, Array, str]:
     """Differentiate a loss that is written in JAX."""
-    value, gradients = carrying("loss", lambda: _jax_gradient(loss, len(arguments))(*arguments))
+    jax: Any = sys.modules["jax"]
+    # It is not compiled, since a compiled loss would keep the globals and attributes that it read at first.
+    value, gradients = carrying("loss", jax.value_and_grad(loss, argnums=tuple(range(len(arguments)))), *arguments)
     if value.dtype != float:
         expected = 'double precision: jax.config.update("jax_enable_x64", True)'
         raise InputError("loss", got=f"a JAX array of {value.dtype}", expected=expected)
@@ -114,13 +115,6 @@ def _by_jax(loss: Loss, arguments: tuple[Array, ...], xs: Array, us: Array) -> t
     else:
         by_xs[:], by_us[:] = gradients
     return _finite(float(value), by_xs, by_us, JAX)
-
-
-@lru_cache(maxsize=32)
-def _jax_gradient(loss: Loss, count: int) -> Callable[..., Any]:
-    """Return the compiled value and gradients of a loss, so that JAX traces it once for each shape."""
-    jax: Any = sys.modules["jax"]
-    return jax.jit(jax.value_and_grad(loss, argnums=tuple(range(count))))
 
 
 def _finite(value: float, by_xs: Array, by_us: Array, method: str) -> tuple[float, Array, Array, str]:

@@ -243,10 +243,7 @@ def batch_of(model: Model, x0: Any, us: Any) -> tuple[int, ...]:
         return ()
     if all(len(shape) <= i + 1 for i, shape in enumerate(shapes)):
         return ()
-    batch = broadcast_shapes({"x0": (model.nx,), "us": ("N", model.nu)}, shapes)[0][:-1]
-    if 0 in batch:
-        raise InputError("x0, us", got=f"a batch of {batch} rollouts", expected="at least one rollout")
-    return batch
+    return broadcast_shapes({"x0": (model.nx,), "us": ("N", model.nu)}, shapes)[0][:-1]
 
 
 def rows_of_batch(model: Model, batch: tuple[int, ...], x0: Any, us: Any) -> Iterator[tuple[Array, Array | None]]:

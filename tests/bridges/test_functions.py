@@ -1,5 +1,6 @@
 """Steps, rollouts and plans as functions of PyTorch and JAX have the derivatives of drake_diff."""
 
+import gc
 import sys
 import warnings
 from functools import partial
@@ -11,8 +12,15 @@ from helpers.robots import example_robot, state_in_range
 from helpers.table import slow_after
 
 import drake_diff as dd
-from drake_diff.bridges import rollouts
-from drake_diff.exceptions import GradientError, GradientWarning, InputError, MissingDependencyError, ShapeError
+from drake_diff.bridges import plans, rollouts
+from drake_diff.exceptions import (
+    GradientError,
+    GradientWarning,
+    InputError,
+    MissingDependencyError,
+    NonFiniteError,
+    ShapeError,
+)
 from drake_diff.motion import ParametricPolicy
 
 pytestmark = pytest.mark.solve
@@ -209,9 +217,50 @@ def test_a_plan_at_a_corner_warns_and_an_unsolved_problem_is_refused(library):
 
     with pytest.warns(GradientWarning, match="valid on both sides"):
         library.gradients(cost, np.array([1.0, 0.0]))
-    with pytest.raises(Exception, match="the plan has no derivative") as caught:
-        library.gradients(cost, np.array([100.0, 0.0]))
+    with pytest.raises(Exception, match=r"problem 1 of the batch was not solved: \w+: ") as caught:
+        library.gradients(lambda goals: cost(goals).sum(), np.array([[0.9, 0.0], [100.0, 0.0]]))
     assert library.name == "jax" or isinstance(caught.value, GradientError)
+
+
+@pytest.mark.parametrize("entry", [np.nan, np.inf])
+def test_a_goal_that_is_not_finite_is_refused_where_the_problem_has_a_goal(library, load, entry):
+    problem = reach(load, x_goal=[0.5, np.nan])
+    assert library.functions.solve(problem, {"goal": [0.5, entry]}).xs.shape == (21, 2)
+    with pytest.raises(NonFiniteError, match=r"goal\[0\]: expected a finite number"):
+        library.functions.solve(problem, {"goal": [entry, 0.0]})
+
+
+def test_a_batch_of_more_plans_than_are_remembered_is_solved_again_only_where_forgotten(library, load, monkeypatch):
+    count, real = [], plans.solve
+    monkeypatch.setattr(plans, "REMEMBERED", 2)
+    monkeypatch.setattr(plans, "solve", lambda *a, **k: count.append(1) or real(*a, **k))
+    x0 = np.array([[0.1, 0.0], [0.2, 0.0], [0.3, 0.0]])
+    _, (found,) = library.gradients(lambda x0: library.functions.solve(reach(load), {"x0": x0}).cost.sum(), x0)
+    assert len(count) == 3 + 1
+    alone = [dd.sensitivity(dd.solve(reach(load, x0=x)), "x0", certified=False).cost for x in x0]
+    assert_same([found], [np.array(alone)])
+
+
+def test_a_second_plan_uses_the_cost_as_it_is_then(library, load):
+    weights = [1.0]
+    problem = reach(load, running_cost=lambda x, u: weights[0] * u[0] ** 2)
+    first = float(library.functions.solve(problem, {"x0": [0.1, 0.0]}).cost)
+    weights[0] = 2.0
+    second = float(library.functions.solve(problem, {"x0": [0.1, 0.0]}).cost)
+    assert second == pytest.approx(2 * first, rel=1e-6)  # the solver's tolerance
+
+
+@pytest.mark.parametrize("options", [{}, {"initial_guess": (np.zeros((21, 2)), np.zeros((20, 1)))}])
+def test_repeated_plans_do_not_stay_in_the_caches_of_the_library(library, load, options):
+    problem = reach(load)
+    for end in (0.5, 0.6):
+        library.functions.solve(problem, {"goal": [end, 0.0]}, **options)
+    if library.name == "jax" and not options:
+        for end in (0.5, 0.6):
+            library.jax.vmap(lambda goal: library.functions.solve(problem, {"goal": goal}).cost)(np.array([[end, 0.0]]))
+    gc.collect()
+    functions = [f for f in gc.get_objects() if type(f) is plans.PlanFunction and f.problem is problem]
+    assert len(functions) <= (library.name == "jax" and not options)
 
 
 def test_a_plan_whose_mesh_was_refined_is_refused(library, load):
@@ -244,6 +293,43 @@ def test_a_plan_whose_mesh_was_refined_is_refused(library, load):
 def test_shapes_that_do_not_fit_are_refused_before_a_step(library, load, x0, us, mass, error, words):
     with pytest.raises(error, match=words):
         library.functions.rollout(load("cart_pole.urdf"), x0, us, parameters={"pole.mass": mass})
+
+
+def test_what_is_left_out_is_refused_by_name(library, load):
+    model, start = load("cart_pole.urdf"), np.zeros(4)
+    for call, words in (
+        (partial(library.functions.solve, reach(load), {}), "parameters: expected at least one value"),
+        (partial(library.functions.rollout, model, start), r"us: expected shape \(N, 1\)"),
+        (partial(library.functions.step, model, start), r"u: expected shape \(1,\)"),
+        (
+            partial(
+                library.functions.rollout,
+                model,
+                np.zeros((0, 4)),
+                np.zeros((5, 1)),
+                parameters={"pole.mass": np.zeros(0)},
+            ),
+            "at least one entry in a batch",
+        ),
+    ):
+        with pytest.raises(InputError, match=words):
+            call()
+
+
+def test_the_inputs_are_returned_with_the_leading_dimensions_of_the_states(library, load):
+    model, x0 = load("cart_pole.urdf"), np.zeros((4, 4))
+    policy = lambda x, t: library.array([0.3])  # noqa: E731
+    for given in ({"us": np.zeros((3, 1))}, {"policy": policy, "num_steps": 3}):
+        xs, us = library.functions.rollout(model, x0, **given)
+        assert (tuple(xs.shape), tuple(us.shape)) == ((4, 4, 4), (4, 3, 1))
+
+
+@pytest.mark.parametrize("shape", [(2,), (3, 1), ()])
+def test_a_policy_whose_input_has_another_shape_is_refused(library, load, shape):
+    with pytest.raises(ShapeError):
+        library.functions.rollout(
+            load("cart_pole.urdf"), np.zeros(4), policy=lambda x, t: library.array(np.ones(shape)), num_steps=3
+        )
 
 
 def test_inputs_and_a_policy_are_refused_together(library, load):

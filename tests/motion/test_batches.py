@@ -87,7 +87,7 @@ def test_a_batch_in_continuous_time_names_the_undefined_columns_of_all(load):
         (np.zeros((2, 3)), np.zeros((5, 1)), ShapeError, r"x0: expected shape \(..., 4\)"),
         (np.zeros((2, 4)), np.zeros((2, 5, 2)), ShapeError, r"us: expected shape \(..., N, 1\)"),
         (np.zeros((2, 4)), np.zeros((3, 5, 1)), InputError, r"got leading dimensions \[\(2,\), \(3,\)\]"),
-        (np.zeros((0, 4)), np.zeros((5, 1)), InputError, "at least one rollout"),
+        (np.zeros((0, 4)), np.zeros((5, 1)), InputError, "at least one entry"),
         (np.full((2, 4), np.nan), np.zeros((5, 1)), NonFiniteError, r"x0\[0, 0\]"),
     ],
 )
