@@ -148,3 +148,20 @@ def test_commanded_positions_need_a_model_with_servos(load, tmp_path):
     path.write_text("t,q_hinge,q_desired_hinge\n0,0.1,0.2\n0.005,0.11,0.25\n")
     with pytest.raises(InputError, match="--gains"):
         read_recording(path, load("pendulum.urdf"), gaps=True)
+
+
+@pytest.fixture
+def swing(load):
+    """Return a pendulum without a servo, and a recording of its swing with damping 0.2 under a torque of 5 mN m."""
+    model = load("pendulum.urdf", time_step=0.001)
+    us = 0.005 * np.sin(0.01 * np.arange(1500))[:, None]
+    xs = dd.rollout(model, [1.0, 0.0], us, parameters={"hinge.damping": 0.2}).xs[::10]
+    xs = xs + 0.02 * np.random.default_rng(0).standard_normal(xs.shape)
+    return model, dd.Recording("lab", "1", 0.01 * np.arange(151), xs, us[::10])
+
+
+def test_a_small_torque_does_not_bound_the_damping(swing):
+    fit = dd.identify(*swing, ["hinge.damping"])
+    assert fit.converged
+    assert fit.explained
+    assert_known(fit, "hinge.damping", 0.2, 0.1)
