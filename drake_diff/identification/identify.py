@@ -105,10 +105,10 @@ def identify(
         max_iterations: The maximum number of Gauss-Newton steps of the fit; through impacts, the limit is 32.
         priors: Prior knowledge of parameters: mean and standard deviation, by name. A prior counts as one more
             measurement. Without a prior, the file's value matters only where the data are uninformative.
-        bounds: Lower and upper bound of parameters, by name. For commanded positions, the defaults are: Coulomb friction up
-            to the largest effort E, damping up to E / (0.1 rad/s), rotor inertia up to 1000 times the inertia that its
-            joint moves in the default state, gains a tenth to ten times the model's, delays up to 0.2 s. E is the
-            effort limit, or less if the servo errors are smaller; the model's values are always within.
+        bounds: Lower and upper bound of parameters, by name. For commanded positions, the defaults are: Coulomb
+            friction up to the largest effort E, damping up to E / (0.1 rad/s), rotor inertia up to 1000 times the
+            inertia that its joint moves in the default state, gains a tenth to ten times the model's, delays up to
+            0.2 s. E is the effort limit, or less if the servo errors are smaller. The model's values are within.
         sensors: The mounts of recorded sensors that are not at the frame of a body: by label, the body and x, y, z
             [m], or x, y, z [m], roll, pitch, yaw [rad], in the body's frame.
         time_limit: Time after which the fit ends, in seconds; the held-out samples are predicted afterwards.
@@ -287,8 +287,10 @@ class Problem:
             z, starts, fit = solved.z, solved.starts, self.fit(with_exact_derivatives(fit.law), pieces, fit.noise)
         while True:
             fit, solved = self.weighted(fit, z, starts, most)
-            if self.watch.is_late or self.follows(fit, solved.z, solved.starts):
+            if self.follows(fit, solved.z, solved.starts):
                 return fit, solved
+            if self.watch.is_late:
+                return fit, replace(solved, converged=False, why=self.watch.reached)
             z, starts = solved.z, solved.starts
             fit = self.shortened(fit, pieces, fit.noise)
 
@@ -367,7 +369,7 @@ class Problem:
         for _ in range(ROUNDS):
             solved = fit.solve(z, starts, most)
             z, starts = solved.z, solved.starts
-            if self.watch.is_late or not self.follows(fit, z, starts):
+            if not self.follows(fit, z, starts):
                 return fit, solved
             noise = np.where(np.isfinite(self.stated), self.stated, np.fmax(noise_of(fit, solved), 1e-3 * self.scatter))
             seen = np.isfinite(noise)
@@ -375,6 +377,8 @@ class Problem:
                 SERVOS.same_noise if fit.has_servos else SAME_NOISE
             ):
                 return fit, solved
+            if self.watch.is_late:
+                return fit, replace(solved, converged=False, why=self.watch.reached)
             fit = self.fit(fit.law, fit.segments.pieces, noise)
         return fit, fit.solve(z, starts, most)
 

@@ -8,6 +8,7 @@ from scipy.integrate import solve_ivp
 import drake_diff as dd
 from drake_diff.comparison import read_recording
 from drake_diff.exceptions import InputError
+from drake_diff.identification.fit import Fit
 from drake_diff.identification.motion import servo_motion, with_exact_derivatives
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import choose_unknowns
@@ -165,3 +166,19 @@ def test_a_small_torque_does_not_bound_the_damping(swing):
     assert fit.converged
     assert fit.explained
     assert_known(fit, "hinge.damping", 0.2, 0.1)
+
+
+def test_a_fit_that_ends_before_its_weights_match_the_noise_has_not_converged(swing, monkeypatch):
+    solve, ended = Fit.solve, []
+
+    def solve_once(self, *arguments):
+        ended.append(solve(self, *arguments))
+        return ended[-1]
+
+    monkeypatch.setattr(Fit, "solve", solve_once)
+    monkeypatch.setattr("drake_diff.identification.fit.now", lambda: np.inf if ended else 0.0)
+    fit = dd.identify(*swing, ["hinge.damping"], time_limit=1e6)
+    assert ended[0].converged
+    assert not fit.converged
+    assert not fit.explained
+    assert "limit of 1e+06 s" in fit.reason
