@@ -281,8 +281,9 @@ def choose_unknowns(
             raise InputError(name, got=why, expected="a quantity that can be estimated")
         usual = (physical or {}).get(name, Physical(lower, np.inf, 0.0))
         start = np.array(value, dtype=float)
+        given = (bounds or {}).get(name)
         usual_bounds = usual.lower, max(usual.upper, *start)
-        low, high = _bounds_of(name, (bounds or {}).get(name, usual_bounds), lower)
+        low, high = usual_bounds if given is None else _bounds_of(name, given, lower)
         prior = _prior_of(name, priors[name], len(start)) if priors and name in priors else None
         shifts = name.endswith(f".{DELAY}")
         size = _size(model, name, value) or usual.size
@@ -339,8 +340,6 @@ def physical_ranges(model: Model, tree: Tree, largest: Array) -> dict[str, Physi
 
 def _bounds_of(name: str, given: Any, lower: float) -> tuple[float, float]:
     """Return the lower and the upper bound: the given ones, limited to possible values."""
-    if given == (lower, np.inf):
-        return given
     subject = f"bounds of {name}"
     try:
         low, high = (float(value) for value in given)

@@ -182,3 +182,8 @@ def test_a_fit_that_ends_before_its_weights_match_the_noise_has_not_converged(sw
     assert not fit.converged
     assert not fit.explained
     assert "limit of 1e+06 s" in fit.reason
+
+
+def test_bounds_may_be_an_array(swing):
+    fit = dd.identify(*swing, ["hinge.damping"], bounds={"hinge.damping": np.array([0.0, 1.0])})
+    assert_known(fit, "hinge.damping", 0.2, 0.1)
