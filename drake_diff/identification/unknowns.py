@@ -329,7 +329,7 @@ def physical_ranges(model: Model, tree: Tree, largest: Array) -> dict[str, Physi
         inertia, kd = inertias[v] / ratio, numbers.kd[tree.servo[v]]
         first = max(RANGES.settling * kd / ratio - inertia, 0.0)
         kinds[f"{label}.rotor_inertia"] = Physical(
-            0.0, max(RANGES.most_rotor * inertia, 10 * first), max(10 * inertia, first), first
+            0.0, max(RANGES.most_rotor * inertia, 10 * first) or np.inf, max(10 * inertia, first), first
         )
     for i, label in enumerate(model.input_names):
         for name in GAINS if tree.commanded[i] else ():

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from helpers.estimates import assert_known
+from helpers.models import MODELS
 from scipy.integrate import solve_ivp
 
 import drake_diff as dd
@@ -11,7 +12,7 @@ from drake_diff.exceptions import InputError
 from drake_diff.identification.fit import Fit
 from drake_diff.identification.motion import servo_motion, with_exact_derivatives
 from drake_diff.identification.tree import tree_for_identification
-from drake_diff.identification.unknowns import choose_unknowns
+from drake_diff.identification.unknowns import choose_unknowns, physical_ranges
 
 pytestmark = pytest.mark.solve
 
@@ -187,3 +188,11 @@ def test_a_fit_that_ends_before_its_weights_match_the_noise_has_not_converged(sw
 def test_bounds_may_be_an_array(swing):
     fit = dd.identify(*swing, ["hinge.damping"], bounds={"hinge.damping": np.array([0.0, 1.0])})
     assert_known(fit, "hinge.damping", 0.2, 0.1)
+
+
+def test_a_rotor_that_moves_no_inertia_has_no_upper_bound(tmp_path):
+    path = tmp_path / "massless.urdf"
+    path.write_text((MODELS / "pendulum.urdf").read_text().replace('<origin xyz="0 0 -0.5"/>', "", 1))
+    model = dd.load_model(path, time_step=0.001, inputs="position", gains=(40.0, 0.0))
+    ranges = physical_ranges(model, tree_for_identification(model, servos=True), np.ones(1))
+    assert ranges["motor.rotor_inertia"].upper == np.inf
