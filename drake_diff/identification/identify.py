@@ -273,8 +273,12 @@ class Problem:
         cut = []
         for piece in pieces:
             count = max(1, round((piece.times[-1] - piece.times[0]) / SERVOS.window))
-            ends = np.searchsorted(piece.times, np.linspace(piece.times[0], piece.times[-1], count + 1) - 1e-9)
-            cut += [piece.part(int(a), int(b)) for a, b in pairwise(ends)]
+            ends = [0]
+            for end in np.searchsorted(piece.times, np.linspace(piece.times[0], piece.times[-1], count + 1) - 1e-9):
+                if end - ends[-1] >= SERVOS.least:
+                    ends.append(int(end))
+            ends[max(len(ends) - 1, 1) :] = [len(piece.times) - 1]
+            cut += [piece.part(a, b) for a, b in pairwise(ends)]
         return cut
 
     def solve(self, law: Law, most: int) -> tuple[Fit, Solved]:

@@ -10,7 +10,10 @@ import drake_diff as dd
 from drake_diff.comparison import read_recording
 from drake_diff.exceptions import InputError
 from drake_diff.identification.fit import Fit
+from drake_diff.identification.identify import Problem
+from drake_diff.identification.judge import colour_of
 from drake_diff.identification.motion import servo_motion, with_exact_derivatives
+from drake_diff.identification.recordings import Excerpt
 from drake_diff.identification.tree import tree_for_identification
 from drake_diff.identification.unknowns import choose_unknowns, physical_ranges
 
@@ -196,3 +199,14 @@ def test_a_rotor_that_moves_no_inertia_has_no_upper_bound(tmp_path):
     model = dd.load_model(path, time_step=0.001, inputs="position", gains=(40.0, 0.0))
     ranges = physical_ranges(model, tree_for_identification(model, servos=True), np.ones(1))
     assert ranges["motor.rotor_inertia"].upper == np.inf
+
+
+def test_windows_of_slow_samples_are_long_enough_for_the_test_of_their_residuals(pendulum):
+    tree, times = tree_for_identification(pendulum, servos=True), 0.05 * np.arange(90)
+    unknowns = choose_unknowns(pendulum, tree, ["hinge.damping"])
+    piece = Excerpt("lab", times, np.zeros((90, 2)), np.zeros((89, 1)), False)
+    problem = Problem(pendulum, unknowns, [piece], np.full(2, np.nan), np.ones(2))
+    windows = problem.windows(servo_motion(pendulum, tree, unknowns), [piece])
+    assert [len(window.times) for window in windows] == [21, 21, 21, 30]
+    short = np.random.default_rng(0).standard_normal((60, 6, 1))
+    assert colour_of(short, ["hinge_q"])[1] == 1.0
