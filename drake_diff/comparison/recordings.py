@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, array_with_gaps, finite_array, frozen
 from drake_diff._base.files import MOST_TEXT, arrays_of, json_of, make_folder, plain_file, read_plain, write_whole
@@ -513,7 +514,7 @@ def _number(subject: str, text: str) -> float:
     return value if text.strip() else math.nan
 
 
-def _other_names(model: Model) -> dict[str, str]:
+def _other_names(model: Model, commanded: NDArray[np.bool_]) -> dict[str, str]:
     """Return other names of columns: QUANTITY.JOINT, QUANTITY_JOINT, JOINT.QUANTITY or JOINT_QUANTITY, and t.
 
     A quantity and a number, as q0, q_0 or q[0], count the joints in the order of the model.
@@ -526,7 +527,7 @@ def _other_names(model: Model) -> dict[str, str]:
         columns = {model.state_names[q.start]: POSITION, model.state_names[model.nq + v.start]: VELOCITY}
         for i in np.flatnonzero(model.inputs.actuator >= 0):
             if motors[model.inputs.actuator[i]].joint().index() == joint.index():
-                columns[model.input_names[i]] = COMMAND if model.inputs.commanded[i] else EFFORT
+                columns[model.input_names[i]] = COMMAND if commanded[i] else EFFORT
         for column, quantities in columns.items():
             for name in quantities:
                 for text in dict.fromkeys((label, label.removesuffix("_joint"))):
@@ -540,10 +541,10 @@ def _other_names(model: Model) -> dict[str, str]:
 
 def _columns(path: Path, model: Model, header: list[str], wanted: Sequence[str], spared: Sequence[str]) -> list[int]:
     """Return the index of each wanted column, or -1 for a column in `spared` that is missing."""
-    others = _other_names(model)
+    others, commands = _other_names(model, model.inputs.commanded), _other_names(model, np.ones(model.nu, dtype=bool))
     names = [text.strip() if text.strip() in wanted else others.get(text.strip(), text.strip()) for text in header]
     for given, column in zip(header, names, strict=True):
-        if column not in wanted and any(name in column for name in COMMAND) and not np.any(model.inputs.commanded):
+        if column not in wanted and column in commands:
             expected = 'a model with inputs="position" and gains (--gains KP,KD)'
             raise InputError(f"{path} line 1, column {given[:80]}", got="a commanded position", expected=expected)
         if column not in wanted:

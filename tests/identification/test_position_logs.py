@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 import drake_diff as dd
 from drake_diff.comparison import read_recording
-from drake_diff.exceptions import InputError
+from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.identification.fit import Fit
 from drake_diff.identification.identify import Problem
 from drake_diff.identification.judge import colour_of
@@ -210,3 +210,10 @@ def test_windows_of_slow_samples_are_long_enough_for_the_test_of_their_residuals
     assert [len(window.times) for window in windows] == [21, 21, 21, 30]
     short = np.random.default_rng(0).standard_normal((60, 6, 1))
     assert colour_of(short, ["hinge_q"])[1] == 1.0
+
+
+def test_a_column_that_only_contains_the_word_of_a_command_is_unknown(load, tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,q_hinge,target_velocity_hinge\n0,0.1,0.2\n0.005,0.11,0.25\n")
+    with pytest.raises(UnknownNameError, match="target_velocity_hinge"):
+        read_recording(path, load("pendulum.urdf"), gaps=True)
