@@ -215,6 +215,7 @@ NORM_TOLERANCE = 1e-3  # of a quaternion's norm: allows float32 and five printed
 POSITION, VELOCITY = ("position", "pos", "q"), ("velocity", "vel", "v", "dq", "qd")
 COMMAND = ("q_desired", "q_des", "desired_position", "position_command", "command", "target")
 EFFORT = ("effort", "torque", "tau")
+NUMBERED = ("{}{}", "{}_{}", "{}[{}]")  # a quantity and the number of a joint
 CLOCK_TOLERANCE = 1e-3  # relative to a time step: allows printed times and nanoseconds
 
 
@@ -514,12 +515,12 @@ def _number(subject: str, text: str) -> float:
     return value if text.strip() else math.nan
 
 
-def _other_names(model: Model, commanded: NDArray[np.bool_]) -> dict[str, str]:
-    """Return other names of columns: QUANTITY.JOINT, QUANTITY_JOINT, JOINT.QUANTITY or JOINT_QUANTITY, and t.
+def _other_names(model: Model, commanded: NDArray[np.bool_], header: Sequence[str]) -> dict[str, list[str]]:
+    """Return the columns for which other names may stand: QUANTITY.JOINT, JOINT_QUANTITY and the like, and t.
 
-    A quantity and a number, as q0, q_0 or q[0], count the joints in the order of the model.
+    A quantity and a number, as q0, q_0 or q[0], count the joints in the order of the model, if the header has a 0.
     """
-    names, motors, index = {"t": "time"}, actuators(model.plant), 0
+    names, shorter, motors, index = {"t": ["time"]}, dict[str, list[str]](), actuators(model.plant), 0
     for label, joint in labelled(joints(model.plant)).items():
         q, v = model.places(joint)
         if len(q) != 1 or len(v) != 1:
@@ -530,20 +531,24 @@ def _other_names(model: Model, commanded: NDArray[np.bool_]) -> dict[str, str]:
                 columns[model.input_names[i]] = COMMAND if commanded[i] else EFFORT
         for column, quantities in columns.items():
             for name in quantities:
-                for text in dict.fromkeys((label, label.removesuffix("_joint"))):
-                    names |= dict.fromkeys(
-                        (f"{name}.{text}", f"{name}_{text}", f"{text}.{name}", f"{text}_{name}"), column
-                    )
-                names |= dict.fromkeys((f"{name}{index}", f"{name}_{index}", f"{name}[{index}]"), column)
+                for table, text in ((names, label), (shorter, label.removesuffix("_joint"))):
+                    for other in (f"{name}.{text}", f"{name}_{text}", f"{text}.{name}", f"{text}_{name}"):
+                        table.setdefault(other, []).append(column)
+                for form in (form for form in NUMBERED if form.format(name, 0) in header):
+                    names.setdefault(form.format(name, index), []).append(column)
         index += 1
-    return names
+    return shorter | names
 
 
 def _columns(path: Path, model: Model, header: list[str], wanted: Sequence[str], spared: Sequence[str]) -> list[int]:
     """Return the index of each wanted column, or -1 for a column in `spared` that is missing."""
-    others, commands = _other_names(model, model.inputs.commanded), _other_names(model, np.ones(model.nu, dtype=bool))
-    names = [text.strip() if text.strip() in wanted else others.get(text.strip(), text.strip()) for text in header]
-    for given, column in zip(header, names, strict=True):
+    texts, every = [text.strip() for text in header], np.ones(model.nu, dtype=bool)
+    others, commands = _other_names(model, model.inputs.commanded, texts), _other_names(model, every, texts)
+    choices = [[text] if text in wanted else others.get(text, [text]) for text in texts]
+    names = [columns[0] for columns in choices]
+    for given, column, columns in zip(header, names, choices, strict=True):
+        if len(set(columns)) > 1:
+            raise InputError(f"{path} line 1, column {given[:80]}", got=" or ".join(columns), expected="one of them")
         if column not in wanted and column in commands:
             expected = 'a model with inputs="position" and gains (--gains KP,KD)'
             raise InputError(f"{path} line 1, column {given[:80]}", got="a commanded position", expected=expected)

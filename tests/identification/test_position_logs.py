@@ -217,3 +217,30 @@ def test_a_column_that_only_contains_the_word_of_a_command_is_unknown(load, tmp_
     path.write_text("t,q_hinge,target_velocity_hinge\n0,0.1,0.2\n0.005,0.11,0.25\n")
     with pytest.raises(UnknownNameError, match="target_velocity_hinge"):
         read_recording(path, load("pendulum.urdf"), gaps=True)
+
+
+TWO_JOINTS = """<robot name="arm"><link name="base"/>{}</robot>"""
+JOINT = """<link name="{0}_link"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>
+</inertial></link><joint name="{0}" type="continuous"><parent link="base"/><child link="{0}_link"/><axis xyz="0 1 0"/>
+</joint>"""
+
+
+def two_joints(tmp_path, *names):
+    path = tmp_path / "arm.urdf"
+    path.write_text(TWO_JOINTS.format("".join(JOINT.format(name) for name in names)))
+    return dd.load_model(path, base="weld", time_step=0.01)
+
+
+@pytest.mark.parametrize(("joints", "column"), [(("position", "pos"), "pos_position"), (("hip", "knee"), "position_1")])
+def test_a_column_whose_name_fits_two_joints_or_counts_from_1_is_refused(tmp_path, joints, column):
+    path = tmp_path / "log.csv"
+    path.write_text(f"t,{column}\n0,0.1\n0.01,0.2\n")
+    with pytest.raises((InputError, UnknownNameError), match=column):
+        read_recording(path, two_joints(tmp_path, *joints), gaps=True)
+
+
+def test_the_whole_name_of_a_joint_comes_before_a_shortened_one(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,position_hip\n0,0.1\n0.01,0.2\n")
+    recording = read_recording(path, two_joints(tmp_path, "hip", "hip_joint"), gaps=True)
+    np.testing.assert_array_equal(recording.xs[0, :2], [0.1, np.nan])
