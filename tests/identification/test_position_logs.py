@@ -12,6 +12,7 @@ from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.identification.fit import Fit
 from drake_diff.identification.identify import Problem
 from drake_diff.identification.judge import colour_of
+from drake_diff.identification.messages import identification_sentence
 from drake_diff.identification.motion import servo_motion, with_exact_derivatives
 from drake_diff.identification.recordings import Excerpt
 from drake_diff.identification.tree import tree_for_identification
@@ -244,3 +245,11 @@ def test_the_whole_name_of_a_joint_comes_before_a_shortened_one(tmp_path):
     path.write_text("t,position_hip\n0,0.1\n0.01,0.2\n")
     recording = read_recording(path, two_joints(tmp_path, "hip", "hip_joint"), gaps=True)
     np.testing.assert_array_equal(recording.xs[0, :2], [0.1, np.nan])
+
+
+def test_the_sentence_about_the_error_is_in_the_unit_of_positions(pendulum):
+    """The rms of 3 and 4 is 3.54, and that of 6 and 8 is 7.07."""
+    unknowns = choose_unknowns(pendulum, None, ["hinge.damping"])
+    sizes = {"a_q": (3.0, 6.0, "degrees"), "b_q": (4.0, 8.0, "degrees"), "a_v": (90.0, 50.0, "degrees/s")}
+    sentence = identification_sentence(unknowns, np.ones(1), np.array([[0.9, 1.1]]), (), (5.0, 4.0), sizes, "bad")
+    assert "the rms error rises from 3.54 to 7.07 degrees, at most 8 in b_q" in sentence
