@@ -215,6 +215,7 @@ NORM_TOLERANCE = 1e-3  # of a quaternion's norm: allows float32 and five printed
 POSITION, VELOCITY = ("position", "pos", "q"), ("velocity", "vel", "v", "dq", "qd")
 COMMAND = ("q_desired", "q_des", "desired_position", "position_command", "command", "target")
 EFFORT = ("effort", "torque", "tau")
+UNUSED = " effort of "  # of a joint with a servo: no model reads it; with a space, as no name in a file begins with one
 NUMBERED = ("{}{}", "{}_{}", "{}[{}]")  # a quantity and the number of a joint
 CLOCK_TOLERANCE = 1e-3  # relative to a time step: allows printed times and nanoseconds
 
@@ -529,6 +530,7 @@ def _other_names(model: Model, commanded: NDArray[np.bool_], header: Sequence[st
         for i in np.flatnonzero(model.inputs.actuator >= 0):
             if motors[model.inputs.actuator[i]].joint().index() == joint.index():
                 columns[model.input_names[i]] = COMMAND if commanded[i] else EFFORT
+                columns |= {f"{UNUSED}{label}": EFFORT} if commanded[i] else {}
         for column, quantities in columns.items():
             for name in quantities:
                 for table, text in ((names, label), (shorter, label.removesuffix("_joint"))):
@@ -552,8 +554,8 @@ def _columns(path: Path, model: Model, header: list[str], wanted: Sequence[str],
         if column not in wanted and column in commands:
             expected = 'a model with inputs="position" and gains (--gains KP,KD)'
             raise InputError(f"{path} line 1, column {given[:80]}", got="a commanded position", expected=expected)
-        if column not in wanted:
-            raise UnknownNameError(f"{path} line 1, column", got=given[:80], known=[*wanted, *others])
+        if column not in wanted and not column.startswith(UNUSED):
+            raise UnknownNameError(f"{path} line 1, column", got=given[:80], known=wanted)
         if names.count(column) > 1:
             raise InputError(f"{path} line 1, column {column}", got="twice", expected="once")
     for column in wanted:

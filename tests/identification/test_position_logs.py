@@ -253,3 +253,10 @@ def test_the_sentence_about_the_error_is_in_the_unit_of_positions(pendulum):
     sizes = {"a_q": (3.0, 6.0, "degrees"), "b_q": (4.0, 8.0, "degrees"), "a_v": (90.0, 50.0, "degrees/s")}
     sentence = identification_sentence(unknowns, np.ones(1), np.array([[0.9, 1.1]]), (), (5.0, 4.0), sizes, "bad")
     assert "the rms error rises from 3.54 to 7.07 degrees, at most 8 in b_q" in sentence
+
+
+def test_a_log_of_commanded_positions_may_have_efforts(pendulum, tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,q_hinge,q_desired_hinge,effort_hinge\n0,0.1,0.2,1.5\n0.005,0.11,0.25,1.6\n")
+    recording = read_recording(path, pendulum, gaps=True)
+    np.testing.assert_array_equal(recording.us, [[0.2]])
