@@ -281,8 +281,7 @@ def choose_unknowns(
             raise InputError(name, got=why, expected="a quantity that can be estimated")
         usual = (physical or {}).get(name, Physical(lower, np.inf, 0.0))
         start = np.array(value, dtype=float)
-        given = (bounds or {}).get(name)
-        usual_bounds = usual.lower, max(usual.upper, *start)
+        given, usual_bounds = (bounds or {}).get(name), (usual.lower, max(usual.upper, *start))
         low, high = usual_bounds if given is None else _bounds_of(name, given, lower)
         prior = _prior_of(name, priors[name], len(start)) if priors and name in priors else None
         shifts = name.endswith(f".{DELAY}")
