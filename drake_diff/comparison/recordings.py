@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_diff._base.arrays import Array, array_with_gaps, finite_array, frozen
 from drake_diff._base.files import MOST_TEXT, arrays_of, json_of, make_folder, plain_file, read_plain, write_whole
@@ -214,6 +215,8 @@ NORM_TOLERANCE = 1e-3  # of a quaternion's norm: allows float32 and five printed
 POSITION, VELOCITY = ("position", "pos", "q"), ("velocity", "vel", "v", "dq", "qd")
 COMMAND = ("q_desired", "q_des", "desired_position", "position_command", "command", "target")
 EFFORT = ("effort", "torque", "tau")
+UNUSED = " effort of "  # of a joint with a servo: no model reads it; with a space, as no name in a file begins with one
+NUMBERED = ("{}{}", "{}_{}", "{}[{}]")  # a quantity and the number of a joint
 CLOCK_TOLERANCE = 1e-3  # relative to a time step: allows printed times and nanoseconds
 
 
@@ -513,12 +516,12 @@ def _number(subject: str, text: str) -> float:
     return value if text.strip() else math.nan
 
 
-def _other_names(model: Model) -> dict[str, str]:
-    """Return other names of columns: QUANTITY.JOINT, QUANTITY_JOINT, JOINT.QUANTITY or JOINT_QUANTITY, and t.
+def _other_names(model: Model, commanded: NDArray[np.bool_], header: Sequence[str]) -> dict[str, list[str]]:
+    """Return the columns for which other names may stand: QUANTITY.JOINT, JOINT_QUANTITY and the like, and t.
 
-    A quantity and a number, as q0, q_0 or q[0], count the joints in the order of the model.
+    A quantity and a number, as q0, q_0 or q[0], count the joints in the order of the model, if the header has a 0.
     """
-    names, motors, index = {"t": "time"}, actuators(model.plant), 0
+    names, shorter, motors, index = {"t": ["time"]}, dict[str, list[str]](), actuators(model.plant), 0
     for label, joint in labelled(joints(model.plant)).items():
         q, v = model.places(joint)
         if len(q) != 1 or len(v) != 1:
@@ -526,28 +529,33 @@ def _other_names(model: Model) -> dict[str, str]:
         columns = {model.state_names[q.start]: POSITION, model.state_names[model.nq + v.start]: VELOCITY}
         for i in np.flatnonzero(model.inputs.actuator >= 0):
             if motors[model.inputs.actuator[i]].joint().index() == joint.index():
-                columns[model.input_names[i]] = COMMAND if model.inputs.commanded[i] else EFFORT
+                columns[model.input_names[i]] = COMMAND if commanded[i] else EFFORT
+                columns |= {f"{UNUSED}{label}": EFFORT} if commanded[i] else {}
         for column, quantities in columns.items():
             for name in quantities:
-                for text in dict.fromkeys((label, label.removesuffix("_joint"))):
-                    names |= dict.fromkeys(
-                        (f"{name}.{text}", f"{name}_{text}", f"{text}.{name}", f"{text}_{name}"), column
-                    )
-                names |= dict.fromkeys((f"{name}{index}", f"{name}_{index}", f"{name}[{index}]"), column)
+                for table, text in ((names, label), (shorter, label.removesuffix("_joint"))):
+                    for other in (f"{name}.{text}", f"{name}_{text}", f"{text}.{name}", f"{text}_{name}"):
+                        table.setdefault(other, []).append(column)
+                for form in (form for form in NUMBERED if form.format(name, 0) in header):
+                    names.setdefault(form.format(name, index), []).append(column)
         index += 1
-    return names
+    return shorter | names
 
 
 def _columns(path: Path, model: Model, header: list[str], wanted: Sequence[str], spared: Sequence[str]) -> list[int]:
     """Return the index of each wanted column, or -1 for a column in `spared` that is missing."""
-    others = _other_names(model)
-    names = [text.strip() if text.strip() in wanted else others.get(text.strip(), text.strip()) for text in header]
-    for given, column in zip(header, names, strict=True):
-        if column not in wanted and any(name in column for name in COMMAND) and not np.any(model.inputs.commanded):
+    texts, every = [text.strip() for text in header], np.ones(model.nu, dtype=bool)
+    others, commands = _other_names(model, model.inputs.commanded, texts), _other_names(model, every, texts)
+    choices = [[text] if text in wanted else others.get(text, [text]) for text in texts]
+    names = [columns[0] for columns in choices]
+    for given, column, columns in zip(header, names, choices, strict=True):
+        if len(set(columns)) > 1:
+            raise InputError(f"{path} line 1, column {given[:80]}", got=" or ".join(columns), expected="one of them")
+        if column not in wanted and column in commands:
             expected = 'a model with inputs="position" and gains (--gains KP,KD)'
             raise InputError(f"{path} line 1, column {given[:80]}", got="a commanded position", expected=expected)
-        if column not in wanted:
-            raise UnknownNameError(f"{path} line 1, column", got=given[:80], known=[*wanted, *others])
+        if column not in wanted and not column.startswith(UNUSED):
+            raise UnknownNameError(f"{path} line 1, column", got=given[:80], known=wanted)
         if names.count(column) > 1:
             raise InputError(f"{path} line 1, column {column}", got="twice", expected="once")
     for column in wanted:

@@ -159,6 +159,11 @@ class Progress:
         """Whether the time has ended."""
         return now() > self.end
 
+    @property
+    def reached(self) -> str:
+        """Why a fit ended when its time ended."""
+        return f"it reached the limit of {self.limit:g} s"
+
     def say(self, line: str) -> None:
         """Report a line of progress."""
         if self.report is not None:
@@ -444,7 +449,8 @@ class Fit:
             settled = PROMISED if self.law.kinks else SETTLED * (1 + SETTLED * value)
             if isinstance(self.law, TreeMotion) and self.law.has_servos:
                 settled = SERVOS.roughly if self.law.frozen else SERVOS.settled
-            if value > FAR_ABOVE * self.count:
+            whole = bool(np.all(np.abs(dz) < (1 - 1e-9) * LARGEST / 3 * self.unknowns.widths))
+            if self.has_servos and whole and value > FAR_ABOVE * self.count:
                 settled = max(settled, PROMISED * value / self.count)
             if promised <= settled and here.gap <= CLOSED:
                 return Solved(here.z, here.starts, reduced, True, steps, "")
@@ -463,8 +469,8 @@ class Fit:
                 return Solved(here.z, here.starts, reduced, ended, steps, "" if ended else STUCK)
             reach = reach * FARTHER if fraction == 1.0 else max(reach / FARTHER, 1.0)
             here = ahead
-        limit = f"{most} steps" if steps == most else f"{self.watch.limit:g} s"
-        return Solved(here.z, here.starts, reduced, False, steps, f"it reached the limit of {limit}")
+        why = f"it reached the limit of {most} steps" if steps == most else self.watch.reached
+        return Solved(here.z, here.starts, reduced, False, steps, why)
 
     def _promised(self, here: "FittedMotion", reduced: Reduced) -> tuple[Array, float]:
         """Return the step dz (np,), and its predicted decrease of |r|^2."""

@@ -34,7 +34,6 @@ from drake_diff.identification.judge import (
 from drake_diff.identification.messages import Sizes, in_usual_units, unidentifiable
 from drake_diff.identification.motion import (
     SERVOS,
-    DiscreteMotion,
     Law,
     TreeMotion,
     discrete_motion,
@@ -106,10 +105,10 @@ def identify(
         max_iterations: The maximum number of Gauss-Newton steps of the fit; through impacts, the limit is 32.
         priors: Prior knowledge of parameters: mean and standard deviation, by name. A prior counts as one more
             measurement. Without a prior, the file's value matters only where the data are uninformative.
-        bounds: Lower and upper bound of parameters, by name. In continuous time, the defaults are: Coulomb friction up
-            to the largest effort E, damping up to E / (0.1 rad/s), rotor inertia up to 1000 times the inertia that its
-            joint moves in the default state, gains a tenth to ten times the model's, delays up to 0.2 s. E is the
-            effort limit, or less if the recordings have only smaller inputs.
+        bounds: Lower and upper bound of parameters, by name. For commanded positions, the defaults are: Coulomb
+            friction up to the largest effort E, damping up to E / (0.1 rad/s), rotor inertia up to 1000 times the
+            inertia that its joint moves in the default state, gains a tenth to ten times the model's, delays up to
+            0.2 s. E is the effort limit, or less if the servo errors are smaller. The model's values are within.
         sensors: The mounts of recorded sensors that are not at the frame of a body: by label, the body and x, y, z
             [m], or x, y, z [m], roll, pitch, yaw [rad], in the body's frame.
         time_limit: Time after which the fit ends, in seconds; the held-out samples are predicted afterwards.
@@ -151,7 +150,8 @@ def identify(
     if columns and own_tree is None:
         raise ModelError(f"{model.name}: sensors need motion in continuous time, but {why or 'steps are fitted'}")
     outputs = choose_sensors(model, own_tree, columns, sensors)
-    ranges = None if own_tree is None else physical_ranges(model, own_tree, _largest(own_tree, pieces))
+    servos = own_tree is not None and bool(np.any(own_tree.commanded))
+    ranges = physical_ranges(model, own_tree, _largest(own_tree, pieces)) if own_tree is not None and servos else None
     unknowns = choose_unknowns(model, own_tree, parameters, priors, bounds, columns, ranges)
     stated = given_noise(model, noise, columns)
     scatter = noise_by_differences(model, pieces)
@@ -165,7 +165,7 @@ def identify(
             discrete_motion(model, unknowns, pieces)
             if own_tree is None
             else servo_motion(model, own_tree, unknowns)
-            if np.any(own_tree.commanded)
+            if servos
             else TreeMotion(model, own_tree, unknowns)
         )
         fit, solved = problem.solve(law, max_iterations)
@@ -188,14 +188,14 @@ def identify(
 
 
 def _largest(tree: Tree, pieces: Sequence[Excerpt]) -> Array:
-    """Return the largest input (nu,) in the recordings; for a servo, the largest distance from the commanded position.
+    """Return the largest distance (nu,) from the commanded positions in the recordings; 0 for inputs without a servo.
 
     Positions that were not measured do not count.
     """
     joints = np.flatnonzero(tree.servo >= 0)
     largest = [np.zeros(tree.actuation.shape[1])]
     for piece in pieces:
-        far = np.abs(piece.us)
+        far = np.zeros_like(piece.us)
         q = tree.joint_positions(piece.ys[:-1, : tree.coordinates.nq])[:, tree.positions[joints]]
         far[:, tree.servo[joints]] = np.nan_to_num(np.abs(piece.us[:, tree.servo[joints]] - q))
         largest.append(np.max(far, axis=0))
@@ -273,8 +273,12 @@ class Problem:
         cut = []
         for piece in pieces:
             count = max(1, round((piece.times[-1] - piece.times[0]) / SERVOS.window))
-            ends = np.searchsorted(piece.times, np.linspace(piece.times[0], piece.times[-1], count + 1) - 1e-9)
-            cut += [piece.part(int(a), int(b)) for a, b in pairwise(ends)]
+            ends = [0]
+            for end in np.searchsorted(piece.times, np.linspace(piece.times[0], piece.times[-1], count + 1) - 1e-9):
+                if end - ends[-1] >= SERVOS.least:
+                    ends.append(int(end))
+            ends[max(len(ends) - 1, 1) :] = [len(piece.times) - 1]
+            cut += [piece.part(a, b) for a, b in pairwise(ends)]
         return cut
 
     def solve(self, law: Law, most: int) -> tuple[Fit, Solved]:
@@ -287,8 +291,10 @@ class Problem:
             z, starts, fit = solved.z, solved.starts, self.fit(with_exact_derivatives(fit.law), pieces, fit.noise)
         while True:
             fit, solved = self.weighted(fit, z, starts, most)
-            if self.watch.is_late or self.follows(fit, solved.z, solved.starts):
+            if self.follows(fit, solved.z, solved.starts):
                 return fit, solved
+            if self.watch.is_late:
+                return fit, replace(solved, converged=False, why=self.watch.reached)
             z, starts = solved.z, solved.starts
             fit = self.shortened(fit, pieces, fit.noise)
 
@@ -298,7 +304,7 @@ class Problem:
         They are those whose deviation would exceed their own size if they were estimated alone.
         """
         point = fit.at(z, starts)
-        if point is None or isinstance(fit.law, DiscreteMotion):
+        if point is None or not (isinstance(fit.law, TreeMotion) and fit.has_servos):
             return fit
         finer = np.nanmax(fit.noise / self.first_noise)  # the residuals may fall to the noise of the samples
         known = finer * np.linalg.norm(fit.reduce(point).R, axis=0) * self.unknowns.widths / FAR
@@ -367,7 +373,7 @@ class Problem:
         for _ in range(ROUNDS):
             solved = fit.solve(z, starts, most)
             z, starts = solved.z, solved.starts
-            if self.watch.is_late or not self.follows(fit, z, starts):
+            if not self.follows(fit, z, starts):
                 return fit, solved
             noise = np.where(np.isfinite(self.stated), self.stated, np.fmax(noise_of(fit, solved), 1e-3 * self.scatter))
             seen = np.isfinite(noise)
@@ -375,6 +381,8 @@ class Problem:
                 SERVOS.same_noise if fit.has_servos else SAME_NOISE
             ):
                 return fit, solved
+            if self.watch.is_late:
+                return fit, replace(solved, converged=False, why=self.watch.reached)
             fit = self.fit(fit.law, fit.segments.pieces, noise)
         return fit, fit.solve(z, starts, most)
 

@@ -190,7 +190,7 @@ def colour_of(residuals: Sequence[Array], names: Sequence[str]) -> tuple[str, fl
             p = float(stats.gamma.sf(total - mean + shape * scale, shape, scale=scale))
             if p < least:
                 worst, least = name, p
-    return worst, min(1.0, least * tests)
+    return worst, min(1.0, least * tests) if tests else 1.0
 
 
 def _ljung_box(rows: Array, lags: int) -> Array:

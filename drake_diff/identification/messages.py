@@ -117,14 +117,19 @@ def identification_sentence(
         first = f" ({unidentifiable[0]}{more})" if unidentifiable else ""
         clauses.append(f"{np.sum(~known)} cannot be known from these recordings{first}")
     verdict = f"Not explained: {'; '.join(clauses)}" if reason else f"Explained: {'; '.join(clauses)}"
-    change = "falls" if errors[1] <= errors[0] else "rises"
-    error = f"the error {change} from {errors[0]:.3g} to {errors[1]:.3g} times the noise"
+    error = f"the error {_change(*errors)} times the noise"
     if reason and sizes:
-        worst = max(sizes, key=lambda name: sizes[name][1])
-        _, now, unit = sizes[worst]
-        rms = np.sqrt(np.mean(np.square([size[:2] for size in sizes.values() if size[2] == unit]), axis=0))
-        error = f"the rms error {change} from {rms[0]:.3g} to {rms[1]:.3g} {unit}, at most {now:.3g} in {worst}"
+        unit = next(iter(sizes.values()))[2]  # of positions, which come first
+        alike = {name: size[:2] for name, size in sizes.items() if size[2] == unit}
+        worst = max(alike, key=lambda name: alike[name][1])
+        rms = np.sqrt(np.mean(np.square(list(alike.values())), axis=0))
+        error = f"the rms error {_change(*rms)} {unit}, at most {alike[worst][1]:.3g} in {worst}"
     return f"{verdict}; {error}; {reason or NOISE_IS_LEFT}."
+
+
+def _change(before: float, after: float) -> str:
+    """Return whether an error falls or rises, and both values."""
+    return f"{'falls' if after <= before else 'rises'} from {before:.3g} to {after:.3g}"
 
 
 def excitation_sentence(

@@ -325,6 +325,7 @@ class ServoOptions:
     step: float = 0.005  # [s] the longest step
     slip: float = 0.05  # [rad/s or m/s] over which friction changes its sign; a sharper change needs steps below 1 ms
     window: float = 0.5  # [s] length of a piece with its own first state
+    least: int = 20  # number of steps in a piece, at least, as fewer do not show whether residuals are noise
     few: int = 8  # number of windows from which the initial guess of a delay is found
     step_error: float = 2e-3  # in units of the noise: largest change of a window's end by steps of half the length
     same_noise: float = 0.03  # relative change of the noise below which it is not estimated again

@@ -280,8 +280,9 @@ def choose_unknowns(
         if why is not None:
             raise InputError(name, got=why, expected="a quantity that can be estimated")
         usual = (physical or {}).get(name, Physical(lower, np.inf, 0.0))
-        low, high = _bounds_of(name, (bounds or {}).get(name, (usual.lower, usual.upper)), lower)
         start = np.array(value, dtype=float)
+        given, usual_bounds = (bounds or {}).get(name), (usual.lower, max(usual.upper, *start))
+        low, high = usual_bounds if given is None else _bounds_of(name, given, lower)
         prior = _prior_of(name, priors[name], len(start)) if priors and name in priors else None
         shifts = name.endswith(f".{DELAY}")
         size = _size(model, name, value) or usual.size
@@ -306,25 +307,28 @@ class Physical(NamedTuple):
 
 
 def physical_ranges(model: Model, tree: Tree, largest: Array) -> dict[str, Physical]:
-    """Return the ranges of joints, servos and delays by name, for the largest inputs or servo errors (nu,)."""
+    """Return the ranges of joints with servos, of servos and of delays by name, for the largest servo errors (nu,)."""
     motors, numbers = labelled(rotors(model.plant)), tree.numbers
     kinds = {f"model.{DELAY}": Physical(0.0, RANGES.most_delay, RANGES.usual_delay)}
     still = np.zeros((1, tree.n))
     q = tree.joint_positions(model.default_state[None, : model.nq])
     inertias = np.diag(TreeDynamics(tree, numbers).inverse_dynamics(q, still, still)[1][0])
-    efforts = np.abs(tree.actuation) @ np.minimum(np.where(tree.commanded, numbers.kp, 1.0) * largest, numbers.limit)
+    efforts = np.abs(tree.actuation) @ np.minimum(numbers.kp * largest, numbers.limit)
     names = names_of(model.plant)[1]
     by_joint = {link.joint: link.v_start for link in tree.bodies.values() if link.kind not in FIXED_OR_FREE}
+    by_joint = {label: v for label, v in by_joint.items() if tree.servo[v] >= 0}
     for label, v in by_joint.items():
         if efforts[v] > 0:
             kinds[f"{label}.{COULOMB}"] = Physical(0.0, efforts[v], RANGES.usual_share * efforts[v])
             kinds[f"{label}.damping"] = Physical(0.0, efforts[v] / RANGES.least_speed, RANGES.usual_share * efforts[v])
     for label, motor in motors.items():
-        v, ratio = by_joint[names[motor.joint().index()]], max(motor.default_gear_ratio() ** 2, 1e-300)
-        inertia, kd = inertias[v] / ratio, numbers.kd[tree.servo[v]] if tree.servo[v] >= 0 else 0.0
+        if (joint := names[motor.joint().index()]) not in by_joint:
+            continue
+        v, ratio = by_joint[joint], max(motor.default_gear_ratio() ** 2, 1e-300)
+        inertia, kd = inertias[v] / ratio, numbers.kd[tree.servo[v]]
         first = max(RANGES.settling * kd / ratio - inertia, 0.0)
         kinds[f"{label}.rotor_inertia"] = Physical(
-            0.0, max(RANGES.most_rotor * inertia, 10 * first), max(10 * inertia, first), first
+            0.0, max(RANGES.most_rotor * inertia, 10 * first) or np.inf, max(10 * inertia, first), first
         )
     for i, label in enumerate(model.input_names):
         for name in GAINS if tree.commanded[i] else ():
@@ -335,8 +339,6 @@ def physical_ranges(model: Model, tree: Tree, largest: Array) -> dict[str, Physi
 
 def _bounds_of(name: str, given: Any, lower: float) -> tuple[float, float]:
     """Return the lower and the upper bound: the given ones, limited to possible values."""
-    if given == (lower, np.inf):
-        return given
     subject = f"bounds of {name}"
     try:
         low, high = (float(value) for value in given)

@@ -3,14 +3,20 @@
 import numpy as np
 import pytest
 from helpers.estimates import assert_known
+from helpers.models import MODELS
 from scipy.integrate import solve_ivp
 
 import drake_diff as dd
 from drake_diff.comparison import read_recording
-from drake_diff.exceptions import InputError
+from drake_diff.exceptions import InputError, UnknownNameError
+from drake_diff.identification.fit import Fit
+from drake_diff.identification.identify import Problem
+from drake_diff.identification.judge import colour_of
+from drake_diff.identification.messages import identification_sentence
 from drake_diff.identification.motion import servo_motion, with_exact_derivatives
+from drake_diff.identification.recordings import Excerpt
 from drake_diff.identification.tree import tree_for_identification
-from drake_diff.identification.unknowns import choose_unknowns
+from drake_diff.identification.unknowns import choose_unknowns, physical_ranges
 
 pytestmark = pytest.mark.solve
 
@@ -148,3 +154,109 @@ def test_commanded_positions_need_a_model_with_servos(load, tmp_path):
     path.write_text("t,q_hinge,q_desired_hinge\n0,0.1,0.2\n0.005,0.11,0.25\n")
     with pytest.raises(InputError, match="--gains"):
         read_recording(path, load("pendulum.urdf"), gaps=True)
+
+
+@pytest.fixture
+def swing(load):
+    """Return a pendulum without a servo, and a recording of its swing with damping 0.2 under a torque of 5 mN m."""
+    model = load("pendulum.urdf", time_step=0.001)
+    us = 0.005 * np.sin(0.01 * np.arange(1500))[:, None]
+    xs = dd.rollout(model, [1.0, 0.0], us, parameters={"hinge.damping": 0.2}).xs[::10]
+    xs = xs + 0.02 * np.random.default_rng(0).standard_normal(xs.shape)
+    return model, dd.Recording("lab", "1", 0.01 * np.arange(151), xs, us[::10])
+
+
+def test_a_small_torque_does_not_bound_the_damping(swing):
+    fit = dd.identify(*swing, ["hinge.damping"])
+    assert fit.converged
+    assert fit.explained
+    assert_known(fit, "hinge.damping", 0.2, 0.1)
+
+
+def test_a_fit_that_ends_before_its_weights_match_the_noise_has_not_converged(swing, monkeypatch):
+    solve, ended = Fit.solve, []
+
+    def solve_once(self, *arguments):
+        ended.append(solve(self, *arguments))
+        return ended[-1]
+
+    monkeypatch.setattr(Fit, "solve", solve_once)
+    monkeypatch.setattr("drake_diff.identification.fit.now", lambda: np.inf if ended else 0.0)
+    fit = dd.identify(*swing, ["hinge.damping"], time_limit=1e6)
+    assert ended[0].converged
+    assert not fit.converged
+    assert not fit.explained
+    assert "limit of 1e+06 s" in fit.reason
+
+
+def test_bounds_may_be_an_array(swing):
+    fit = dd.identify(*swing, ["hinge.damping"], bounds={"hinge.damping": np.array([0.0, 1.0])})
+    assert_known(fit, "hinge.damping", 0.2, 0.1)
+
+
+def test_a_rotor_that_moves_no_inertia_has_no_upper_bound(tmp_path):
+    path = tmp_path / "massless.urdf"
+    path.write_text((MODELS / "pendulum.urdf").read_text().replace('<origin xyz="0 0 -0.5"/>', "", 1))
+    model = dd.load_model(path, time_step=0.001, inputs="position", gains=(40.0, 0.0))
+    ranges = physical_ranges(model, tree_for_identification(model, servos=True), np.ones(1))
+    assert ranges["motor.rotor_inertia"].upper == np.inf
+
+
+def test_windows_of_slow_samples_are_long_enough_for_the_test_of_their_residuals(pendulum):
+    tree, times = tree_for_identification(pendulum, servos=True), 0.05 * np.arange(90)
+    unknowns = choose_unknowns(pendulum, tree, ["hinge.damping"])
+    piece = Excerpt("lab", times, np.zeros((90, 2)), np.zeros((89, 1)), False)
+    problem = Problem(pendulum, unknowns, [piece], np.full(2, np.nan), np.ones(2))
+    windows = problem.windows(servo_motion(pendulum, tree, unknowns), [piece])
+    assert [len(window.times) for window in windows] == [21, 21, 21, 30]
+    short = np.random.default_rng(0).standard_normal((60, 6, 1))
+    assert colour_of(short, ["hinge_q"])[1] == 1.0
+
+
+def test_a_column_that_only_contains_the_word_of_a_command_is_unknown(load, tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,q_hinge,target_velocity_hinge\n0,0.1,0.2\n0.005,0.11,0.25\n")
+    with pytest.raises(UnknownNameError, match="target_velocity_hinge"):
+        read_recording(path, load("pendulum.urdf"), gaps=True)
+
+
+TWO_JOINTS = """<robot name="arm"><link name="base"/>{}</robot>"""
+JOINT = """<link name="{0}_link"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>
+</inertial></link><joint name="{0}" type="continuous"><parent link="base"/><child link="{0}_link"/><axis xyz="0 1 0"/>
+</joint>"""
+
+
+def two_joints(tmp_path, *names):
+    path = tmp_path / "arm.urdf"
+    path.write_text(TWO_JOINTS.format("".join(JOINT.format(name) for name in names)))
+    return dd.load_model(path, base="weld", time_step=0.01)
+
+
+@pytest.mark.parametrize(("joints", "column"), [(("position", "pos"), "pos_position"), (("hip", "knee"), "position_1")])
+def test_a_column_whose_name_fits_two_joints_or_counts_from_1_is_refused(tmp_path, joints, column):
+    path = tmp_path / "log.csv"
+    path.write_text(f"t,{column}\n0,0.1\n0.01,0.2\n")
+    with pytest.raises((InputError, UnknownNameError), match=column):
+        read_recording(path, two_joints(tmp_path, *joints), gaps=True)
+
+
+def test_the_whole_name_of_a_joint_comes_before_a_shortened_one(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,position_hip\n0,0.1\n0.01,0.2\n")
+    recording = read_recording(path, two_joints(tmp_path, "hip", "hip_joint"), gaps=True)
+    np.testing.assert_array_equal(recording.xs[0, :2], [0.1, np.nan])
+
+
+def test_the_sentence_about_the_error_is_in_the_unit_of_positions(pendulum):
+    """The rms of 3 and 4 is 3.54, and that of 6 and 8 is 7.07."""
+    unknowns = choose_unknowns(pendulum, None, ["hinge.damping"])
+    sizes = {"a_q": (3.0, 6.0, "degrees"), "b_q": (4.0, 8.0, "degrees"), "a_v": (90.0, 50.0, "degrees/s")}
+    sentence = identification_sentence(unknowns, np.ones(1), np.array([[0.9, 1.1]]), (), (5.0, 4.0), sizes, "bad")
+    assert "the rms error rises from 3.54 to 7.07 degrees, at most 8 in b_q" in sentence
+
+
+def test_a_log_of_commanded_positions_may_have_efforts(pendulum, tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,q_hinge,q_desired_hinge,effort_hinge\n0,0.1,0.2,1.5\n0.005,0.11,0.25,1.6\n")
+    recording = read_recording(path, pendulum, gaps=True)
+    np.testing.assert_array_equal(recording.us, [[0.2]])
