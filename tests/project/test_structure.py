@@ -30,5 +30,6 @@ def test_no_module_imports_a_test_module_and_no_test_a_benchmark():
     assert len(texts) > 80
     assert len(PROGRAMS) > 3
     for path, names in texts.items():
-        assert not [name for name in names if any(p == "conftest" or p.startswith("test_") for p in name)], path
+        ours = [name for name in names if name[0] != "jax"]  # its test_util is public
+        assert not [name for name in ours if any(p == "conftest" or p.startswith("test_") for p in name)], path
         assert BENCHMARKS in path.parents or not [name for name in names if name[0] in PROGRAMS], path
