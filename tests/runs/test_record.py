@@ -223,7 +223,7 @@ def test_energy_from_nowhere_fails_where_the_verdict_rests_on_that_motion():
     off = with_replay(solution, potential_energy=potential)
     for rests_on, verdict in ((off.replay, "fail"), (solution.replay, "info")):
         holding = [dataclasses.replace(r, checks=(), motion=rests_on) for r in solution.replays]
-        vars(off)["replays"] = tuple(holding)
+        vars(off).update(replays=tuple(holding), deciding_replays=tuple(holding))
         found = {m.name: m for m in measure(off).metrics}["energy drift"]
         assert found.value > 40
         assert found.verdict == verdict
