@@ -449,8 +449,8 @@ class Fit:
             settled = PROMISED if self.law.kinks else SETTLED * (1 + SETTLED * value)
             if isinstance(self.law, TreeMotion) and self.law.has_servos:
                 settled = SERVOS.roughly if self.law.frozen else SERVOS.settled
-            whole = bool(np.all(np.abs(dz) < (1 - 1e-9) * LARGEST / 3 * self.unknowns.widths))
-            if self.has_servos and whole and value > FAR_ABOVE * self.count:
+            uncut = bool(np.all(np.abs(dz) < (1 - 1e-9) * LARGEST / 3 * self.unknowns.widths))
+            if self.has_servos and uncut and value > FAR_ABOVE * self.count:
                 settled = max(settled, PROMISED * value / self.count)
             if promised <= settled and here.gap <= CLOSED:
                 return Solved(here.z, here.starts, reduced, True, steps, "")

@@ -33,7 +33,7 @@ from drake_diff.identification.tree import (
     Tree,
     TreeDynamics,
     branches_of,
-    whole,
+    undivided,
 )
 from drake_diff.identification.unknowns import (
     BIAS,
@@ -289,7 +289,9 @@ class TreeMotion:
     def slopes(self, z: Array, xs: Array, hs: Array, us: Array, *, together: bool = False) -> list["Slopes"]:
         """Return the derivatives of each step of each independent branch, or of the whole tree."""
         dynamics, by = self.dynamics(self.unknowns.values(z)), self.by(z)
-        return [self._slopes(b, dynamics, by, xs, hs, us) for b in ((whole(self.tree),) if together else self.branches)]
+        return [
+            self._slopes(b, dynamics, by, xs, hs, us) for b in ((undivided(self.tree),) if together else self.branches)
+        ]
 
     def _slopes(self, branch: Branch, dynamics: TreeDynamics, by: Array, xs: Array, hs: Array, us: Array) -> "Slopes":
         by, dynamics, nx = by[branch.flat], branch.restrict(dynamics), len(branch.states)

@@ -393,7 +393,7 @@ class Branch:
         return replace(dynamics, tree=self.tree, numbers=numbers, dry=dry)
 
 
-def whole(tree: Tree) -> Branch:
+def undivided(tree: Tree) -> Branch:
     """Return the branch that is the whole tree."""
     nx, nv, names = tree.coordinates.nq + tree.coordinates.nv, tree.coordinates.nv, vars(tree.numbers)
     places = {name: tree.numbers.places(name) for name in names}
@@ -403,7 +403,7 @@ def whole(tree: Tree) -> Branch:
 def branches_of(tree: Tree) -> tuple[Branch, ...]:
     """Return the independent branches of a tree; one if it has free bodies or mimic joints, which may couple them."""
     if tree.coupling is not None or tree.coordinates.free or not tree.links:
-        return (whole(tree),)
+        return (undivided(tree),)
     roots = list(range(len(tree.links)))
     for i, link in enumerate(tree.links):
         roots[i] = i if link.parent < 0 else roots[link.parent]

@@ -87,6 +87,8 @@ class Robot:
 
     def closed(self, q: Array) -> Array | None:
         """Return posture q (nq,) with closed loops and unchanged coordinates of the steered joints, or None."""
+        if not self.model.file_facts.held_points:  # along paths, in every posture
+            return q
         return closed(self.model, q, coordinates_of(self.model, self.steered))
 
     def overlap(self, q: Array) -> float:
@@ -280,8 +282,8 @@ def _placed(draft: _Draft, random: np.random.Generator) -> Robot:
     first = inside(model, lower, upper)
     touches, flies = bool(model.contract.contact.collision_pairs), bool(model.body_forces)
     apart = draft.read(contact=False) if touches else model
-    kept = closed(model, first, coordinates_of(model, np.any(model.actuation != 0, axis=1)))
-    first = assembled(model, np.append(first, np.zeros(model.nv)))[: model.nq] if kept is None else kept
+    assembly = closed(model, first, coordinates_of(model, np.any(model.actuation != 0, axis=1)))
+    first = assembled(model, np.append(first, np.zeros(model.nv)))[: model.nq] if assembly is None else assembly
     chosen = steered(apart, first)
     driven = chosen is not None
     shapes, holds = model if touches else None, apart if driven else None
@@ -397,13 +399,13 @@ def start(
     lower: Array,
     upper: Array,
     random: np.random.Generator,
-    kept: NDArray[np.bool_],
+    fixed: NDArray[np.bool_],
 ) -> StartPosture:
     """Return the posture `first` (nq,) or a better one: without overlap, and within the motors' effort of `driven`.
 
     If possible, it has free space in all directions, in which the searches continue.
     `lower` and `upper` (nq,) are the ranges of all coordinates; poses of floating bodies do not change. If there are
-    loops, they are closed by all coordinates except the `kept` (nq,).
+    loops, they are closed by all coordinates except the `fixed` (nq,).
     """
     model = shapes or driven
     if model is None:
@@ -412,7 +414,7 @@ def start(
 
     def drawn(middle: Array, width: Array, moved: NDArray[np.bool_]) -> Array | None:
         q = np.clip(middle + width * random.uniform(-1, 1, len(first)), lower + margin, upper - margin)
-        return _closed_within(model, np.where(is_joint & moved, q, middle), kept, lower, upper)
+        return _closed_within(model, np.where(is_joint & moved, q, middle), fixed, lower, upper)
 
     every, whole = np.ones(len(first), dtype=bool), upper - lower
     seen = [first, *(drawn(first, whole, every) for _ in range(SEEN - 1))]
@@ -426,7 +428,7 @@ def start(
 
     def has_room(q: Array) -> bool:
         ways = [np.where(is_joint, random.choice([-ROOM, ROOM], len(q)), 0.0) for _ in range(BESIDE)]
-        beside = [closed(model, q + way, kept) for way in ways]
+        beside = [closed(model, q + way, fixed) for way in ways]
         return shapes is None or all(q is not None and deepest(shapes, q, always) <= TOUCHING for q in beside)
 
     best, tight = measured(first), None
@@ -440,7 +442,7 @@ def start(
         if i < ATTEMPTS:
             fraction = (i + 1) / ATTEMPTS
             q = np.where(is_joint, first + fraction * (random.uniform(lower + margin, upper - margin) - first), first)
-            near = _closed_within(model, q, kept, lower, upper)
+            near = _closed_within(model, q, fixed, lower, upper)
         else:
             few = random.random(len(first)) < max(0.1, 3 / len(first))
             near = drawn(best.q, whole * 0.5 ** random.uniform(0, 6), few)
@@ -449,9 +451,9 @@ def start(
     return best
 
 
-def _closed_within(model: Model, q: Array, kept: NDArray[np.bool_], lower: Array, upper: Array) -> Array | None:
-    """Return posture q (nq,) with closed loops and unchanged `kept` (nq,) coordinates, or None beyond joint limits."""
-    near, is_joint = closed(model, q, kept), of_joints(model)
+def _closed_within(model: Model, q: Array, fixed: NDArray[np.bool_], lower: Array, upper: Array) -> Array | None:
+    """Return posture q (nq,) with closed loops and unchanged `fixed` (nq,) coordinates, or None beyond joint limits."""
+    near, is_joint = closed(model, q, fixed), of_joints(model)
     return near if near is not None and np.all(((lower <= near) & (near <= upper))[is_joint]) else None
 
 

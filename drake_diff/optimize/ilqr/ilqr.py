@@ -398,7 +398,7 @@ class _Search:
     def _roll(self, policy: AffinePolicy, size: float) -> Motion:
         """Simulate from x_0 with feedback, where each gap shrinks to 1 - `size` times itself."""
         old, nx = self.motion, self.motion.xs.shape[1]
-        xs, us, begun = np.empty_like(old.xs), np.empty_like(old.us), 0
+        xs, us, first = np.empty_like(old.xs), np.empty_like(old.us), 0
         gaps = (1 - size) * old.gaps
         xs[0] = self._inside_start(old.xs[0] + size * policy.start[:nx])
         c = np.clip(old.c + size * policy.start[nx:], *self.design.limits)
@@ -407,9 +407,9 @@ class _Search:
             wanted = wanted + policy.feedback[:, :, nx:] @ (c - old.c)
         if self.tried_by is not None:
             bounds = *self.inner, self.problem.bounds.u_lower, self.problem.bounds.u_upper
-            xs, us, begun = self.tried_by(xs[0], old.xs, gaps, wanted, policy.feedback, bounds)
+            xs, us, first = self.tried_by(xs[0], old.xs, gaps, wanted, policy.feedback, bounds)
         with self.problem.intervals(self.design.at(c)) as intervals:
-            for k in range(begun, len(us)):  # at a joint limit or if not finite, Drake's step goes on
+            for k in range(first, len(us)):  # at a joint limit or if not finite, Drake's step goes on
                 feedback = policy.feedback[k, :, :nx]
                 us[k] = self._inside(wanted[k] + feedback.dot(xs[k] - old.xs[k]))
                 xs[k + 1] = intervals.end(xs[k], us[k]) - gaps[k]
