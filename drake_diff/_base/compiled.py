@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from functools import cache
+from hashlib import sha256
 from importlib import import_module
 from typing import Any, TypeVar, cast
 
@@ -32,13 +33,19 @@ def compiled(function: Function) -> Function:
         dispatcher = njit(cache=True, error_model="numpy")(function)
     except RuntimeError:  # Numba finds no folder for a cache
         return cast(Function, njit(error_model="numpy")(function))
-    ignore_unreadable_index(dispatcher)
+    separate_versions(dispatcher._cache._cache_file)
     return cast(Function, dispatcher)
 
 
-def ignore_unreadable_index(dispatcher: Any) -> None:
-    """Compile again if the cache's index names a class of an older version; Numba would raise AttributeError."""
-    cached = dispatcher._cache._cache_file
+def separate_versions(cached: Any) -> None:
+    """Give each version of Numba and of the source its own cache files, and ignore an index that cannot be read.
+
+    With common files, a process that starts while another one writes them may load code of the other version, as Numba
+    writes the index first. The index cannot be read if it names a class that was renamed.
+    """
+    version = sha256(repr((cached._version, cached._source_stamp)).encode()).hexdigest()[:12]
+    cached._index_path = cached._index_path.removesuffix(".nbi") + f"-{version}.nbi"
+    cached._data_name_pattern = cached._data_name_pattern.replace(".{number", f"-{version}.{{number")
     load_index = cached._load_index
 
     def read() -> Any:

@@ -368,6 +368,8 @@ def independent(model: Model, q: Array, preferred: Collection[int] = ()) -> NDAr
     The first choice are the velocities of the coordinates `preferred`, by index in q, and then those with a motor.
     """
     ways, mask = loop_velocities(model, q), np.zeros(model.nv, dtype=bool)
+    if not ways.shape[1]:  # a truss; the lowest SciPy refuses an empty matrix
+        return mask
     weights = np.where(np.any(model.actuation != 0, axis=1), DRIVEN_FIRST, 1.0)
     weights[np.isin(places_of_velocities(model), list(preferred))] = DRIVEN_FIRST**2
     _, order = qr((ways * weights[:, None]).T, mode="r", pivoting=True)

@@ -109,6 +109,21 @@ def test_a_function_without_a_folder_for_its_cache_is_compiled_all_the_same(monk
     assert (double(1.5), double.stats.cache_path) == (3.0, None)
 
 
+def test_another_version_of_numba_has_cache_files_of_its_own(tmp_path, monkeypatch):
+    """Otherwise, a process that reads while another one writes loads machine code of the other version."""
+    from numba.core import caching
+
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "kernel_of_two_versions.py").write_text("def double(x):\n    return 2 * x\n")
+    double = importlib.import_module("kernel_of_two_versions").double
+    written = []
+    for version in ("0.60.0", "0.61.0"):
+        monkeypatch.setattr(caching.numba, "__version__", version)
+        assert compiled(double)(1.5) == 3.0
+        written.append({f.name for f in (tmp_path / "__pycache__").iterdir() if f.suffix in (".nbi", ".nbc")})
+    assert len(written[0]) == 2 and len(written[1]) == 4 and written[0] < written[1]
+
+
 @pytest.mark.solve
 def test_a_cache_that_names_a_class_of_an_older_version_is_compiled_anew(tmp_path, monkeypatch):
     """Numba unpickles the index of a cache, with the classes of its signatures, before it compares the source."""
