@@ -6,7 +6,7 @@ other values as a third argument. If only some parameters act at time t, its met
 A policy is written with ordinary arithmetic that AutoDiffXd supports. These NumPy functions support AutoDiffXd: tanh,
 sin, cos, tan, arcsin, arccos, arctan, arctan2, sinh, cosh, exp, log, sqrt, square, power, abs, maximum, minimum, clip,
 where, sum, mean, dot, @, outer, einsum, concatenate, linalg.norm. These do not: expm1, log1p, logaddexp, hypot, interp,
-heaviside, var, std, and every function of the module `math`.
+heaviside, var, std, and every function of the module `math`. A policy may also be written in JAX, and is not compiled.
 """
 
 from __future__ import annotations

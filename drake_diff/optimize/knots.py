@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
+from drake_diff._base.jax_rows import JaxRows, in_jax
 from drake_diff._base.values import Refusal
 from drake_diff.exceptions import GradientError
 from drake_diff.mechanics.casadi_tree import agrees
@@ -142,6 +143,28 @@ class Traced(PointFunction):
         return [ca.SX.sym(f"z{i}", self.function.size1_in(i)) for i in range(self.function.n_in())]
 
 
+class InJax(PointFunction):
+    """A function written in JAX. `known` (K, p) are its further arguments, if its points do not have them."""
+
+    def __init__(self, function: JaxRows, known: Array | None = None):
+        self.function, self.known = function, known
+        self.rows, self.width = function.rows, function.width
+        self.jacobian_at = np.repeat(np.arange(self.rows), self.width), np.tile(np.arange(self.width), self.rows)
+        self.hessian_at = np.triu_indices(self.width)
+
+    def _whole(self, points: Array) -> Array:
+        return points if self.known is None else np.hstack([points, self.known])
+
+    def values(self, points: Array) -> Array:
+        return self.function.values(self._whole(points))
+
+    def jacobian(self, points: Array) -> Array:
+        return self.function.jacobians(self._whole(points)).reshape(len(points), -1)
+
+    def hessian(self, points: Array, weights: Array, jacobian: Array) -> Array:
+        return self.function.hessians(self._whole(points), weights)[:, *self.hessian_at]
+
+
 class Called(PointFunction):
     """A function that is called, and that depends on the entries `depends` of a point (None: on all entries).
 
@@ -197,10 +220,13 @@ def constraint_function(c: Constraint, nx: int, probe: Array) -> PointFunction:
         depends, why_not = np.arange(c.clearance.model.nq), "distances between shapes are taken as linear"
         return _called(c, why_not, nx, probe[:0], depends, linear=True)
     values = c.along(probe[:, :nx], probe[:, nx:])
+    as_given: Any = c.function if c.takes_input else lambda x, u: c.function(x)
     with np.errstate(all="ignore"):
-        function = trace(c.function if c.takes_input else lambda x, u: c.function(x), nx, probe, values)
+        function = trace(as_given, nx, probe, values)
     if not isinstance(function, Refusal):
         return Traced(function)
+    if (compiled := in_jax(as_given, nx, len(c.lower), probe)) is not None:
+        return InJax(compiled)
     return _called(c, function.reason, nx, probe, np.arange(probe.shape[1] if c.takes_input else nx))
 
 
@@ -334,11 +360,12 @@ class _Function:
                 return self.timed.of(x, rest[:nu], rest[nu:])
             return cost(x, rest) if nu else cost(x)
 
-        self.evaluate, self.mapped = evaluate, None
+        self.evaluate, self.mapped, self.by_jax = evaluate, None, None
         knots = self._with_known(probe, np.zeros(len(probe)))
         with np.errstate(all="ignore"):
             function = trace(evaluate, nx, knots, self._called(knots)[:, None])
         if isinstance(function, Refusal):
+            self.by_jax = in_jax(evaluate, nx, 1, knots, self.n)
             return
         z, known = ca.SX.sym("z", self.n), ca.SX.sym("known", knots.shape[1] - self.n)
         inputs, value = [ca.vertcat(z, known)], function(ca.vertcat(z, known))
@@ -357,6 +384,8 @@ class _Function:
 
     def values(self, knots: Array, times: Array) -> Array:
         rows = self._with_known(knots, times)
+        if self.by_jax is not None:
+            return self.by_jax.values(rows)[:, 0]
         if self.mapped is None:
             return self._called(rows)
         return np.asarray(self.mapped[0](rows)[0][:, 0])
@@ -366,6 +395,9 @@ class _Function:
         if self.mapped is not None:
             gradients, hessians = self.mapped[1](rows)
             return gradients, not_negative(hessians.reshape(len(rows), self.n, self.n))
+        if self.by_jax is not None:
+            hessians = self.by_jax.hessians(rows, np.ones((len(rows), 1)))
+            return self.by_jax.jacobians(rows)[:, 0], not_negative(hessians)
         gradients, hessians = np.empty(knots.shape), np.empty((*knots.shape, self.n))
         for k, (z, row) in enumerate(zip(knots, rows, strict=True)):
 

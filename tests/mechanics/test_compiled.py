@@ -121,7 +121,9 @@ def test_another_version_of_numba_has_cache_files_of_its_own(tmp_path, monkeypat
         monkeypatch.setattr(caching.numba, "__version__", version)
         assert compiled(double)(1.5) == 3.0
         written.append({f.name for f in (tmp_path / "__pycache__").iterdir() if f.suffix in (".nbi", ".nbc")})
-    assert len(written[0]) == 2 and len(written[1]) == 4 and written[0] < written[1]
+    assert len(written[0]) == 2
+    assert len(written[1]) == 4
+    assert written[0] < written[1]
 
 
 @pytest.mark.solve

@@ -11,7 +11,7 @@ import numpy as np
 from pydrake.autodiffutils import AutoDiffXd, ExtractValue, InitializeAutoDiff
 
 from drake_diff._base.arrays import Array, array_with_gaps, frozen
-from drake_diff._base.autodiff import called, carrying, chain_rows, gradient_rows, named
+from drake_diff._base.autodiff import called, carrying, chain_rows, gradient_rows, named, user_function
 from drake_diff.exceptions import GradientError, InputError, ShapeError
 from drake_diff.model.assembly import single_coordinates
 from drake_diff.model.model import Model
@@ -133,6 +133,7 @@ class Constraint:
             raise InputError("Constraint.function", got=type(self.function).__name__, expected=FORM)
         if self.lower is None and self.upper is None:
             raise InputError("Constraint", got="no lower and no upper", expected="lower, upper, or both")
+        object.__setattr__(self, "function", user_function(f"constraint {self.name}".strip(), self.function, None))
         lower, upper = -np.inf if self.lower is None else self.lower, np.inf if self.upper is None else self.upper
         lower = array_with_gaps("Constraint.lower", np.atleast_1d(lower), ("m",))
         upper = array_with_gaps("Constraint.upper", np.atleast_1d(upper), ("m",))

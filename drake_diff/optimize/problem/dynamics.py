@@ -13,6 +13,7 @@ from pydrake.autodiffutils import ExtractValue, InitializeAutoDiff
 
 from drake_diff._base.arrays import Array, Indices, array_with_gaps, count, finite_array, frozen, positive_int
 from drake_diff._base.autodiff import gradient_rows, user_function
+from drake_diff._base.jax_rows import JaxRows, in_jax
 from drake_diff.exceptions import GradientError, InputError, ShapeError, UnknownNameError
 from drake_diff.mechanics.tree import tree_for
 from drake_diff.model.equations import EquationsOfMotion
@@ -50,6 +51,7 @@ class Pointwise:
         self.subject, self.f, self.nx, self.shape = subject, f, nx, shape
         self.rows = int(np.prod(shape))
         self.takes_rows = self.takes_columns = False
+        self.compiled: JaxRows | None = None
         with np.errstate(all="ignore"):
             single = self.values(probe)
             carried_values, slopes = self.linearize(probe)
@@ -59,6 +61,7 @@ class Pointwise:
             i = np.unravel_index(int(np.nanargmax(np.abs(carried_values - single))), single.shape)
             got = f"{carried_values[i]:.6g} with AutoDiffXd and {single[i]:.6g} with floats"
             raise GradientError(f"{subject} is {got} at the same x and u: write it as {ORDINARY}")
+        self.compiled = in_jax(f, nx, self.rows, probe)
         if getattr(f, "takes_rows", False):  # forward kinematics are compared with Drake's
             self.takes_rows = True
             self.takes_rows = bool(np.allclose(self.values(probe), single, rtol=SAME_VALUES, atol=0.0))
@@ -71,6 +74,8 @@ class Pointwise:
 
     def values(self, knots: Array) -> Array:
         """Return the values (K, r) at `knots` (K, nx + nu)."""
+        if self.compiled is not None:
+            return self.compiled.values(knots)
         if self.takes_rows:
             return np.asarray(self.f(knots[:, : self.nx], knots[:, self.nx :]), dtype=float).reshape(-1, self.rows)
         if self.takes_columns:
@@ -82,6 +87,8 @@ class Pointwise:
 
         Raises GradientError if the result has no derivatives.
         """
+        if self.compiled is not None:
+            return self.compiled.values(knots), self.compiled.jacobians(knots)
         count, width = knots.shape
         if not self.takes_columns:
             pairs = [self._carried(InitializeAutoDiff(k).ravel(), width) for k in knots]

@@ -7,12 +7,14 @@ import casadi as ca
 import numpy as np
 
 from drake_diff._base.arrays import Array
+from drake_diff._base.jax_rows import in_jax
 from drake_diff._base.values import Refusal
 from drake_diff.mechanics.casadi_tree import PlantFunctions, symbolic_plant
 from drake_diff.mechanics.fixed_contacts import FixedContactPlant
 from drake_diff.mechanics.symbol import Mapped
 from drake_diff.optimize.knots import (
     Called,
+    InJax,
     Linearize,
     PointFunction,
     Traced,
@@ -69,7 +71,9 @@ class Timed:
         self.rate, self.width = rate, rate.width
         with np.errstate(all="ignore"):
             self.expression = trace(rate.f, nx, rate.probe, rate.values(rate.probe))
-        self.why_not = self.expression.reason if isinstance(self.expression, Refusal) else ""
+        refused = isinstance(self.expression, Refusal)
+        self.compiled = in_jax(rate.f, nx, 1, rate.probe, self.width) if refused else None
+        self.why_not = "" if self.compiled is not None or not refused else self.expression.reason
 
     def at(self, times: Array) -> PointFunction:
         """Return the function of the knots at `times` (K,) [s]."""
@@ -84,6 +88,8 @@ class Timed:
         def linearize(knots: Array) -> tuple[Array, Array]:
             return rate.linearize(np.hstack([knots, known]))
 
+        if self.compiled is not None:
+            return InJax(self.compiled, known)
         return Called(self.why_not, values, linearize, 1, self.width)
 
 
@@ -139,9 +145,11 @@ def joined_function(c: BoundCoupling, nx: int, probe: Array) -> PointFunction:
 def _chosen(f: Any, values: Values, linearize: Linearize, rows: int, nx: int, probe: Array) -> PointFunction:
     with np.errstate(all="ignore"):
         expression = trace(f, nx, probe, values(probe))
-    if isinstance(expression, Refusal):
-        return Called(expression.reason, values, linearize, rows, probe.shape[1])
-    return Traced(expression)
+    if not isinstance(expression, Refusal):
+        return Traced(expression)
+    if (compiled := in_jax(f, nx, rows, probe)) is not None:
+        return InJax(compiled)
+    return Called(expression.reason, values, linearize, rows, probe.shape[1])
 
 
 def _dynamics(task: OptimalControl) -> PointFunction:
