@@ -62,6 +62,7 @@ FASTEST = 1.0  # [rad/s or m/s] peak speed of a joint without a velocity limit
 OF_SPEED, OF_EFFORT, OF_PULL = 0.6, 0.9, 0.8  # share of speed limits, of effort limits, and of a controller's effort
 SHORTEST, LONGEST = 0.6, 6.0  # [s] limits of a motion's duration
 STEPS = (30, 100)  # minimum and maximum number of steps of a plan
+MOST_IF_STIFF = 1000  # steps of a plan with springs that need short steps
 PEAK = 1.875  # the maximum slope of the smooth profile from 0 to 1
 PROBED = 1e-3  # [rad/s or m/s] size of a change by which the effect of an input is measured
 SETTLED = 1e-3  # [rad or m] largest motion in a step of a joint at rest
@@ -515,7 +516,7 @@ def _carrier(robot: Robot, name: str) -> int:
 def _timed(robot: Robot, name: str, postures_at: Callable[[Array], Array], duration: float) -> MotionGuess:
     """Return the motion through postures (M, nq) at s (M,) from 0 to 1 in `duration` [s], with its inputs."""
     model = robot.model
-    steps = int(np.clip(round(duration / model.time_step), *STEPS))
+    steps = int(np.clip(round(duration / model.time_step), STEPS[0], MOST_IF_STIFF if robot.is_stiff else STEPS[1]))
     if duration / steps > 1.25 * model.time_step:
         model = model.at_time_step(float(f"{duration / steps:.1g}"))
     # It reaches the goal one step before the end and rests there: Drake's step uses the velocity after the step.

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from drake_diff._base.arrays import Array, Indices
+from drake_diff._base.differences import central_differences
 from drake_diff._base.values import Refusal
 from drake_diff.derivatives.analytic import analytic_of
 from drake_diff.exceptions import DrakeDiffError, ModelError, ModelWarning, SimulationError
@@ -25,8 +26,11 @@ from drake_diff.model.inputs import BodyForce
 from drake_diff.model.model import Model, load_model
 from drake_diff.model.plant import actuators, bodies, joints, labelled
 from drake_diff.model.step import advance, set_state
+from drake_diff.model.tangent import tangent_space
 
 TIME_STEP = 0.02  # [s] of a plan
+# Drake's springs are explicit: a step of 2 / (their angular frequency) is unstable, and a fourth of it is accurate.
+OF_SPRING, NUDGE = 0.5, 1e-6  # the second in rad or m
 FEW = 0.5  # of all joints: if fewer have a motor, the file does not describe motors or lacks some
 TEXTBOOK = 6  # joints: in a larger file, which is not a textbook model, every joint should have a motor
 SMALLEST_DRIVE = 1e-9  # of the largest singular value: a velocity with a smaller one is not driven
@@ -71,7 +75,7 @@ class Robot:
     shapes that overlap in every posture, which are ignored. If `model` has contact, `apart` is the model without it
     in its steps, for motions without contact. `standing` describes how the robot stands on its feet, if it does.
     Otherwise, floating bases are welded. `steered` (nv,) are the velocities that a motion of a fully driven robot
-    chooses; it is None for other robots.
+    chooses; it is None for other robots. `is_stiff` tells that springs limit the time step.
     """
 
     model: Model
@@ -84,6 +88,7 @@ class Robot:
     always: frozenset[Pair] = frozenset()
     standing: tuple[Legs, Rest] | None = None
     apart: Model | None = None
+    is_stiff: bool = False
 
     def closed(self, q: Array) -> Array | None:
         """Return posture q (nq,) with closed loops and unchanged coordinates of the steered joints, or None."""
@@ -134,7 +139,30 @@ def load_robot(path: Path, seed: int, packages: Mapping[str, str | Path] | None 
     _fix_stuck(draft)
     _fix_massless(draft)
     _add_thrusters(draft)
-    return _placed(draft, np.random.default_rng(seed))
+    resolved = spring_step(draft.model)
+    if is_stiff := resolved < TIME_STEP:
+        step = float(f"{resolved:.1g}")
+        draft.mend(f"stiff springs need short time steps: {step:g} s (time_step={step:g})", time_step=step)
+    return replace(_placed(draft, np.random.default_rng(seed)), is_stiff=is_stiff)
+
+
+def spring_step(model: Model) -> float:
+    """Return the time step [s] that resolves the fastest vibration of the springs in the default state, or inf."""
+    if model.plant.num_force_elements() == 1:  # gravity
+        return float("inf")
+    x, still, space = model.default_state, np.zeros(model.nv), tangent_space(model)
+    x = np.append(x[: model.nq], still)
+
+    def force(move: Array) -> Array:
+        set_state(model.double, space.plus(x, np.append(move, still)))
+        return np.asarray(model.double.inverse_dynamics(still))
+
+    stiffness = central_differences(force, model.nv, NUDGE)
+    set_state(model.double, x)
+    ways = loop_velocities(model, x[: model.nq])
+    mass = ways.T @ model.double.mass_matrix() @ ways
+    squares = np.linalg.eigvals(np.linalg.pinv(mass) @ ways.T @ stiffness @ ways).real
+    return OF_SPRING / float(np.sqrt(max(np.max(squares, initial=0.0), np.finfo(float).tiny)))
 
 
 def _reduce_followers(draft: _Draft) -> None:

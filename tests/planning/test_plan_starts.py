@@ -9,7 +9,7 @@ import drake_diff as dd
 from drake_diff.exceptions import ModelError
 from drake_diff.planning import plan
 from drake_diff.planning.guesses import Goals, postures
-from drake_diff.planning.robot import TOUCHING, load_robot, share_to_hold
+from drake_diff.planning.robot import TOUCHING, load_robot, share_to_hold, spring_step
 from drake_diff.runs.fields import Failure
 
 pytestmark = pytest.mark.solve
@@ -217,3 +217,34 @@ def test_a_robot_that_can_go_nowhere_is_refused_and_not_planned_for(tmp_path):
     )
     with pytest.raises(ModelError, match="no goal posture"):
         plan(path, out=tmp_path / "out")
+
+
+SPRUNG = """<mujoco model="sprung"><compiler angle="radian"/><worldbody>
+<body name="a" pos="0 0 0.5"><joint name="j1" axis="0 1 0" range="-2 2" damping="0.5"/>
+<inertial pos="0 0 0.15" mass="1" diaginertia="0.01 0.01 0.001"/><body name="b" pos="0 0 0.3">
+<joint name="j2" axis="0 1 0" range="-2 2" stiffness="{}" damping="0.1"/>
+<inertial pos="0 0 0.1" mass="0.2" diaginertia="0.001 0.001 0.0001"/></body></body></worldbody><actuator>
+<motor joint="j1" ctrlrange="-20 20"/><motor joint="j2" ctrlrange="-60 60"/></actuator></mujoco>"""
+SLIDE = """<mujoco><worldbody><body><joint name="slide" type="slide" axis="1 0 0" stiffness="{}"/>
+<geom type="sphere" size="0.1" mass="2.5"/></body></worldbody><actuator><motor joint="slide"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("stiffness", [4e2, 9e4])
+def test_the_step_that_resolves_a_spring_is_half_the_inverse_of_its_frequency(stiffness, tmp_path):
+    path = tmp_path / "slide.xml"
+    path.write_text(SLIDE.format(stiffness))
+    frequency = np.sqrt(stiffness / 2.5)
+    assert spring_step(dd.load_model(path, time_step=0.01)) == pytest.approx(0.5 / frequency, rel=1e-6)
+    path.write_text(SLIDE.format(0))
+    assert spring_step(dd.load_model(path, time_step=0.01)) == np.inf
+
+
+@pytest.mark.slow
+def test_an_arm_with_a_stiff_spring_is_planned_in_steps_that_resolve_it(tmp_path):
+    """In steps of 20 ms, Drake's explicit spring is unstable, and no plan holds."""
+    path = tmp_path / "sprung.xml"
+    path.write_text(SPRUNG.format(300))
+    result = plan(path, goals={"j2": 0.1}, out=tmp_path / "out")
+    assert result.success, result
+    assert result.solution.problem.model.time_step == 0.001
+    assert any("stiff springs" in repair for repair in result.repairs)
