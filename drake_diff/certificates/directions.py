@@ -38,6 +38,7 @@ class ScreenOptions:
     widest_power: int = 1  # the widest width is 10^(-1/2)
     narrow: float = 2.0  # the first width over the cube root of the precision, see `first_power`
     resolved: float = 4e3  # see `resolution`
+    by_value: float = 0.04  # see `least_size`
     wide: tuple[float, float] = (8e-3, 4e-3)  # of all columns together, to find a staircase, flat except for jumps
     flat: float = 1e-2  # relative to the change over `wide`, as is `alike`
     alike: float = 0.2
@@ -67,6 +68,17 @@ def resolution(precision: float) -> float:
     return float(np.clip(SCREEN.resolved * precision ** (2 / 3), LIMITS.negligible, 1.0))
 
 
+def least_size(largest: Array, values: Array, precision: float) -> Array:
+    """Return the size (m,) that an entry must reach to be resolved to 1 %, from the largest of its row (m,).
+
+    Rounding also hides slopes below 6e-9 of the value (m,) in double precision, 4e-3 in single precision. They are
+    ignored up to the same part of the largest entry of all rows.
+    """
+    by_value = SCREEN.by_value * SCREEN.resolved * precision ** (2 / 3) * np.abs(values)
+    by_others = resolution(precision) * np.max(largest, initial=0.0)
+    return np.asarray(np.maximum(resolution(precision) * largest, np.minimum(by_value, by_others)))
+
+
 @dataclass(frozen=True, eq=False)
 class Claim:
     """The claimed slopes of a function R^n -> R^m of scaled displacements, and the errors that must be noticed."""
@@ -80,14 +92,22 @@ class Claim:
 
     @classmethod
     def of_matrix(
-        cls, a: Array, second: Scales | None = None, *, least: float = 0.0, power: float = LIMITS.power
+        cls,
+        a: Array,
+        second: Scales | None = None,
+        *,
+        least: Array | float = 0.0,
+        power: float = LIMITS.power,
+        still: float = 0.0,
     ) -> "Claim":
         """Claim the slopes of the Jacobian `a` (m, n), of which errors of `power` of an entry must be noticed.
 
-        An entry counts at least `least` of the largest of its row.
+        An entry counts `least` (m, 1) at least. Columns of zeros get the weight `still`. If it is
+        0, they must have no effect at all.
         """
-        size = weigh(a, a, second, least * np.abs(a).max(axis=1, keepdims=True, initial=0))[0]
+        size = weigh(a, a, second, least)[0]
         weights = _weights(a, size)
+        weights[weights == 0] = still
         allowed = power * np.min((weights * size)[:, weights > 0], axis=1, initial=np.inf)
         return cls(lambda z: z @ a.T, weights, allowed, np.abs(a).sum(axis=1), size, second)
 
@@ -101,7 +121,7 @@ class Screen:
 
     def __init__(self, claim: Claim, values: Many, minus: Difference = np.subtract, *, precision: float = EPS):
         self.claim, self._values, self._minus = claim, values, minus
-        n, z, first = len(claim.weights), _normals(len(claim.weights)), first_power(precision)
+        n, z, first = len(claim.weights), normals(len(claim.weights)), first_power(precision)
         self.directions = z * claim.weights  # (K, n)
         signs = np.where(z[0] > 0, 1.0, -1.0)
         line = signs * np.minimum(claim.weights, 1.0)
@@ -113,7 +133,7 @@ class Screen:
             np.zeros((1, n)),
             _to_both_sides(self.directions, self._widths(self.powers)),
             _to_both_sides(line[None], SCREEN.wide),
-            np.multiply.outer([self._widths(self.powers)[0], -SCREEN.wide[0]], unmoved),
+            np.multiply.outer([self._widths(self.powers)[0], -SCREEN.wide[0]], unmoved)[: 2 * unmoved.any()],
         ]
         self.evaluations = sum(map(len, self.displacements))
         evaluated = np.asarray(values(np.vstack(self.displacements)), dtype=float)
@@ -198,8 +218,8 @@ class Screen:
 
     def _doubt(self) -> str:
         """Return the reason to compare entries, or "" if the claim is correct."""
-        near, far = np.any(np.abs(self._left_out) > self.rounding, axis=1)
-        if near:
+        moves = np.any(np.abs(self._left_out) > self.rounding, axis=1)
+        if moves[:1].any():
             return "a column that is 0 in the derivative has an effect"
         if self.in_doubt.any():
             i = int(np.argmax(self.in_doubt))
@@ -209,7 +229,7 @@ class Screen:
         if np.any(self._stairs()):
             return "a row is constant near the point and changes farther away"
         hidden, over = self._hidden, np.maximum(_bound(self.gaps), self.corners) * self._widths(self.powers)[1:, None]
-        if (self.agrees | (over <= hidden)).all() and not far:
+        if (self.agrees | (over <= hidden)).all() and not moves.any():
             return ""
         # A jump, a staircase or noise makes widths disagree. Values along a line distinguish them.
         self.broken, noise = is_broken(self.changes, len(self.claim.weights), self._unit * SCREEN.scatter)
@@ -286,7 +306,7 @@ def _bound(gaps: Array) -> Array:
 
 
 @cache
-def _normals(n: int) -> Array:
+def normals(n: int) -> Array:
     """Return fixed normal numbers (K, n), of which no column is small."""
     random = np.random.default_rng(SCREEN.seeded)
     z = random.standard_normal((SCREEN.directions, n))
