@@ -15,7 +15,7 @@ from drake_diff._base.autodiff import called
 from drake_diff._base.differences import richardson
 from drake_diff._base.values import ShowsItsRepr
 from drake_diff.certificates.certificate import EPS, LIMITS, VERDICTS, Certificate, Entry, Flags, certify_displacement
-from drake_diff.certificates.differences import TINY, noise_of
+from drake_diff.certificates.differences import noise_of
 from drake_diff.certificates.directions import SCREEN, Claim, Screen, first_power, least_size, normals, resolution
 from drake_diff.exceptions import CertificateError, InputError, ShapeError
 
@@ -399,10 +399,11 @@ class _ByTransposedProducts(_Claimed):
         return values @ self._mixed.T
 
     def screen(self, precision: float) -> Screen:
-        share = np.sqrt(len(self.function.rows) / len(self._mixed))  # an entry's part of a combination
-        largest, values = np.abs(self.matrix).max(axis=1), np.abs(self._mixed) @ np.abs(self.function.value)
-        least = np.minimum(share * least_size(largest, values, precision), np.maximum(largest, TINY))
-        claim = Claim.of_matrix(self.matrix, least=least[:, None], still=1.0, power=LIMITS.power / share)
+        if len(self._mixed) == len(self.function.rows):
+            return super().screen(precision)
+        a, values = self.matrix, np.abs(self._mixed) @ np.abs(self.function.value)
+        size = least_size(np.abs(a).max(axis=1), values, precision)  # an entry is a small part of a combination's
+        claim = Claim(lambda z: z @ a.T, np.ones(a.shape[1]), LIMITS.power * size, np.abs(a).sum(axis=1), size[:, None])
         return Screen(claim, lambda d: self._mix(self.function.values(d)), precision=precision)
 
     def blocks(self, columns: list[int], rows: Flags) -> Iterator[Block]:
