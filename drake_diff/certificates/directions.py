@@ -175,8 +175,8 @@ class Screen:
         error = np.linalg.lstsq(self.directions * per_weight, gap, rcond=None)[0].T
         noticeable = self.noticeable[:, None] * per_weight
         statement = (
-            f"{self.evaluations} evaluations along {SCREEN.directions} random directions leave no doubt: of single "
-            "entries an error that large would have been noticed, of several together but for a probability of "
+            f"the slopes along {SCREEN.directions} random directions leave no doubt: of single entries an error that "
+            "large would have been noticed, of several together but for a probability of "
             f"{SCREEN.miss:g}; differences of entries are the nearest that explain the slopes"
         )
         numbers = unscaled(scale, derivative, derivative - error * per_weight, noticeable, noticeable, claim.size)
