@@ -29,10 +29,9 @@ MODULES = [
 ]  # other packages are imported explicitly
 PUBLIC = """
 Bounds BoxObstacle CenterOfMassGoal Constraint Dynamics FrameGoal FrameVelocityGoal JointGoal KeepLevel Model PD
-Problem QuadraticCost Recording SelfCollision Solution SphereObstacle Status audit certify certify_function certify_rollout
-check_plan compare differentiate_rollout differentiate_step example_model explain identify linearize list_parameters
-load_model load_record model_from_diagram robustness rollout save sensitivity solve step
-verify
+Problem QuadraticCost Recording SelfCollision Solution SphereObstacle Status audit certify certify_function
+certify_rollout check_plan compare differentiate_rollout differentiate_step example_model explain identify linearize
+list_parameters load_model load_record model_from_diagram robustness rollout save sensitivity solve step verify
 """.split()
 MOST = 48  # names at the root, few enough to be read as a table of contents
 
