@@ -6,6 +6,7 @@ from . import model as model
 from . import optimize as optimize
 from .certificates.audit import audit as audit
 from .certificates.certify import certify as certify
+from .certificates.functions import certify_function as certify_function
 from .certificates.rollout import certify_rollout as certify_rollout
 from .comparison.recordings import Recording as Recording
 from .comparison.side_by_side import compare as compare

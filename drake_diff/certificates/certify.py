@@ -1,4 +1,4 @@
-"""Certify the derivatives of steps: of a single step entry by entry, of many steps along a few directions first."""
+"""Certify the derivatives of steps: along a few directions first, and entry by entry where these leave a doubt."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from drake_diff._base.arrays import Array
 from drake_diff._base.differences import one_by_one
 from drake_diff.certificates.certificate import LIMITS, Certificate, ModeChange, certificate_of, jitter
-from drake_diff.certificates.differences import Neighbourhood, is_broken, look_around
-from drake_diff.certificates.directions import FirstLook, LookAt
+from drake_diff.certificates.differences import Neighbourhood, look_around
+from drake_diff.certificates.directions import Claim, Screen
 from drake_diff.derivatives.refine_step import RefinedSteps, refine_steps
 from drake_diff.derivatives.smooth_step import form_of
 from drake_diff.derivatives.sources import check_method, step_at
@@ -55,8 +55,11 @@ def certify(
     parameters: Parameters = (),
     method: str = "auto",
     derivatives: StepDerivatives | None = None,
+    thorough: bool = False,
 ) -> Certificate:
-    """Compare the Jacobians of one step with differences of the double step, entry by entry.
+    """Compare the Jacobians of one step with differences of the double step.
+
+    A few random directions decide first, with some 25 steps. Where they leave a doubt, every entry is compared.
 
     Args:
         model: The model.
@@ -65,6 +68,7 @@ def certify(
         parameters: Names, or values by name, of the parameters that the step is also differentiated with respect to.
         method: As in `differentiate_step`.
         derivatives: The derivatives to certify. The default is the result of `differentiate_step`.
+        thorough: Whether every entry is compared in any case, and changes of the contact mode are searched nearby.
 
     Returns:
         The certificate. Its rows are the next state, its columns [x; u; parameters], with states on the tangent space
@@ -82,7 +86,15 @@ def certify(
         ('agree', (2, 3))
     """
     check_method(method)
-    return _certified(model, *check_point(model, x, u), select(model, parameters), method, derivatives, not derivatives)
+    x, u = check_point(model, x, u)
+    vector, look_beside = select(model, parameters), not derivatives
+    if not thorough:
+        with applied(vector) as applied_model:
+            derivatives = derivatives or step_jacobians(applied_model, vector, x, u, method)
+            sure = StepLook.at(applied_model, vector, x, u, derivatives).certificate
+        if sure is not None:
+            return sure
+    return _certified(model, x, u, vector, method, derivatives, look_beside)
 
 
 def _certified(
@@ -307,67 +319,58 @@ class StepAround:
 
         return held
 
-    def first_look(self, derivative: Array) -> Looked:
-        """Check the derivative along a few directions. Return the result, the residual of Drake's steps and the doubt.
+    def screened(self, derivative: Array) -> Screened:
+        """Screen the derivative. Return the result, the residual of Drake's steps and the doubt."""
+        residuals = [-1.0]
 
-        In case of doubt, the comparison is repeated over a tenth of the widths, which do not reach a contact that
-        begins or slides a little farther away. These widths would also miss wider stairs, and corners in a column of
-        small weight. Both are therefore searched along a line, as in the comparison of every entry.
-        """
-        look, left, doubt = None, -1.0, ""
+        def values(displacements: Array) -> Array:
+            x_next, residual = ends(displacements)
+            residuals.append(residual)
+            return x_next
+
         try:
             ends = self.ends()
-            look, left = self._look(LookAt(derivative, self.units), ends)
-            doubt = look.doubt()
-            if doubt:
-                nearer, its_left = self._look(LookAt(derivative, self.units, nearer=True), ends)
-                if not (nearer.doubt() or is_broken(lambda d: self._changes(ends, d), len(self.scale))):
-                    return nearer, its_left, ""
+            screen = Screen(Claim.of_matrix(derivative, self.units), values, self.space.minus)
         except (UnsolvedError, SimulationError) as why:
-            return look, left, doubt or str(why)
-        return look, left, doubt
-
-    def _look(self, plan: LookAt, ends: Ends) -> tuple[FirstLook, float]:
-        values, left = ends(plan.displacements)
-        return plan.taken(values, self.space.minus), left
-
-    def _changes(self, ends: Ends, displacements: Array) -> Array:
-        x_next, _ = ends(np.vstack([np.zeros((1, len(self.scale))), displacements]))
-        return self.space.minus(x_next[1:], x_next[0])
+            return None, -1.0, str(why)
+        return screen, max(residuals), screen.doubt
 
 
-Ends = Callable[[Array], tuple[Array, float]]
-Looked = tuple[FirstLook | None, float, str]
+Screened = tuple[Screen | None, float, str]
 
 
 @dataclass(frozen=True, eq=False)
 class StepLook:
-    """The comparison of a step along a few directions: its certificate, or why every entry must be compared."""
+    """The screen of the derivatives of a step: its certificate, or why every entry must be compared."""
 
     step: StepAround
     derivatives: StepDerivatives
-    look: FirstLook | None  # None if the steps cannot be solved to rounding
+    screen: Screen | None  # None if the steps cannot be solved to rounding
     left: float  # residual of Drake's own steps, relative to the momentum
     doubt: str
+
+    @classmethod
+    def at(cls, model: Model, vector: ParameterVector, x: Array, u: Array, d: StepDerivatives) -> StepLook:
+        """Screen the derivatives `d` of the step from x (nx,) under u (nu,), while `vector` is applied."""
+        step = StepAround.of_point(model, vector, x, u)
+        return cls(step, d, *step.screened(step.jacobian(d, x)))
 
     @property
     def certificate(self) -> Certificate | None:
         """The certificate that the derivative is correct, or None in case of doubt."""
-        if self.look is None or self.doubt:
+        if self.screen is None or self.doubt:
             return None
         note = differences_of_solved(self.left) if self.left >= 0 else ""
-        return self.look.certificate(**self.step.labels(self.derivatives, note))
+        a = self.step.jacobian(self.derivatives, self.step.point[: self.step.model.nx])
+        return self.screen.certificate(a, **self.step.labels(self.derivatives, note))
 
 
 def first_looks(model: Model, xs: Array, us: Array, parameters: Parameters) -> list[StepLook]:
-    """Compare the derivatives of the steps from xs (N, nx) under us (N, nu) along a few directions."""
-    vector, looks = select(model, parameters), []
+    """Screen the derivatives of the steps from xs (N, nx) under us (N, nu)."""
+    vector = select(model, parameters)
     with applied(vector) as model:
         derivatives = derivatives_along(model, xs[0], us, vector=vector, xs=xs)
-        for x, u, d in zip(xs, us, derivatives, strict=True):
-            step = StepAround.of_point(model, vector, x, u)
-            looks.append(StepLook(step, d, *step.first_look(step.jacobian(d, x))))
-    return looks
+        return [StepLook.at(model, vector, *step) for step in zip(xs, us, derivatives, strict=True)]
 
 
 def differences_of_solved(left: float) -> str:

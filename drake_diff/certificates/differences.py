@@ -113,21 +113,31 @@ def look_around(
     return Neighbourhood(centre, size, ahead, sweep.backward, scatter, finest, products, stairs)
 
 
-def is_broken(changes: Many, n: int) -> str:
+def is_broken(changes: Many, n: int, noise: Array | float = 0.0) -> tuple[str, Array]:
     """Describe how a function of displacements (K, n) is not smooth, from its `changes` (K, m) along one line.
 
-    It may be a staircase, or have a corner or a jump within 1e-6 of the point. The result is "" if it is smooth.
+    It may be a staircase, or have a corner or a jump within 1e-6 of the point. The description is "" if it is smooth.
+    The scatter of the values (m,) beside the point is returned too; it is `noise` (m,) at least.
     """
     direction, line_changes = line(n), changes(_along(n))
-    unsolved = np.zeros(line_changes.shape[1])
-    along, rounding, by_spacing = _scattered(line_changes, unsolved + 1)
+    unsolved = np.zeros(line_changes.shape[1]) + DIFFERENCES.significant * noise
+    along, rounding, by_spacing = _scattered(line_changes, np.ones(len(unsolved)))
     still = np.maximum(by_spacing[:, 0].min(axis=0), rounding[:, DIFFERENCES.near - 1].max(axis=0))
+    still = np.maximum(still, noise)
     for k in range(DIFFERENCES.near):
         through = np.concatenate([along[1, k, ::-1], np.zeros((1, len(unsolved))), along[0, k]])
         if np.any(_scatter(through) > DIFFERENCES.significant * still):
-            return "the function has a break near the point"
+            return "the function has a break near the point", still
     some = _stairs(lambda t: changes(np.multiply.outer(t, direction)), along, by_spacing, rounding, unsolved)
-    return next(iter(some.values()), "")
+    return next(iter(some.values()), ""), still
+
+
+def noise_of(changes: Many, n: int) -> Array:
+    """Return the scatter (m,) of a function's values on both sides of the point, from its `changes` (K, m)."""
+    spacing = DIFFERENCES.spacings[DIFFERENCES.near]
+    places = np.multiply.outer([1.0, -1.0], spacing * np.arange(1, DIFFERENCES.values + 1))
+    values = changes(np.multiply.outer(places, line(n)).reshape(-1, n))
+    return np.asarray(_scatter(values.reshape(2, DIFFERENCES.values, -1)).min(axis=0))
 
 
 def _along(n: int) -> Array:

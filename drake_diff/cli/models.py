@@ -1,5 +1,7 @@
-"""Commands on a model file: audit, certify, compare, identify, excite, export-model."""
+"""Commands on a model file: audit, certify, compare, identify, excite, export-model; and certify-function."""
 
+import sys
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,7 +27,7 @@ from drake_diff.cli.text import (
     takes_model,
 )
 from drake_diff.derivatives import METHODS
-from drake_diff.exceptions import InputError
+from drake_diff.exceptions import InputError, UnknownNameError
 
 GAPS = {"same": "green", "other law": "yellow", "other model": "red", "unexplained": "red"}
 FINDINGS = {"error": "bold red", "warning": "bold yellow", "info": "bold dim"}
@@ -36,6 +38,7 @@ def add_commands(app: typer.Typer) -> None:
     for command in (audit, certify, compare, identify, excite):
         app.command()(takes_model(command))
     app.command("export-model")(takes_model(export))
+    app.command("certify-function")(certify_function)
 
 
 def audit(model: Any, file: Path) -> None:
@@ -95,6 +98,45 @@ def certify(
     show(judged(record.verdict), f"{record.sentence}, {record.wall_clock.duration_s:.1f} s")
     show(f"wrote {directory / record.FILE}")
     conclude(record.verdict == "pass")
+
+
+def certify_function(
+    function: Annotated[str, typer.Argument(metavar="MODULE:FUNCTION", help="A function in a module of yours.")],
+    x: Annotated[str, typer.Option(help="The point: numbers separated by commas, or the name of an array in MODULE.")],
+    jacobian: Annotated[str | None, typer.Option(metavar="NAME", help="The function's Jacobian, in MODULE.")] = None,
+    jvp: Annotated[str | None, typer.Option(metavar="NAME", help="Its products with tangents (x, v).")] = None,
+    vjp: Annotated[str | None, typer.Option(metavar="NAME", help="Its products with cotangents (x, w).")] = None,
+    scales: Annotated[str | None, typer.Option(help="Scales of the variables, as --x.")] = None,
+) -> None:
+    """Certify the derivative of a function of any engine, along random directions and then entry by entry.
+
+    This imports MODULE, which runs its code. Exit status 0 only if the derivative agrees.
+    """
+    from drake_diff.certificates.functions import certify_function as certify_derivative
+
+    name, colon, attribute = function.partition(":")
+    if not (name and colon and attribute):
+        raise InputError("MODULE:FUNCTION", got=repr(function), expected="the names of a module and of its function")
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        module = import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name != name:
+            raise
+        raise InputError("MODULE:FUNCTION", got=repr(name), expected="a module in this folder or installed") from error
+
+    def named(option: str, word: str | None) -> Any:
+        if word is None or not word.isidentifier():
+            return None if word is None else floats_in(option, word, "numbers separated by commas, or a name in MODULE")
+        if not hasattr(module, word):
+            raise UnknownNameError(option, got=word, known=[key for key in vars(module) if not key.startswith("_")])
+        return getattr(module, word)
+
+    given = {key: named(f"--{key}", word) for key, word in (("jacobian", jacobian), ("jvp", jvp), ("vjp", vjp))}
+    point, sizes = named("--x", x), named("--scales", scales)
+    certificate = certify_derivative(named("MODULE:FUNCTION", attribute), point, scales=sizes, **given)
+    show(judged(certificate.verdict), str(certificate).removeprefix(certificate.verdict).strip())
+    conclude(certificate.verdict == "agree")
 
 
 def compare(

@@ -1,6 +1,6 @@
 """Checks of a solution's own states and inputs, without replays."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -10,7 +10,7 @@ import numpy as np
 
 from drake_diff._base.arrays import Array, Indices
 from drake_diff.certificates.certificate import Certificate, certify_jacobian
-from drake_diff.certificates.directions import LookAt
+from drake_diff.certificates.directions import Claim, Screen
 from drake_diff.model.contact import penetration
 from drake_diff.model.parameters import applied
 from drake_diff.model.step import set_state
@@ -278,6 +278,10 @@ def telling_knots(problem: Problem, xs: Array) -> Indices:
     return np.unique([0, *knots.tolist(), count - 1]).astype(np.intp)
 
 
+def _near(f: Callable[[Array], Array], point: Array, scale: Array, displacements: Array) -> Array:
+    return f(point + scale * displacements)
+
+
 def certify_equations(
     problem: Problem,
     jacobian: Any,
@@ -311,12 +315,10 @@ def certify_equations(
         f = system.at_step(k).values if isinstance(system, DiscreteMap) else values
         derivative = partial(jacobian, k=k) if is_map else jacobian
         matrix = np.asarray(derivative(point), dtype=float)
-        look = None
-        if np.all(np.isfinite(matrix)):
-            plan = LookAt(matrix * scale)
-            look = plan.taken(np.asarray(f(point + scale * plan.displacements), dtype=float))
-        if look is None or look.doubt():
+        finite, near = bool(np.all(np.isfinite(matrix))), partial(_near, f, point, scale)
+        screen = Screen(Claim.of_matrix(matrix * scale), near) if finite else None
+        if screen is None or screen.doubt:
             certificates.append(certify_jacobian(f, point, derivative, batched=True, scale=scale, **named))
         else:
-            certificates.append(look.certificate(scale, **named))
+            certificates.append(screen.certificate(matrix * scale, scale, **named))
     return tuple(certificates)

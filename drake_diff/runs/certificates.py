@@ -94,7 +94,7 @@ def _certify_state(model: Model, state: SampledState, parameters: Parameters, me
     try:
         advance(model.double, state.x, state.u)
         modes = {" - ".join(pair): mode for pair, mode in sorted(active_modes(model).items())}
-        certificate = certify(model, state.x, state.u, parameters=parameters, method=method)
+        certificate = certify(model, state.x, state.u, parameters=parameters, method=method, thorough=True)
     except (GradientError, SimulationError) as error:
         return CertifiedState(**point, gradient=None, refusal=str(error), contact_modes=modes)
     return CertifiedState(

@@ -399,3 +399,31 @@ def test_a_plan_of_another_tool_is_checked(tmp_path, monkeypatch, capsys):
         assert exit_of(monkeypatch, "check", tmp_path / words[0], *words[1:], *robot) == status
         assert text in capsys.readouterr().out
     assert dd.verify(tmp_path / "run").verdict == "holds"
+
+
+@each_row(
+    "words, status, message",
+    [
+        (("mine:step", "--x", "1,2", "--jacobian", "jacobian"), 0, "agree"),
+        (("mine:step", "--x", "start", "--vjp", "vjp", "--scales", "1,1"), 0, "agree"),
+        (("mine:step", "--x", "start", "--jacobian", "wrong"), 1, "d f[0] / d x[1]"),
+        (("mine:stop", "--x", "start", "--jacobian", "wrong"), 2, "did you mean 'step'"),
+        (("other:step", "--x", "start", "--jacobian", "wrong"), 2, "a module in this folder or installed"),
+        (("mine", "--x", "start", "--jacobian", "wrong"), 2, "the names of a module and of its function"),
+        (("mine:step", "--x", "1,two", "--jacobian", "wrong"), 2, "numbers separated by commas"),
+        (("mine:step", "--x", "1,2"), 2, "expected one of them"),
+    ],
+)
+def test_a_function_of_a_module_is_certified(tmp_path_factory, words, status, message):
+    folder = tmp_path_factory.mktemp("functions")
+    (folder / "mine.py").write_text(
+        "import numpy as np\n"
+        "start = np.array([1.0, 2.0])\n"
+        "step = lambda x: np.array([x[0] * x[1], np.sin(x[1])])\n"
+        "jacobian = lambda x: np.array([[x[1], x[0]], [0.0, np.cos(x[1])]])\n"
+        "wrong = lambda x: jacobian(x) * [1.0, 1.02]\n"
+        "vjp = lambda x, w: w @ jacobian(x)\n"
+    )
+    done = drake_diff("certify-function", *words, cwd=folder)
+    assert done.returncode == status, done.stderr
+    assert message in re.sub(r"\s+", " ", done.stdout + done.stderr)
