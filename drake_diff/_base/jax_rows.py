@@ -1,6 +1,7 @@
 """Functions that a user writes in JAX, compiled with their derivatives for many points at once."""
 
 import sys
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -8,8 +9,10 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import returns_jax
+from drake_diff.exceptions import GradientWarning
 
 SAME_VALUES = 1e-10  # the same operations in another order, relative to values above 1
+STEP, SAME_SLOPES = 1e-6, 1e-4  # a difference over this step is accurate to 1e-6 for values and slopes of order 1
 
 
 class JaxRows:
@@ -45,13 +48,13 @@ class JaxRows:
         return points[:, : self.width], points[:, self.width :]
 
 
-def in_jax(f: Any, nx: int, rows: int, probe: Array, width: int | None = None) -> JaxRows | None:
+def in_jax(name: str, f: Any, nx: int, rows: int, probe: Array, width: int | None = None) -> JaxRows | None:
     """Return the function (x, rest) -> (rows,) of points like `probe` if it is written in JAX, or else None.
 
-    It is None too if JAX cannot trace all of the function or gets other values.
+    The result is None too if JAX cannot trace all of the function or gets other values. Messages show the `name`.
     """
     with np.errstate(all="ignore"):
-        if not returns_jax("function", f, probe[0, :nx], probe[0, nx:]):
+        if not returns_jax(name, f, probe[0, :nx], probe[0, nx:]):
             return None
         wanted = np.array([np.reshape(f(point[:nx], point[nx:]), rows) for point in probe])
     try:
@@ -59,5 +62,20 @@ def in_jax(f: Any, nx: int, rows: int, probe: Array, width: int | None = None) -
         values = function.values(probe)
     except Exception:  # a part of f may be written in NumPy and raise anything
         return None
-    same = np.allclose(values, wanted, rtol=SAME_VALUES, atol=SAME_VALUES, equal_nan=True)
-    return function if same else None
+    if not np.allclose(values, wanted, rtol=SAME_VALUES, atol=SAME_VALUES, equal_nan=True):
+        return None
+    _warn_of_other_slopes(name, function, probe)
+    return function
+
+
+def _warn_of_other_slopes(name: str, function: JaxRows, points: Array) -> None:
+    """Warn if JAX's slopes along a line are not those of the values, as behind `stop_gradient` or a wrong rule."""
+    direction = np.zeros(points.shape[1])
+    direction[: function.width] = np.cos(np.arange(function.width))
+    ahead, behind = (function.values(points + side * STEP * direction) for side in (1, -1))
+    measured, claimed = (ahead - behind) / (2 * STEP), function.jacobians(points) @ direction[: function.width]
+    bad = np.abs(measured - claimed) > SAME_SLOPES * np.maximum(1.0, np.abs(measured))
+    if np.any(np.all(bad, axis=0)):  # at every point, so that a corner at one of them does not count
+        row = int(np.argmax(np.all(bad, axis=0)))
+        text = f"value {row} of {name} changes by {measured[0, row]:.6g} along a line, by JAX {claimed[0, row]:.6g}"
+        warnings.warn(f"{text}: see dd.certify_function", GradientWarning, stacklevel=2)

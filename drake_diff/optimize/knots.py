@@ -225,7 +225,7 @@ def constraint_function(c: Constraint, nx: int, probe: Array) -> PointFunction:
         function = trace(as_given, nx, probe, values)
     if not isinstance(function, Refusal):
         return Traced(function)
-    if (compiled := in_jax(as_given, nx, len(c.lower), probe)) is not None:
+    if (compiled := in_jax(f"constraint {c.label}", as_given, nx, len(c.lower), probe)) is not None:
         return InJax(compiled)
     return _called(c, function.reason, nx, probe, np.arange(probe.shape[1] if c.takes_input else nx))
 
@@ -365,7 +365,7 @@ class _Function:
         with np.errstate(all="ignore"):
             function = trace(evaluate, nx, knots, self._called(knots)[:, None])
         if isinstance(function, Refusal):
-            self.by_jax = in_jax(evaluate, nx, 1, knots, self.n)
+            self.by_jax = in_jax("cost", evaluate, nx, 1, knots, self.n)
             return
         z, known = ca.SX.sym("z", self.n), ca.SX.sym("known", knots.shape[1] - self.n)
         inputs, value = [ca.vertcat(z, known)], function(ca.vertcat(z, known))

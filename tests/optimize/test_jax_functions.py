@@ -1,5 +1,7 @@
 """Functions that a user writes in JAX give the plans and gradients of the same functions in NumPy."""
 
+import warnings
+
 import cloudpickle
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from helpers.table import each_row
 import drake_diff as dd
 from drake_diff._base.autodiff import UserFunction
 from drake_diff._base.jax_rows import in_jax
-from drake_diff.exceptions import GradientError, InputError
+from drake_diff.exceptions import GradientError, GradientWarning, InputError
 from drake_diff.motion import ParametricPolicy
 
 jax = pytest.importorskip("jax", reason="pip install 'drake-diff[jax]'")
@@ -103,7 +105,7 @@ def test_jax_traces_a_cost_once_for_its_values_and_once_for_each_derivative():
         return jnp.sum(x**2) + jnp.sum(u**2)
 
     function = UserFunction("running_cost", cost, (), 1)
-    compiled = in_jax(lambda x, rest: function(x, rest), 2, 1, np.ones((3, 3)))
+    compiled = in_jax("cost", lambda x, rest: function(x, rest), 2, 1, np.ones((3, 3)))
     first = len(traced)
     points = np.arange(12.0).reshape(4, 3)
     for _ in range(3):
@@ -122,8 +124,23 @@ def test_single_precision_is_refused_with_the_setting_to_change():
 def test_a_function_that_jax_cannot_trace_is_called():
     """A branch on a number works with single points, and JAX does not see it."""
     inner = UserFunction("cost", lambda x, u: jnp.sum(x**2), (), 1)
-    assert in_jax(lambda x, u: inner(x, u) if x[0] > 0 else 0.0, 2, 1, np.ones((3, 3))) is None
-    assert in_jax(lambda x, u: np.sum(x**2), 2, 1, np.ones((3, 3))) is None
+    assert in_jax("cost", lambda x, u: inner(x, u) if x[0] > 0 else 0.0, 2, 1, np.ones((3, 3))) is None
+    assert in_jax("cost", lambda x, u: np.sum(x**2), 2, 1, np.ones((3, 3))) is None
+
+
+def test_a_slope_that_jax_does_not_see_is_reported():
+    """JAX has the slope 0 behind `stop_gradient`. A corner at one of the points is no reason for a warning."""
+
+    def cost(x, u):
+        return jnp.sum(x**2) + 3 * jax.lax.stop_gradient(x[0])
+
+    user, points = UserFunction("running_cost", cost, (), 1), np.array([[1.0, 2.0, 3.0], [0.5, 0.1, 0.2], [3, 2, 1]])
+    with pytest.warns(GradientWarning, match="certify_function"):
+        in_jax("cost", lambda x, rest: user(x, rest), 2, 1, points)
+    corner = UserFunction("running_cost", lambda x, u: jnp.abs(x[0] - 1) + x[1] ** 3, (), 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert in_jax("cost", lambda x, rest: corner(x, rest), 2, 1, points) is not None
 
 
 def test_a_function_that_returns_no_numbers_is_refused_by_its_name():

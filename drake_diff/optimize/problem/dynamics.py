@@ -61,7 +61,7 @@ class Pointwise:
             i = np.unravel_index(int(np.nanargmax(np.abs(carried_values - single))), single.shape)
             got = f"{carried_values[i]:.6g} with AutoDiffXd and {single[i]:.6g} with floats"
             raise GradientError(f"{subject} is {got} at the same x and u: write it as {ORDINARY}")
-        self.compiled = in_jax(f, nx, self.rows, probe)
+        self.compiled = in_jax(subject, f, nx, self.rows, probe)
         if getattr(f, "takes_rows", False):  # forward kinematics are compared with Drake's
             self.takes_rows = True
             self.takes_rows = bool(np.allclose(self.values(probe), single, rtol=SAME_VALUES, atol=0.0))

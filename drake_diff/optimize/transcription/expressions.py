@@ -72,7 +72,7 @@ class Timed:
         with np.errstate(all="ignore"):
             self.expression = trace(rate.f, nx, rate.probe, rate.values(rate.probe))
         refused = isinstance(self.expression, Refusal)
-        self.compiled = in_jax(rate.f, nx, 1, rate.probe, self.width) if refused else None
+        self.compiled = in_jax("running_cost", rate.f, nx, 1, rate.probe, self.width) if refused else None
         self.why_not = "" if self.compiled is not None or not refused else self.expression.reason
 
     def at(self, times: Array) -> PointFunction:
@@ -147,7 +147,7 @@ def _chosen(f: Any, values: Values, linearize: Linearize, rows: int, nx: int, pr
         expression = trace(f, nx, probe, values(probe))
     if not isinstance(expression, Refusal):
         return Traced(expression)
-    if (compiled := in_jax(f, nx, rows, probe)) is not None:
+    if (compiled := in_jax("function", f, nx, rows, probe)) is not None:
         return InJax(compiled)
     return Called(expression.reason, values, linearize, rows, probe.shape[1])
 
