@@ -208,6 +208,8 @@ def identify(
     show_table(("parameter", "before", "found", "95 % from", "to", "unit", ""), rows, left=1)
     if record.rms and not record.explained:
         show_table(("rms error", "before", "after", "unit"), [(name, *e) for name, e in record.rms.items()], left=1)
+    for line in record.remains:
+        show(plain("remains", "bold dim"), line)
     for line in record.unidentifiable:
         show(plain("left open", "bold dim"), line)
     show(f"fitted: {record.motion}")

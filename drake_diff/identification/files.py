@@ -145,6 +145,7 @@ def record_of(e: Identification, name: str) -> FitRecord:
         "data": _data(recordings),
         "estimates": estimates_of(e),
         "unidentifiable": list(e.unidentifiable),
+        "remains": list(e.remains),
         "noise": dict(e.noise),
         "rms": dict(e.sizes),
         "correlation": _correlation(e.covariance),
