@@ -24,9 +24,10 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.clock import now
 from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.identification.motion import SERVOS, DiscreteMotion, Law, Slopes, TreeMotion
-from drake_diff.identification.recordings import LEAST, Excerpt
+from drake_diff.identification.recordings import LEAST, Excerpt, unseen_heights
 from drake_diff.identification.sensors import Sensors
 from drake_diff.identification.unknowns import BIAS, Unknowns
+from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 from drake_diff.model.tangent import tangent_space
 
@@ -44,6 +45,7 @@ FARTHER = 3.0  # growth of the trust region after an accepted full step, for mot
 NEAR = 10.0  # radius of the trust region of velocities, in units of their measured accuracy, for motions with kinks
 TOO_LARGE = 1e100  # derivative, in units of the noise, above which its square may overflow
 STUCK = "the line search found no motion that is closer to the measurements"
+RESTS = 1e4  # [1/rad, 1/m] the same for what is not measured of a free body or a height, if bodies touch
 NO_PRIOR = 1e-7  # [1/rad, 1/m] regularization that bounds first states without measurements
 
 
@@ -202,8 +204,14 @@ class Fit:
         delay = None if unknowns.delay is None else 0.0
         self.segments = cut_segments(law, pieces, model.nu, delay)
         self._cut = delay, self.segments  # the latest cut, and its delay
+        nv, self.prior = model.nv, [np.full(self.space.size, NO_PRIOR) for _ in pieces]  # of the first states
+        free = {j for _, first in coordinates_of(model).free for j in range(first, first + 6)}
+        for prior, piece in zip(self.prior, pieces if isinstance(law, DiscreteMotion) else (), strict=False):
+            unseen = ~np.isfinite(self.space.minus(piece.ys, piece.ys)).any(axis=0)
+            for j in free.union(height for _, height in unseen_heights(model, piece)):
+                prior[[k for k in (j, nv + j) if unseen[j] and unseen[k]]] = RESTS
         self.gap_scale = np.empty(self.space.size)
-        nv, period = model.nv, max(float(np.median(np.diff(pieces[0].times))), 1e-3)
+        period = max(float(np.median(np.diff(pieces[0].times))), 1e-3)
         from_positions = np.where(np.isfinite(noise[:nv]), noise[:nv], 1.0) / (5 * period)
         self.gap_scale[:nv] = np.where(np.isfinite(noise[:nv]), noise[:nv], 1.0)
         self.gap_scale[nv:] = np.where(np.isfinite(noise[nv : 2 * nv]), noise[nv : 2 * nv], from_positions)
@@ -387,7 +395,7 @@ class Fit:
                 D = end[:, :n] @ D
                 D[:, n:] += end[:, n:]
             ridge = np.zeros((n, n + len(columns) + 1))
-            ridge[:, :n] = NO_PRIOR * np.eye(n)
+            ridge[:, :n] = np.diag(self.prior[p][tangent])
             if self.law.kinks:
                 ridge[n // 2 :, n // 2 : n] = np.diag(1 / (reach * NEAR * scale[n // 2 :]))
             R = _triangle(np.vstack([*rows, ridge]))

@@ -88,7 +88,8 @@ def identify(
         recordings: One or more of `dd.Recording`, or files for `comparison.read_recording`. States that were not
             measured are NaN, or columns that are missing in a file; positions alone are enough. Inputs are constant
             from each sample to the next. The sample times need not be equidistant.
-        parameters: Names as in `dd.list_parameters`, and also JOINT.coulomb_friction, INPUT.strength, STATE.bias and
+        parameters: Names as in `dd.list_parameters`, and also JOINT.coulomb_friction, INPUT.strength, STATE.bias,
+            BODY.point_mass [kg], added at the centre of mass with the inertia about it unchanged, and
             model.input_delay [s], by which inputs act later than they are recorded. Or "all": masses, centres of mass,
             inertias, dampings, spring stiffnesses and rotor inertias. If inputs are commanded positions, "all" are
             dampings, Coulomb frictions, rotor inertias and the input delay; INPUT.kp and INPUT.kd can be added.

@@ -122,7 +122,10 @@ def freedoms_of(unknowns: Unknowns, R: Array, groups: Iterable[slice]) -> tuple[
 
 def freedom_of(fit: Fit, solved: Solved) -> Freedom:
     """Return the degrees of freedom at the end of a fit."""
-    of_starts = sum(float(np.sum(np.abs(np.diag(R)) > 10 * NO_PRIOR)) for R, _, _ in solved.reduced.own)
+    blocks = zip(solved.reduced.own, fit.prior, strict=True)
+    of_starts = sum(
+        float(np.sum((np.abs(np.diag(R)) > 10 * NO_PRIOR) & (prior == NO_PRIOR))) for (R, _, _), prior in blocks
+    )
     unknowns, R = fit.unknowns, solved.reduced.R
     (of_unknowns,) = (0.0,) if fit.fixed else freedoms_of(unknowns, R, [slice(0, len(solved.z))])
     return Freedom(sum(int(np.isfinite(r).sum()) for r in solved.reduced.residuals), of_starts, of_unknowns)

@@ -16,13 +16,13 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.files import write_whole
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, UnknownNameError
 from drake_diff.identification.results import Identification, Request
-from drake_diff.identification.unknowns import BIAS, CENTER, COULOMB, DELAY, INERTIA, MASS, STRENGTH
+from drake_diff.identification.unknowns import BIAS, CENTER, COULOMB, DELAY, INERTIA, MASS, POINT_MASS, STRENGTH
 from drake_diff.model.load_file import add_packages
 from drake_diff.model.model import Model, load_model
 from drake_diff.model.parameters import applied, list_parameters, select
 from drake_diff.model.xml_text import Element, XmlText
 
-BODY = (MASS, CENTER, INERTIA)
+BODY = (MASS, CENTER, INERTIA, POINT_MASS)
 SPRING = {
     "spring_stiffness": "spring_stiffness",
     "spring_rest_angle": "spring_reference",
@@ -303,6 +303,7 @@ def _inertia(model: Model, e: Identification, label: str) -> tuple[float, Array,
         spatial = model.double.body(label).CalcSpatialInertiaInBodyFrame(model.double.context)
     mass, center = float(spatial.get_mass()), np.asarray(spatial.get_com(), dtype=float)
     inertia = np.array(spatial.Shift(center).CalcRotationalInertia().CopyToFullMatrix3())
+    mass += float(e.values.get(f"{label}.{POINT_MASS}", 0.0))
     inertia[np.abs(inertia) < ROUNDING * mass * float(center @ center)] = 0.0
     return mass, center, inertia
 
@@ -325,6 +326,8 @@ def _check(e: Identification, model: Model, path: Path) -> None:
                     central = body.Shift(center).CalcRotationalInertia()
                     wanted = np.concatenate([central.get_moments(), central.get_products()])
                     size = float(np.max(np.abs(wanted))) + 1e-3 * body.get_mass() * float(center @ center)
+                if quantity == MASS:
+                    wanted = wanted + e.values.get(f"{label}.{POINT_MASS}", 0.0)
             if p.name not in new:
                 raise UnknownNameError(f"{path.name}: parameter", got=p.name, known=new)
             if not np.allclose(new[p.name], wanted, rtol=0, atol=SAME * size):
