@@ -53,7 +53,7 @@ FAR = 3.0  # prior standard deviation of a quantity's change, in units of its ow
 
 @dataclass(frozen=True)
 class RangeOptions:
-    """The ranges of joints, servos, delays and point masses, and the usual sizes of quantities that are 0 in the model."""
+    """The ranges of joints, servos, delays and point masses, and usual sizes of quantities that are 0 in the model."""
 
     most_rotor: float = 1000.0  # times the inertia that a joint moves: the largest reflected rotor inertia
     least_speed: float = 0.1  # [rad/s, m/s] at which the largest damping takes the largest effort
