@@ -154,7 +154,9 @@ def compare(
 def identify(
     model: Any,
     file: Path,
-    recording: Annotated[list[Path], typer.Option(help="A recorded motion: CSV, .npz, MCAP or a ROS 2 bag. Repeatable.")],
+    recording: Annotated[
+        list[Path], typer.Option(help="A recorded motion: CSV, .npz, MCAP or a ROS 2 bag. Repeatable.")
+    ],
     parameters: Annotated[str | None, names_option("Parameters to estimate", "all")] = None,
     noise: Annotated[list[str] | None, repeated("STATE=DEVIATION", "Standard deviation of a state's noise")] = None,
     held_out: Annotated[

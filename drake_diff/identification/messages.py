@@ -178,6 +178,8 @@ def identification_sentence(
 
 def _change(before: float, after: float) -> str:
     """Return whether an error falls or rises, and both values."""
+    if f"{before:.3g}" == f"{after:.3g}":
+        return f"stays at {after:.3g}"
     return f"{'falls' if after <= before else 'rises'} from {before:.3g} to {after:.3g}"
 
 
