@@ -24,10 +24,9 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.clock import now
 from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.identification.motion import SERVOS, DiscreteMotion, Law, Slopes, TreeMotion
-from drake_diff.identification.recordings import LEAST, Excerpt, unseen_heights
+from drake_diff.identification.recordings import LEAST, Excerpt, unseen_at_rest
 from drake_diff.identification.sensors import Sensors
 from drake_diff.identification.unknowns import BIAS, Unknowns
-from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 from drake_diff.model.tangent import tangent_space
 
@@ -205,11 +204,10 @@ class Fit:
         self.segments = cut_segments(law, pieces, model.nu, delay)
         self._cut = delay, self.segments  # the latest cut, and its delay
         nv, self.prior = model.nv, [np.full(self.space.size, NO_PRIOR) for _ in pieces]  # of the first states
-        free = {j for _, first in coordinates_of(model).free for j in range(first, first + 6)}
         for prior, piece in zip(self.prior, pieces if isinstance(law, DiscreteMotion) else (), strict=False):
-            unseen = ~np.isfinite(self.space.minus(piece.ys, piece.ys)).any(axis=0)
-            for j in free.union(height for _, height in unseen_heights(model, piece)):
-                prior[[k for k in (j, nv + j) if unseen[j] and unseen[k]]] = RESTS
+            for j in unseen_at_rest(model, piece):
+                prior[j] = RESTS
+                prior[nv + j] = NO_PRIOR if np.isfinite(piece.ys[:, model.nq + j]).any() else RESTS
         self.gap_scale = np.empty(self.space.size)
         period = max(float(np.median(np.diff(pieces[0].times))), 1e-3)
         from_positions = np.where(np.isfinite(noise[:nv]), noise[:nv], 1.0) / (5 * period)

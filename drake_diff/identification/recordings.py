@@ -258,6 +258,18 @@ def unseen_heights(model: Model, piece: Excerpt) -> list[tuple[int, int]]:
     return [(i, j) for i, j in heights(model) if unseen[i] and j not in driven] if np.any(unseen[: model.nq]) else []
 
 
+def unseen_at_rest(model: Model, piece: Excerpt) -> list[int]:
+    """Return the velocities that begin at rest: of `unseen_heights`, and of free bodies along axes without positions.
+
+    It is empty if bodies cannot touch, or if a diagram's systems, such as propellers, move them.
+    """
+    if not model.contract.contact.collision_pairs or np.any(model.inputs.actuator < 0):
+        return []
+    seen = np.isfinite(tangent_space(model).minus(piece.ys, piece.ys)).any(axis=0)
+    free = {j for _, first in coordinates_of(model).free for j in range(first, first + 6)}
+    return [j for j in free.union(j for _, j in unseen_heights(model, piece)) if not seen[j]]
+
+
 def _resting(model: Model, x: Array, i: int, j: int) -> float:
     """Return the position i of the body at x (nx,) at which it begins to touch others, or x[i] if it touches none."""
     set_state(model.double, x)

@@ -1,29 +1,22 @@
-"""Fit the recorded joints of a hanging Unitree Go2, and judge the values on the part that was not fitted.
+"""Fit the joints of a hanging Unitree Go2 on 15 s of its log, and judge the values in windows of 0.5 s of the rest.
 
-    pip install -e '.[test]' pin
     python tests/benchmarks/identify_go2.py [--gains] [--plain]
 
-The first 15 s are fitted: damping, Coulomb friction and rotor inertia of 12 joints and the delay of the commands, with
---gains also kp and kd. The rest is predicted in windows of 0.5 s, each from a measured state: the cubic through 11
-samples. The judges are the law that is fitted, Drake's own steps of 0.5 ms, and MuJoCo with steps of 0.5 ms and dry
-friction. In Drake, whose joints have no friction, the commands are shifted by friction / kp. --plain also fits the
-same values by scipy's least_squares with windows of Pinocchio's motion.
+A window starts at a measured state: the cubic through 11 samples. The judges are the law that is fitted, and Drake and
+MuJoCo with steps of 0.5 ms. In Drake, whose joints have no friction, commands are shifted by friction / kp. --gains
+also fits kp and kd, and --plain fits the other values by SciPy with the motion of Pinocchio.
 """
 
 import argparse
-import sys
 import time
 import warnings
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import _one_thread  # noqa: F401 (before NumPy)
-
-sys.path.insert(0, str(Path(__file__).parents[1]))  # tests/helpers
-
 import mujoco
 import numpy as np
-from helpers.models import robot_file
+from identify_fits import bare, robot_file
 from scipy.optimize import least_squares
 
 import drake_diff as dd
@@ -87,10 +80,7 @@ def in_drake(model, recording, values, windows, starts):
 
 
 def in_mujoco(model, recording, values, windows, starts):
-    root = ET.parse(FILE).getroot()
-    for link in root.iter("link"):
-        for shape in [*link.findall("visual"), *link.findall("collision")]:
-            link.remove(shape)
+    root = bare(FILE)
     ET.SubElement(ET.SubElement(root, "mujoco"), "compiler", fusestatic="false")
     m = mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
     m.opt.timestep, m.opt.integrator = STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -111,7 +101,7 @@ def in_mujoco(model, recording, values, windows, starts):
 
 
 def plain_fit(t, q, u):
-    """Return 37 values by scipy, with positions and commands (n, 12) in the order of JOINTS."""
+    """Return 37 values for positions and commands (n, 12) in the order of JOINTS."""
     import pinocchio as pin
 
     m = pin.buildModelFromUrdf(str(FILE))
