@@ -196,7 +196,9 @@ def compare(
 def identify(
     model: Any,
     file: Path,
-    recording: Annotated[list[Path], typer.Option(help="A recorded motion: CSV, MCAP or a ROS 2 bag. Repeatable.")],
+    recording: Annotated[
+        list[Path], typer.Option(help="A recorded motion: CSV, .npz, MCAP or a ROS 2 bag. Repeatable.")
+    ],
     parameters: Annotated[str | None, names_option("Parameters to estimate", "all")] = None,
     noise: Annotated[list[str] | None, repeated("STATE=DEVIATION", "Standard deviation of a state's noise")] = None,
     held_out: Annotated[
@@ -250,6 +252,8 @@ def identify(
     show_table(("parameter", "before", "found", "95 % from", "to", "unit", ""), rows, left=1)
     if record.rms and not record.explained:
         show_table(("rms error", "before", "after", "unit"), [(name, *e) for name, e in record.rms.items()], left=1)
+    for line in record.remains:
+        show(plain("remains", "bold dim"), line)
     for line in record.unidentifiable:
         show(plain("left open", "bold dim"), line)
     show(f"fitted: {record.motion}")

@@ -1,7 +1,8 @@
-"""Recorded motions of a model: reading from CSV, MCAP and ROS 2 messages, checks, and storage as arrays in a run.
+"""Recorded motions of a model: reading from CSV, NumPy, MCAP and ROS 2 files, checks, and storage as arrays in a run.
 
 ROS 2 messages, in a bag or in one MCAP file, have the time of their headers. sensor_msgs/JointState (/joint_states, or
-the only topic of this type) gives joints by name, with efforts as the inputs of their actuators. nav_msgs/Odometry, or
+the only topic of this type) gives joints by name, with efforts as the inputs of their actuators. Commanded positions
+are those of trajectory_msgs/JointTrajectory: the latest message holds, linear between its points. nav_msgs/Odometry, or
 geometry_msgs/PoseStamped and TwistStamped, give one free body. With several bodies, a message belongs to the body
 of its frame, or to the body whose name is part of the topic's name. A truncated bag is refused. A changed byte is
 detected only if the writer added a checksum, which rosbags does not.
@@ -30,36 +31,41 @@ from drake_diff._base.values import ShowsItsRepr
 from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyError, UnknownNameError
 from drake_diff.logs.mcap_file import has_channels, raw_messages, read_mcap
 from drake_diff.mechanics.coordinates import rotation
-from drake_diff.mechanics.description import Link, describe_whole
+from drake_diff.mechanics.description import Link, describe_tree, describe_whole
+from drake_diff.model.file_facts import Mjcf
 from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators, joints, labelled
 from drake_diff.model.tangent import tangent_space
+from drake_diff.model.xml_text import XmlText, first_number
 
 JOINTS, ODOMETRY = "sensor_msgs/msg/JointState", "nav_msgs/msg/Odometry"
 POSE, TWIST = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TwistStamped"
 ROS2 = "cdr"  # encoding of ROS 2 messages
-USED = (JOINTS, ODOMETRY, POSE, TWIST)
+COMMANDS = "trajectory_msgs/msg/JointTrajectory"
+USED = (JOINTS, ODOMETRY, POSE, TWIST, COMMANDS)
 Stamped = dict[int, Any]  # messages by time [ns]
 Motion = tuple[Array, Array, Array]  # times (n,) [s], xs (n, nx), us (n - 1, nu)
 Source = tuple[str, str]  # a topic, and the body frame in its messages, or "" if they have none
 
 
-def read_ros2(path: Path, model: Model) -> tuple[Motion, Mapping[str, str]]:
+def read_ros2(path: Path, model: Model, gaps: bool = False) -> tuple[Motion, Mapping[str, str]]:
     """Return (times (n,) from 0, xs (n, nx), us (n - 1, nu)), and the metadata record "contract" of an MCAP file.
 
-    Raises InputError that names message and time if a joint, a twist or an effort is missing.
+    With `gaps`, velocities that a JointState lacks are NaN. Raises InputError that names message and time if a joint, a
+    twist or an effort is missing.
     """
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise MissingDependencyError("a ROS 2 bag needs rosbags: pip install 'drake-diff[ros2]'") from error
-    store, log = get_typestore(Stores.ROS2_HUMBLE), _Found(str(path), model)
+    store, log = get_typestore(Stores.ROS2_HUMBLE), _Found(str(path), model, gaps)
     messages, facts = _messages(path)
-    for topic, kind, data in messages:
+    for topic, kind, data, logged in messages:
         message = store.deserialize_cdr(data, kind)
         stamp = message.header.stamp
-        source = topic, _frame_of_body(kind, message)
-        log.sources[kind].setdefault(source, {})[stamp.sec * 1_000_000_000 + stamp.nanosec] = message
+        source, time = (topic, _frame_of_body(kind, message)), stamp.sec * 1_000_000_000 + stamp.nanosec
+        time = logged if kind == COMMANDS and not time else time  # without a stamp, a trajectory begins at once
+        log.sources[kind].setdefault(source, {})[time] = message
     return log.motion(), facts
 
 
@@ -69,8 +75,8 @@ def _frame_of_body(kind: str, message: Any) -> str:
     return str(message.header.frame_id) if kind == TWIST else ""
 
 
-def _messages(path: Path) -> tuple[list[tuple[str, str, bytes]], Mapping[str, str]]:
-    """Return topic, type and bytes of the messages used, and the metadata record "contract" of an MCAP file."""
+def _messages(path: Path) -> tuple[list[tuple[str, str, bytes, int]], Mapping[str, str]]:
+    """Return topic, type, bytes and log time of the messages, and the metadata record "contract" of an MCAP file."""
     from rosbags.rosbag2 import Reader
 
     files, rows, facts = sorted(path.glob("*.mcap")) if path.is_dir() else [path], [], dict[str, str]()
@@ -87,14 +93,15 @@ def _messages(path: Path) -> tuple[list[tuple[str, str, bytes]], Mapping[str, st
             raise ArtifactError(f"{file}: expected only tables of messages, got {others} views and triggers")
     with Reader(path) as bag:
         wanted = [c for c in bag.connections if c.msgtype in USED]
-        return [(c.topic, c.msgtype, data) for c, _, data in bag.messages(wanted)] if wanted else [], {}
+        return [(c.topic, c.msgtype, data, logged) for c, logged, data in bag.messages(wanted)] if wanted else [], {}
 
 
 class _Found:
     """Messages by type and source, and their conversion to states."""
 
-    def __init__(self, path: str, model: Model):
-        self.path, self.model, self.description = path, model, describe_whole(model)
+    def __init__(self, path: str, model: Model, gaps: bool):
+        self.path, self.model, self.gaps = path, model, gaps
+        self.description = describe_tree(model) if np.any(model.inputs.commanded) else describe_whole(model)
         self.sources: dict[str, dict[Source, Stamped]] = {kind: {} for kind in USED}
         followers = {follower.joint for follower in self.description.followers}
         moving = [link for link in self.description.moving if link.joint not in followers]
@@ -106,13 +113,17 @@ class _Found:
         messages = self._only(JOINTS, "/joint_states") if self.singles else {}
         bases = {link.body: self._base_of(link) for link in self.free}
         stamps = self._common({"the joints": messages, **bases} if self.singles else bases)
+        commands = self._commands() if np.any(model.inputs.commanded) else {}
+        stamps = [time for time in stamps if all(times[0] <= time for times, _ in commands.values())]
         xs, us = np.zeros((len(stamps), model.nx)), np.zeros((max(len(stamps) - 1, 0), model.nu))
         places = {label: model.places(joint) for label, joint in labelled(joints(model.plant)).items()}
         for k, time in enumerate(stamps):
             for link in self.singles:
                 q, v = places[link.joint]
                 xs[k, q.start] = self._joint(messages[time], time, link.joint, "position")
-                xs[k, model.nq + v.start] = self._joint(messages[time], time, link.joint, "velocity")
+                is_given = len(messages[time].velocity) or not self.gaps
+                speed = self._joint(messages[time], time, link.joint, "velocity") if is_given else np.nan
+                xs[k, model.nq + v.start] = speed
             for link in self.free:
                 q, v = places[link.joint]
                 xs[k, [*q, *(model.nq + j for j in v)]] = bases[link.body][time]
@@ -120,8 +131,30 @@ class _Found:
                 if self.description.actuated.count(joint) > 1:
                     expected = "a joint with one actuator"
                     raise InputError(f"joint {joint}", got="several actuators", expected=expected)
-                us[k, i] = self._joint(messages[time], time, joint, "effort")
+                if not model.inputs.commanded[i]:
+                    us[k, i] = self._joint(messages[time], time, joint, "effort")
+                elif joint in commands:
+                    us[k, i] = np.interp(time, *commands[joint])
+                else:
+                    raise InputError(f"{self.path}: commands of {joint}", got="none", expected=f"{COMMANDS} with it")
         return np.array([time - stamps[0] for time in stamps]) / 1e9, xs, us
+
+    def _commands(self) -> dict[str, tuple[list[int], list[float]]]:
+        """Return times [ns] and commanded positions of each joint, linear in between."""
+        commands: dict[str, tuple[list[int], list[float]]] = {}
+        messages = [pair for source in self.sources[COMMANDS].values() for pair in source.items()]
+        for begin, message in sorted(messages, key=lambda pair: pair[0]):
+            for i, joint in enumerate(message.joint_names):
+                times, values = commands.setdefault(joint, ([], []))
+                if times:  # the command until now ends just before this one begins
+                    until = float(np.interp(begin - 1, times, values))
+                    before = sum(time < begin - 1 for time in times)
+                    times[before:], values[before:] = [begin - 1], [until]
+                for point in message.points:
+                    wait = point.time_from_start
+                    times.append(begin + wait.sec * 1_000_000_000 + wait.nanosec)
+                    values.append(float(point.positions[i]))
+        return {joint: pair for joint, pair in commands.items() if pair[0]}
 
     def _common(self, parts: Mapping[str, Mapping[int, Any]]) -> list[int]:
         """Return the times of all parts. Raises InputError for a time that a part lacks."""
@@ -317,17 +350,19 @@ PACKED = {
     b"\xfd7zXZ": "an xz file", b"BZh": "a bzip2 file", b"\xff\xfe": "text in UTF-16",
     b"\xfe\xff": "text in UTF-16", b"\x89MCAP": "an MCAP file", b"SQLite": "an SQLite file",
 }  # fmt: skip
-SUFFIXES = "a .csv file, an .mcap file or the directory of a ROS 2 bag"
+SUFFIXES = "a .csv, .npz or .mcap file, or the directory of a ROS 2 bag"
 
 
 def read_recording(path: str | Path, model: Model, *, name: str | None = None, gaps: bool = False) -> Recording:
-    """Read a motion of `model` from a CSV file, an MCAP file or the directory of a ROS 2 bag.
+    """Read a motion of `model` from a CSV, .npz or MCAP file, or the directory of a ROS 2 bag.
 
     A CSV file has a header row and a row per sample. Its columns, in any order, are `time`, `model.state_names` and
     `model.input_names`. Joints with one degree of freedom may use `position.JOINT` and `velocity.JOINT` instead. Inputs
     are constant until the next sample and may be empty in the last row. With `gaps`, columns of sensors are allowed,
     with names as in `Recording`. An MCAP file has the channels /state and /input as written by this package, or ROS 2
-    messages (JointState, Odometry, PoseStamped and TwistStamped).
+    messages (JointState, JointTrajectory, Odometry, PoseStamped and TwistStamped). An .npz file has MuJoCo's arrays
+    time (n,), qpos, and with `gaps` perhaps no qvel, and ctrl (n or n - 1, nu); a CSV file may have such columns, as
+    qpos_0. Their order is that of the model's MJCF file, or that of the model.
 
     Facts of the engine are in a JSON object in NAME.contract.json in the folder of the recording NAME, or in the
     metadata record "contract" of the MCAP file: any of the facts of `Recording`, and "engine" and "version".
@@ -365,7 +400,9 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None, g
         if path.suffix == ".csv":
             motion, outputs = _read_csv(path, model, gaps)
         elif path.is_dir() or (path.suffix == ".mcap" and has_channels(read_plain(path, links=True), ROS2)):
-            motion, facts = read_ros2(path, model)
+            motion, facts = read_ros2(path, model, gaps)
+        elif path.suffix == ".npz":
+            motion = _of_mujoco(str(path), arrays_of(path), model, gaps)
         elif path.suffix == ".mcap":
             motion, facts = _read_mcap(path, model)
         else:
@@ -427,6 +464,9 @@ def _read_csv(path: Path, model: Model, gaps: bool) -> tuple[Motion, dict[str, A
     _, header = next(rows, (0, []))
     if not header:
         raise InputError(str(path), got="an empty file", expected="a header row and samples")
+    texts = [text.strip() for text in header]
+    if any(form.format("qpos", 0) in texts for form in NUMBERED):
+        return _of_mujoco(str(path), _arrays_in(path, rows, texts), model, gaps), {}
     outputs = tuple(text.strip() for text in header if gaps and is_output(text.strip()))
     wanted = ("time", *model.state_names, *model.input_names, *outputs)
     places = np.array(_columns(path, model, header, wanted, model.state_names if gaps else ()))
@@ -444,6 +484,54 @@ def _read_csv(path: Path, model: Model, gaps: bool) -> tuple[Motion, dict[str, A
         raise InputError(f"{path} line {lines[k + 1]}, column time", got=table[k + 1, 0], expected=expected)
     motion = table[:, 0], table[:, 1 : model.nx + 1], table[:-1, model.nx + 1 : last]
     return motion, {name: frozen(table[:, last + i]) for i, name in enumerate(outputs)}
+
+
+def _arrays_in(path: Path, rows: Iterator[tuple[int, list[str]]], header: list[str]) -> dict[str, Array]:
+    """Return the arrays of numbered columns, as qpos_0 and qpos_1, by name."""
+    _, cells = _numbers_of(path, rows, [(name, i) for i, name in enumerate(header)], len(header))
+    arrays = {}
+    for name in ("qpos", "qvel", "ctrl"):
+        columns = [f for form in NUMBERED for k in range(len(header)) if (f := form.format(name, k)) in header]
+        arrays[name] = cells[:, [header.index(column) for column in columns]]
+    arrays |= {name: cells[:, header.index(name)] for name in ("time", "t") if name in header}
+    return {name: values for name, values in arrays.items() if values.shape[-1]}
+
+
+def _of_mujoco(subject: str, arrays: Mapping[str, Array], model: Model, gaps: bool) -> Motion:
+    """Return the motion with MuJoCo's qpos, qvel and ctrl in the order of the model's MJCF file, or of the model."""
+    times, qpos = arrays.get("time", arrays.get("t", np.zeros(0))), arrays.get("qpos", np.zeros(0))
+    n = len(times)
+    qvel, ctrl = arrays.get("qvel", np.full((n, model.nv), np.nan)), arrays.get("ctrl", np.zeros((n, model.nu)))
+    if "qvel" not in arrays and not gaps:
+        raise InputError(subject, got=f"arrays {', '.join(arrays)}", expected="arrays time, qpos, qvel and ctrl")
+    for name, values, width in (("qpos", qpos, model.nq), ("qvel", qvel, model.nv), ("ctrl", ctrl, model.nu)):
+        if values.shape[1:] != (width,) or len(values) not in (n, n - (name == "ctrl")):
+            raise InputError(f"{subject}: {name}", got=values.shape, expected=f"({n}, {width}), as time and model have")
+    labels, i, j = labelled(joints(model.plant)), 0, 0
+    places = {label: ends for label, joint in labels.items() if (ends := model.places(joint))[0]}
+    order, us = sorted(places, key=lambda label: places[label][0].start), np.array(ctrl[: n - 1])
+    if model.source is not None and model.source.suffix == ".xml":
+        mjcf = Mjcf(XmlText(model.source.read_bytes()))
+        elements = mjcf.root.of_world("joint", "freejoint")
+        free = [e.tag == "freejoint" or mjcf.attributes(e).get("type") == "free" for e in elements]
+        order = [str((e.parent if f and e.parent else e).get("name")) for e, f in zip(elements, free, strict=True)]
+        for k, element in enumerate(mjcf.root.findall("actuator", "*")):
+            says = mjcf.attributes(element)
+            gear = first_number(says, "gear", 1.0)
+            factor = 1 / gear if element.tag == "position" else gear * first_number(says, "gainprm", 1.0)
+            us[:, model.input_names.index(says.get("name", ""))] = factor * ctrl[: n - 1, k]
+    xs = np.full((n, model.nx), np.nan)
+    for label in order:
+        if label not in places:
+            raise UnknownNameError(f"{subject}: joint of the model's file", got=label, known=places)
+        q, v = places[label]
+        there, speed = qpos[:, i : i + len(q)], qvel[:, j : j + len(v)]
+        if len(q) == 7:  # MuJoCo has the position first, and the angular velocity in the body's frame
+            spin = np.array([rotation(turn) @ w for turn, w in zip(there[:, 3:], speed[:, 3:], strict=True)])
+            there, speed = np.roll(there, 4, axis=1), np.hstack([spin, speed[:, :3]])
+        xs[:, q], xs[:, [model.nq + k for k in v]] = there, speed
+        i, j = i + len(q), j + len(v)
+    return times, xs, us
 
 
 def _rows_of_csv(path: Path) -> Iterator[tuple[int, list[str]]]:

@@ -21,14 +21,12 @@ from drake_diff.identification.fit import Fit, FittedMotion, Solved
 from drake_diff.identification.judge import HOPELESS
 from drake_diff.identification.messages import NO_CHANGE
 from drake_diff.identification.motion import DiscreteMotion, discrete_motion
-from drake_diff.identification.recordings import Excerpt, guess_states
+from drake_diff.identification.recordings import Excerpt, guess_states, heights
 from drake_diff.identification.results import Explanation
 from drake_diff.identification.unknowns import BIAS, CENTER, MASS, Unknown, Unknowns, choose_unknowns
-from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
 from drake_diff.model.parameters import applied, list_parameters, select
 from drake_diff.model.plant import bodies, labelled
-from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
 
 FIRST, LONGER = 3, 1.5  # samples of the first stage; ratio of the lengths of successive stages
@@ -53,7 +51,7 @@ def may_touch(model: Model, pieces: Sequence[Excerpt]) -> bool:
     stride = np.round(np.median(periods))
     if not model.contract.contact.collision_pairs or stride < 1 or np.any(np.abs(periods - stride) > CLOCK_TOLERANCE):
         return False
-    lower = [model.position_names.index(name) for name in _heights(model)]
+    lower = [i for i, _ in heights(model)]
     radii = {p.name: p.value for p in list_parameters(model) if p.name.endswith(".radius") and "/" not in p.name}
     with applied(select(model, {name: LARGER * value for name, value in radii.items()})) as larger:
         states = np.concatenate([guess_states(model, piece, np.arange(len(piece.times))) for piece in pieces])
@@ -243,7 +241,7 @@ class ContactExplanation(Ranking):
         """All quantities that are tried: first those of contact, then those of motion."""
         known, plant = {p.name: p.value for p in list_parameters(self.model)}, self.model.plant
         names = [n for q in OF_CONTACT for n in known if n.endswith(f".{q}") and "/" not in n and np.all(known[n] > 0)]
-        names += [f"{height}.{BIAS}" for height in _heights(self.model)]
+        names += [f"{self.model.position_names[i]}.{BIAS}" for i, _ in heights(self.model)]
         names += [n for q in OF_MOTION for n in known if n.endswith(f".{q}")]
         fixed = {body.index() for body in plant.GetBodiesWeldedTo(plant.world_body())}
         moving = {label for label, body in labelled(bodies(plant)).items() if body.index() not in fixed}
@@ -261,13 +259,3 @@ class ContactExplanation(Ranking):
     def of_model(self, name: str) -> tuple[Array, str]:
         unknown = next(unknown for unknown in self.changes if unknown.name == name)
         return unknown.start, "m" if unknown.quantity == BIAS else unknown.unit
-
-
-def _heights(model: Model) -> list[str]:
-    """Return the positions along which nearly all weight acts; the ground's height is a bias of these."""
-    set_state(model.double, model.default_state)
-    pulls = np.abs(model.plant.CalcGravityGeneralizedForces(model.double.context))
-    coordinates = coordinates_of(model)
-    pairs = [*coordinates.single, *((i + 6, j + 5) for i, j in coordinates.free)]
-    most = float(np.max(pulls, initial=0.0))
-    return [model.position_names[i] for i, j in pairs if most > 0 and pulls[j] > 0.9 * most]

@@ -34,7 +34,7 @@ from drake_diff.identification.messages import NO_CHANGE
 from drake_diff.identification.recordings import given_noise, read_pieces
 from drake_diff.identification.results import Explanation
 from drake_diff.identification.tree import tree_for_identification
-from drake_diff.identification.unknowns import DELAY, LIMIT
+from drake_diff.identification.unknowns import DELAY, LIMIT, POINT_MASS
 from drake_diff.model.model import Model
 
 BESIDE, LOOKED_AT_BESIDE = 3, 4  # number of first changes of pairs, and number of second changes for each
@@ -53,10 +53,11 @@ def explain(
     """Find the smallest change of a model that explains recordings of its motion.
 
     Mistaken columns are tried first: two exchanged columns, wrong signs, and degrees instead of radians. Then each
-    parameter is tried alone: masses, centres of mass, inertias, dampings, springs, rotor inertias, offsets of joints
-    and gravity. Quantities that model files lack are also tried: Coulomb friction, the strength and the limit of each
-    input, a delay of all inputs, and biases of sensors. If none explains the recordings alone, semi-implicit Euler
-    steps of several lengths are tried, with one change or none, and then pairs of changes.
+    parameter is tried alone: masses, first with and then without their inertias, centres of mass, inertias, dampings,
+    springs, rotor inertias, offsets of joints and gravity. Quantities that model files lack are also tried: Coulomb
+    friction, the strength and the limit of each input, a delay of all inputs, and biases of sensors. If none explains
+    the recordings alone, semi-implicit Euler steps of several lengths are tried, with one change or none, and then
+    pairs of changes.
 
     Args:
         model: The model.
@@ -137,12 +138,16 @@ class _Search(Candidates):
         alone = self.view(self.cut, self.unknowns.z_start, base.starts if base.explains else self.starts)
         if alone is None:
             raise SimulationError(f"{self.model.name} has no motion near the states that were measured")
-        count = len(alone.freedoms)
-        chosen = self.chosen(alone, [(i,) for i in range(count)])
+        points = {i for i, unknown in enumerate(self.unknowns.each) if unknown.quantity == POINT_MASS}
+        count = len(alone.freedoms) - len(points)
+        chosen = self.chosen(alone, [(i,) for i in range(len(alone.freedoms)) if i not in points])
         if self.delay is not None:  # at zero delay, the prediction is poor for a delay of several samples
             chosen.setdefault((f"model.{DELAY}",), Promise((self.delay,), alone.most, 1.0, np.zeros(1)))
         singles, runners = self.tried(alone, chosen, base)
         named = self.enough(base, singles, count)
+        if not (named or base.explains or self.is_late):  # a mass without its inertia changes the motion as others do
+            singles += self.tried(alone, self.chosen(alone, [(i,) for i in points]), base)[0]
+            named = self.enough(base, singles, count + len(points))
         self.nearest = min([self.nearest or base, base, *singles], key=self.bic)
         return self.named(named, how) if named else None, base, alone, runners
 
@@ -198,7 +203,8 @@ class _Search(Candidates):
         return left
 
     def by_two(self, alone: View, runners: Sequence[Runner], base: Tried) -> Explanation | None:
-        count = len(alone.freedoms) * (len(alone.freedoms) - 1) // 2
+        several = sum(unknown.quantity != POINT_MASS for unknown in self.unknowns.each)
+        count = several * (several - 1) // 2
         pairs = self.paired(alone, runners, base)
         named = self.enough(base, pairs, count)
         if named:
@@ -236,7 +242,8 @@ class _Search(Candidates):
         return candidates
 
     def at_the_model(self, alone: View, base: Tried) -> list[Tried]:
-        moving = [i for i in range(len(self.unknowns.each)) if i not in self.of_inputs]
+        kinds = [unknown.quantity for unknown in self.unknowns.each]
+        moving = [i for i, kind in enumerate(kinds) if i not in self.of_inputs and kind != POINT_MASS]
         return self.tried(alone, self.chosen(alone, combinations(moving, 2)), base)[0]
 
     def beside(self, runner: Runner, base: Tried) -> list[Tried]:
@@ -248,7 +255,7 @@ class _Search(Candidates):
         if seen is None:
             return []
         without = {i, *self.of_inputs} if i in self.of_inputs else {i}
-        others = [k for k in range(len(seen.freedoms)) if k not in without]
+        others = [k for k, u in enumerate(self.unknowns.each) if k not in without and u.quantity != POINT_MASS]
         pairs = [(k, i) if i == self.delay else (i, k) for k in others]
         return self.tried(seen, self.chosen(seen, pairs, LOOKED_AT_BESIDE), base)[0]
 

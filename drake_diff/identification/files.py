@@ -3,6 +3,7 @@
 The recordings are stored as they were read, so that `verify` can repeat the fit.
 """
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
@@ -46,6 +47,7 @@ OF_RECORDINGS = (
     "inputs, model and recordings: they define the task, and no check can tell whether the robot moved as recorded; "
     "recordings[...].sha256 is the hash of the file that was read"
 )
+LATE = r"it reached the limit of \S+ s$"  # the end of the reason for a fit that its time limit ended
 MOST_PLOTS = 12  # plots of coordinates
 MOST_COLUMNS = 16  # columns of the table of correlations
 
@@ -145,6 +147,7 @@ def record_of(e: Identification, name: str) -> FitRecord:
         "data": _data(recordings),
         "estimates": estimates_of(e),
         "unidentifiable": list(e.unidentifiable),
+        "remains": list(e.remains),
         "noise": dict(e.noise),
         "rms": dict(e.sizes),
         "correlation": _correlation(e.covariance),
@@ -254,6 +257,11 @@ def reproduce(folder: Path, record: FitRecord, models: Path | None) -> Reproduce
     if record.inputs.parameters == [] or not record.recordings:
         raise ArtifactError(f"{record.FILE}: it lists no parameters or no recordings")
     carried = "" if record.model.file is None else record.model.file.path
+    stored = [name for name in record.files if any(name.startswith(r.path) for r in record.recordings)]
+    written = (carried, *stored, *MADE)
+    if re.search(LATE, record.reason):
+        why = f"{record.reason}, and no other run ends at the same step"
+        return Reproduced({}, {}, undecided=(why,), unchecked=(OF_RECORDINGS,), written=written, recorded={})
     with rebuilt(folder, record, models) as model:
         given, files = zip(*(_stored(folder, record, i, model) for i in range(len(record.recordings))), strict=True)
         again = identify(model, given, record.inputs.parameters, **_options(record.inputs))
@@ -264,8 +272,6 @@ def reproduce(folder: Path, record: FitRecord, models: Path | None) -> Reproduce
         contents = {name: (Path(location) / name).read_bytes() for name in MADE}
     lacking = (name for name in MADE if name not in record.files)
     problems = tuple(f"{name}: the file is missing, although each fit has it" for name in lacking)
-    stored = [name for name in record.files if any(name.startswith(r.path) for r in record.recordings)]
-    written = (carried, *stored, *MADE)
     return Reproduced(
         made.model_dump(mode="json"), contents, problems=problems, unchecked=(OF_RECORDINGS,), written=written
     )

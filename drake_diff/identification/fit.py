@@ -24,7 +24,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.clock import now
 from drake_diff.exceptions import ModelError, SimulationError
 from drake_diff.identification.motion import SERVOS, DiscreteMotion, Law, Slopes, TreeMotion
-from drake_diff.identification.recordings import LEAST, Excerpt
+from drake_diff.identification.recordings import LEAST, Excerpt, unseen_at_rest
 from drake_diff.identification.sensors import Sensors
 from drake_diff.identification.unknowns import BIAS, Unknowns
 from drake_diff.model.model import Model
@@ -44,6 +44,7 @@ FARTHER = 3.0  # growth of the trust region after an accepted full step, for mot
 NEAR = 10.0  # radius of the trust region of velocities, in units of their measured accuracy, for motions with kinks
 TOO_LARGE = 1e100  # derivative, in units of the noise, above which its square may overflow
 STUCK = "the line search found no motion that is closer to the measurements"
+RESTS = 1e4  # [1/rad, 1/m] the same for what is not measured of a free body or a height, if bodies touch
 NO_PRIOR = 1e-7  # [1/rad, 1/m] regularization that bounds first states without measurements
 
 
@@ -202,8 +203,13 @@ class Fit:
         delay = None if unknowns.delay is None else 0.0
         self.segments = cut_segments(law, pieces, model.nu, delay)
         self._cut = delay, self.segments  # the latest cut, and its delay
+        nv, self.prior = model.nv, [np.full(self.space.size, NO_PRIOR) for _ in pieces]  # of the first states
+        for prior, piece in zip(self.prior, pieces if isinstance(law, DiscreteMotion) else (), strict=False):
+            for j in unseen_at_rest(model, piece):
+                prior[j] = RESTS
+                prior[nv + j] = NO_PRIOR if np.isfinite(piece.ys[:, model.nq + j]).any() else RESTS
         self.gap_scale = np.empty(self.space.size)
-        nv, period = model.nv, max(float(np.median(np.diff(pieces[0].times))), 1e-3)
+        period = max(float(np.median(np.diff(pieces[0].times))), 1e-3)
         from_positions = np.where(np.isfinite(noise[:nv]), noise[:nv], 1.0) / (5 * period)
         self.gap_scale[:nv] = np.where(np.isfinite(noise[:nv]), noise[:nv], 1.0)
         self.gap_scale[nv:] = np.where(np.isfinite(noise[nv : 2 * nv]), noise[nv : 2 * nv], from_positions)
@@ -387,7 +393,7 @@ class Fit:
                 D = end[:, :n] @ D
                 D[:, n:] += end[:, n:]
             ridge = np.zeros((n, n + len(columns) + 1))
-            ridge[:, :n] = NO_PRIOR * np.eye(n)
+            ridge[:, :n] = np.diag(self.prior[p][tangent])
             if self.law.kinks:
                 ridge[n // 2 :, n // 2 : n] = np.diag(1 / (reach * NEAR * scale[n // 2 :]))
             R = _triangle(np.vstack([*rows, ridge]))

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -27,11 +27,12 @@ from drake_diff.identification.judge import (
     freedom_of,
     intervals_of,
     known_of,
+    lacks,
     most_scatter,
     noise_of,
     score_of,
 )
-from drake_diff.identification.messages import Sizes, in_usual_units, unidentifiable
+from drake_diff.identification.messages import Sizes, in_usual_units, structure_line, unidentifiable, where_left
 from drake_diff.identification.motion import (
     SERVOS,
     Law,
@@ -87,7 +88,8 @@ def identify(
         recordings: One or more of `dd.Recording`, or files for `comparison.read_recording`. States that were not
             measured are NaN, or columns that are missing in a file; positions alone are enough. Inputs are constant
             from each sample to the next. The sample times need not be equidistant.
-        parameters: Names as in `dd.list_parameters`, and also JOINT.coulomb_friction, INPUT.strength, STATE.bias and
+        parameters: Names as in `dd.list_parameters`, and also JOINT.coulomb_friction, INPUT.strength, STATE.bias,
+            BODY.point_mass [kg], added at the centre of mass with the inertia about it unchanged, and
             model.input_delay [s], by which inputs act later than they are recorded. Or "all": masses, centres of mass,
             inertias, dampings, spring stiffnesses and rotor inertias. If inputs are commanded positions, "all" are
             dampings, Coulomb frictions, rotor inertias and the input delay; INPUT.kp and INPUT.kd can be added.
@@ -214,6 +216,17 @@ def what_acts(model: Model, pieces: Sequence[Excerpt]) -> str:
         if any(overlaps_along(model, guess_states(model, piece, np.arange(len(piece.times))))):
             return TOUCH
     return ""
+
+
+class _Predicted(NamedTuple):
+    """Errors with the model's values and with the estimates, and the motions; at last the fit of first states."""
+
+    errors: tuple[float, float]  # in units of the noise
+    sizes: dict[str, Sizes]  # by entry, in its unit
+    why: str  # why the errors are too large, or ""
+    motions: list[Followed]
+    fit: Fit
+    solved: Solved
 
 
 @dataclass(eq=False)
@@ -391,16 +404,23 @@ class Problem:
         freedom = freedom_of(fit, solved)
         known = known_of(unknowns, z, solved.reduced.R)
         intervals = intervals_of(unknowns, z, known.covariance, freedom.left)
-        (before, after), sizes, why_not, motions = self._predicted(fit, solved, known, freedom.left)
-        reason = self.doubt(fit, solved, why_not)
+        predicted = self._predicted(fit, solved, known, freedom.left)
+        reason, remains = self.doubt(fit, solved, predicted.why), ()
+        held_out = any(motion.piece.held_out for motion in predicted.motions)
+        if reason:
+            judged = [(m.piece.ys, m.xs) for m in predicted.motions if m.piece.held_out or not held_out]
+            falls = lacks(fit, solved, predicted.fit if held_out else None, predicted.solved)
+            remains = (*where_left(self.model, judged), *([structure_line(falls, held_out)] if falls else ()))
         return identification(
             unknowns,
             unknowns.values(z),
             intervals,
             open_=unidentifiable(unknowns, z, known.open),
-            errors=(before, after),
-            sizes=sizes,
+            errors=predicted.errors,
+            sizes=predicted.sizes,
             reason=reason,
+            held_out=held_out,
+            remains=remains,
             noise={n: float(s) for n, s in zip(self.entries, fit.noise, strict=True) if np.isfinite(s)},
             residuals=tuple(frozen(r) for r in solved.reduced.residuals),
             entries=self.entries,
@@ -410,16 +430,11 @@ class Problem:
             converged=solved.converged,
             steps=solved.steps,
             motion=fit.law.words + (f", as {why_steps}" if why_steps else ""),
-            motions=tuple(motions),
+            motions=tuple(predicted.motions),
         )
 
-    def _predicted(
-        self, fit: Fit, solved: Solved, known: Known, freedom: float
-    ) -> tuple[tuple[float, float], dict[str, Sizes], str, list[Followed]]:
-        """Return the errors with the model's values and with the estimates, why they are too large, and the motions.
-
-        The errors are in units of the noise, and by entry in its unit.
-        """
+    def _predicted(self, fit: Fit, solved: Solved, known: Known, freedom: float) -> "_Predicted":
+        """Predict the held-out samples, or all if none are held out, with the model's values and the estimates."""
         held = self.windows(fit.law, [piece for piece in self.pieces if piece.held_out])
         pieces = held or list(fit.segments.pieces)
         states_fit = self.fit(with_exact_derivatives(fit.law, False), pieces, fit.noise, fixed=True)
@@ -439,19 +454,19 @@ class Problem:
             for name, was, now in zip(self.entries, *sizes, strict=True)
             if np.isfinite(was)
         }
-        pair = (errors[0], errors[1])
+        pair, last = (errors[0], errors[1]), (states_fit, fixed)
         fitted = [frozen(xs) for xs in fit.states(solved)]
         if not held:
-            return pair, by_entry, "", [*map(Followed, pieces, fitted, moved[0])]
+            return _Predicted(pair, by_entry, "", [*map(Followed, pieces, fitted, moved[0])], *last)
         motions = [Followed(p, xs, None) for p, xs in zip(fit.segments.pieces, fitted, strict=True)]
         motions += map(Followed, held, moved[1], moved[0])
         finite = np.where(np.isfinite(known.covariance), known.covariance, 0.0)
         extra = float(np.trace(fixed.reduced.R @ finite @ fixed.reduced.R.T))
         allowed = float(stats.f.ppf(0.999, left, max(freedom, 1))) * (1 + extra / left)
         if fixed.converged and errors[1] ** 2 <= allowed:
-            return pair, by_entry, "", motions
+            return _Predicted(pair, by_entry, "", motions, *last)
         why = f"the error on held-out samples is {errors[1]:.3g} times the noise"
-        return pair, by_entry, why, motions
+        return _Predicted(pair, by_entry, why, motions, *last)
 
     def doubt(self, fit: Fit, solved: Solved, why_not: str) -> str:
         """Return why the model does not explain the recordings, or "" if it does."""

@@ -1,18 +1,20 @@
-"""Identifiability and intervals of the unknowns, and tests whether the model explains the data."""
+"""Identifiability and intervals of the unknowns, tests whether the model explains the data, and what it lacks."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import comb
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 from scipy import stats
 
-from drake_diff._base.arrays import Array
-from drake_diff.identification.fit import NO_PRIOR, Fit, Solved
+from drake_diff._base.arrays import Array, Indices
+from drake_diff.identification.fit import NO_PRIOR, Fit, Reduced, Solved
+from drake_diff.identification.motion import Law, Slopes, TreeMotion, with_exact_derivatives
 from drake_diff.identification.recordings import ORDERS
-from drake_diff.identification.unknowns import FAR, MASS, Unknowns
+from drake_diff.identification.tree import TreeDynamics
+from drake_diff.identification.unknowns import FAR, MASS, Unknown, Unknowns
 
 HOPELESS = 3.0  # times the noise: residuals that other weights cannot explain
 CONFIDENCE = 0.95
@@ -120,7 +122,10 @@ def freedoms_of(unknowns: Unknowns, R: Array, groups: Iterable[slice]) -> tuple[
 
 def freedom_of(fit: Fit, solved: Solved) -> Freedom:
     """Return the degrees of freedom at the end of a fit."""
-    of_starts = sum(float(np.sum(np.abs(np.diag(R)) > 10 * NO_PRIOR)) for R, _, _ in solved.reduced.own)
+    blocks = zip(solved.reduced.own, fit.prior, strict=True)
+    of_starts = sum(
+        float(np.sum((np.abs(np.diag(R)) > 10 * NO_PRIOR) & (prior == NO_PRIOR))) for (R, _, _), prior in blocks
+    )
     unknowns, R = fit.unknowns, solved.reduced.R
     (of_unknowns,) = (0.0,) if fit.fixed else freedoms_of(unknowns, R, [slice(0, len(solved.z))])
     return Freedom(sum(int(np.isfinite(r).sum()) for r in solved.reduced.residuals), of_starts, of_unknowns)
@@ -213,3 +218,136 @@ def _white(n: int, lags: int) -> Array:
     Q = _ljung_box(noise - (noise @ line) @ line.T, lags)
     off = Q - np.mean(Q)
     return np.array([np.mean(Q), np.mean(off**2), np.mean(off**3)])
+
+
+GAIN = "compliance, or other gains (INPUT.kp, INPUT.strength)"
+LACKING = (
+    "Stribeck friction",
+    "friction that grows with the load",
+    "drag that grows with the square of speed",
+    "backlash",
+    "a second delay, of each input alone",
+    GAIN,
+    "a constant effort",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class WithEfforts:
+    """A motion law whose derivatives include efforts that the model lacks: for each of LACKING, one of each input.
+
+    z continues with their coefficients, which are 0 in the motion itself.
+    """
+
+    CHANGE: ClassVar[float] = 1e-4  # of an input for the derivative of a step, which is linear in inputs
+    STRIBECK: ClassVar[float] = 0.25  # [rad/s or m/s] over which Stribeck friction falls
+    PLAY: ClassVar[float] = 0.2  # of the usual effort: the effort over which backlash changes its side
+
+    law: TreeMotion
+    period: float  # [s] between samples
+    usual: Array  # (nu,) usual effort of each input
+
+    def efforts(self, dynamics: TreeDynamics, x: Array, u: Array, earlier: Array) -> tuple[Array, Array]:
+        """Return the lacking efforts (LACKING, N, nu) at x (N, nx) with unit coefficients, and the effort by input.
+
+        `earlier` (N, nu) are the inputs one sample before.
+        """
+        tree, numbers, nv = dynamics.tree, dynamics.numbers, dynamics.nv
+        joint, inputs = np.argmax(np.abs(tree.actuation), axis=0), np.arange(u.shape[1])
+        q = tree.joint_positions(x[:, : x.shape[1] - nv])[:, tree.positions[joint]]
+        v = (x[:, -nv:] @ tree.spread.T)[:, joint]
+        force = np.where(tree.commanded, numbers.kp * (u - q) - numbers.kd * v, u)
+        by_input = numbers.strength * np.where(tree.commanded, numbers.kp, 1.0) * tree.actuation[joint, inputs]
+        effort = numbers.strength * np.clip(force, -numbers.limit, numbers.limit) * tree.actuation[joint, inputs]
+        slide = np.tanh(v / dynamics.slip)
+        lacking = (
+            -slide * np.exp(-((v / self.STRIBECK) ** 2)),
+            -slide * np.abs(effort),
+            -np.abs(v) * v,
+            -np.tanh(effort / (self.PLAY * self.usual)),
+            by_input * (earlier - u),
+            effort,
+            np.ones_like(v),
+        )
+        return np.array(lacking), by_input
+
+    def slopes(self, z: Array, xs: Array, hs: Array, us: Array, *, together: bool = False) -> list[Slopes]:
+        """Return the derivatives of each step of each independent branch, or of the whole tree."""
+        branches, values = self.law.slopes(z, xs, hs, us, together=together), self.law.unknowns.values(z)
+        (K, M, nu), nx, nz = us.shape, xs.shape[2], len(self.law.unknowns.start)
+        before = np.maximum(np.arange(M) - max(round(self.period / float(np.median(hs[hs > 0]))), 1), 0)
+        x, h, u = xs[:, :-1].reshape(-1, nx), hs.reshape(-1, 1), us.reshape(-1, 1, nu)
+        lacking, by_input = self.efforts(self.law.dynamics(values), x, u[:, 0], us[:, before].reshape(-1, nu))
+        groups = [b.inputs for b in self.law.branches] if len(branches) == len(self.law.branches) else [np.arange(nu)]
+        begun, added = self.law.run(values, x, h, u)[:, 1], [np.zeros((K * M, len(b.states), 0)) for b in branches]
+        for turn in range(max(map(len, groups))):  # one input of each branch at once
+            some = [inputs[turn] for inputs in groups if turn < len(inputs)]
+            moved = u.copy()
+            moved[..., some] += self.CHANGE
+            by_u = (self.law.run(values, x, h, moved)[:, 1] - begun) / self.CHANGE
+            for k, (branch, inputs) in enumerate(zip(branches, groups, strict=True)):
+                if turn < len(inputs):
+                    share = lacking[:, :, inputs[turn]].T / by_input[inputs[turn]]
+                    added[k] = np.concatenate([added[k], by_u[:, branch.states, None] * share[:, None]], axis=2)
+        return [
+            replace(
+                branch,
+                columns=np.concatenate([branch.columns, *(nz + i + nu * np.arange(len(LACKING)) for i in inputs)]),
+                by_z=np.concatenate([branch.by_z, more.reshape(K, M, *more.shape[1:])], axis=3),
+            )
+            for branch, inputs, more in zip(branches, groups, added, strict=True)
+        ]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.law, name)
+
+
+def lacks(fit: Fit, solved: Solved, held: Fit | None, of_held: Solved) -> dict[str, float]:
+    """Return by which fraction the rms error would fall if the model had each of LACKING.
+
+    The fall is that of the linearized motion, with all unknowns and first states fitted again. If pieces are `held`
+    out, the coefficients of the fitted pieces are used for them, and the fall is theirs. Efforts without evidence by
+    BIC are left out.
+    """
+    law, unknowns, model = fit.law, fit.unknowns, fit.model
+    point = fit.at(solved.z, solved.starts)
+    if not (isinstance(law, TreeMotion) and model.nu and law.tree.coupling is None) or law.kinks or point is None:
+        return {}
+    law, (s, xs) = cast(TreeMotion, with_exact_derivatives(law, False)), (point.segments, point.xs)
+    period = float(np.median(np.diff(s.pieces[0].times)))
+    simple = WithEfforts(law, period, np.ones(model.nu))
+    here = xs[:, :-1][s.hs > 0], s.us[s.hs > 0]
+    efforts = simple.efforts(law.dynamics(unknowns.values(solved.z)), *here, here[1])[0][LACKING.index(GAIN)]
+    usual = np.sqrt(np.mean(efforts**2, axis=0))
+    wide = cast(Law, replace(simple, usual=np.maximum(usual, 1e-12)))
+    more = [Unknown(f"{i}.{lack}", "", np.zeros(1), -np.inf, 0.0) for lack in LACKING for i in model.input_names]
+
+    def seen(fit: Fit, solved: Solved) -> Reduced | None:
+        all_of = Fit(
+            model, wide, Unknowns((*unknowns.each, *more)), fit.segments.pieces, fit.noise, sensors=fit.sensors
+        )
+        motion = all_of.at(np.concatenate([solved.z, np.zeros(len(more))]), solved.starts)
+        reduced = None if motion is None else all_of.reduce(motion)
+        return None if reduced is None or not reduced.finite else reduced
+
+    fitted = seen(fit, solved)
+    judged = fitted if held is None else seen(held, of_held)
+    if fitted is None or judged is None:
+        return {}
+    low, high = unknowns.bounds
+    pinned = np.array([u.pinned for u in unknowns.each for _ in u.start], dtype=bool)
+    free = np.flatnonzero((solved.z > low) & (solved.z < high) & ~pinned)
+
+    def left(columns: Indices) -> tuple[float, float]:
+        dz = np.zeros(fitted.R.shape[1])
+        dz[columns] = np.linalg.lstsq(fitted.R[:, columns], fitted.b, rcond=1e-9)[0]
+        a, b = (r.rest + float(np.sum((r.b - r.R @ dz) ** 2)) for r in (fitted, judged))
+        return a, b
+
+    (before, was), price = left(free), model.nu * np.log(fit.count)
+    falls = {}
+    for k, lack in enumerate(LACKING):
+        after, now = left(np.concatenate([free, len(solved.z) + model.nu * k + np.arange(model.nu)]))
+        if before - after > price:
+            falls[lack] = 1 - float(np.sqrt(now / was))
+    return falls

@@ -7,6 +7,8 @@ import numpy as np
 
 from drake_diff._base.arrays import Array
 from drake_diff.identification.unknowns import Unknowns
+from drake_diff.mechanics.description import coordinates_of
+from drake_diff.model.model import Model
 
 Sizes = tuple[float, float, str]  # rms errors before and after, and their unit
 DEGREES = {"rad": "degrees", "rad/s": "degrees/s"}
@@ -20,6 +22,51 @@ def in_usual_units(before: float, after: float, unit: str) -> Sizes:
     """Return two errors with their unit; angles are in degrees."""
     factor = 180 / np.pi if unit in DEGREES else 1.0
     return factor * before, factor * after, DEGREES.get(unit, unit)
+
+
+def where_left(model: Model, motions: Sequence[tuple[Array, Array]]) -> tuple[str, ...]:
+    """Return where the largest error of a joint is, for motions of measured and predicted states (n, nx) each."""
+    ys, xs = (np.concatenate(states) for states in zip(*motions, strict=True))
+    rms, worst = 0.0, None
+    for i, j in coordinates_of(model).single:
+        seen = np.isfinite(ys[:, i])
+        error = (ys[seen, i] - xs[seen, i]) * in_usual_units(1.0, 1.0, model.contract.positions[i].unit)[0]
+        if len(error) and np.sqrt(np.mean(error**2)) > rms:
+            rms, worst = float(np.sqrt(np.mean(error**2))), (i, model.nq + j, seen, error)
+    if worst is None:
+        return ()
+    i, j, seen, error = worst
+    unit, rate = model.contract.positions[i].unit, model.contract.velocities[j - model.nq].unit
+    places = [_worst_third(error, np.abs(xs[seen, j]), "speeds", rate)]
+    places.append(_worst_third(error, xs[seen, i], "positions", unit))
+    for sign, word in ((1, "positive"), (-1, "negative")):
+        some = error[sign * xs[seen, j] > 0]
+        if len(some) and np.mean(some**2) > rms**2:
+            places.append(f"{np.sqrt(np.mean(some**2)):.3g} at {word} velocities, {np.mean(some):+.3g} in the mean")
+    text = f"{rms:.3g} {in_usual_units(1.0, 1.0, unit)[2]} rms, measured minus model {np.mean(error):+.3g} in the mean"
+    return (f"the largest error is in {model.state_names[i]}: {text}; {'; '.join(places)}",)
+
+
+def _worst_third(error: Array, values: Array, name: str, unit: str) -> str:
+    """Return the third of the samples with the largest error, in words: with low, middle or high values."""
+    low, high = np.quantile(values, [1 / 3, 2 / 3])
+    masks = values <= low, (values > low) & (values < high), values >= high
+    rms = [float(np.sqrt(np.mean(error[mask] ** 2))) if np.any(mask) else 0.0 for mask in masks]
+    a, b, unit = in_usual_units(float(low), float(high), unit)
+    ranges = f"below {a:.3g}", f"from {a:.3g} to {b:.3g}", f"above {b:.3g}"
+    return f"{max(rms):.3g} at {name} {ranges[int(np.argmax(rms))]} {unit}"
+
+
+def structure_line(falls: Mapping[str, float], held_out: bool, least: float = 0.02) -> str:
+    """Return which changes of the model's structure would reduce the error, by at least the fraction `least`."""
+    best = sorted((lack for lack in falls if falls[lack] >= least), key=lambda lack: -falls[lack])
+    error = "the error of held-out samples" if held_out else "the error"
+    if not best:
+        return (
+            f"no other friction, backlash, delay, gain or constant effort would reduce {error} by {100 * least:.0f} %"
+        )
+    parts = ", ".join(f"{lack} by {100 * falls[lack]:.0f} %" for lack in best[:3])
+    return f"changes of the model's structure would reduce {error}, as the linearized motion predicts: {parts}"
 
 
 def changed_to(name: str, values: Array, intervals: Array, start: Array, unit: str) -> str:
@@ -88,6 +135,7 @@ def identification_sentence(
     errors: tuple[float, float],
     sizes: Mapping[str, Sizes],
     reason: str,
+    held_out: bool = False,
 ) -> str:
     """Return the sentence about the estimates (np,), their intervals (np, 2) and the decrease of the error.
 
@@ -123,12 +171,15 @@ def identification_sentence(
         alike = {name: size[:2] for name, size in sizes.items() if size[2] == unit}
         worst = max(alike, key=lambda name: alike[name][1])
         rms = np.sqrt(np.mean(np.square(list(alike.values())), axis=0))
-        error = f"the rms error {_change(*rms)} {unit}, at most {alike[worst][1]:.3g} in {worst}"
+        samples = " of held-out samples" if held_out else ""
+        error = f"the rms error{samples} {_change(*rms)} {unit}, at most {alike[worst][1]:.3g} in {worst}"
     return f"{verdict}; {error}; {reason or NOISE_IS_LEFT}."
 
 
 def _change(before: float, after: float) -> str:
     """Return whether an error falls or rises, and both values."""
+    if f"{before:.3g}" == f"{after:.3g}":
+        return f"stays at {after:.3g}"
     return f"{'falls' if after <= before else 'rises'} from {before:.3g} to {after:.3g}"
 
 

@@ -18,6 +18,8 @@ from drake_diff.comparison.recordings import Recording, check_sizes, checked_mot
 from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.mechanics.description import coordinates_of
 from drake_diff.model.model import Model
+from drake_diff.model.plant import actuators
+from drake_diff.model.step import set_state
 from drake_diff.model.tangent import tangent_space
 
 LEAST = 8  # minimum number of samples of a piece
@@ -27,6 +29,7 @@ ORDERS = 8  # highest order of the differences of samples from which the noise i
 NO_NOISE = 1e-9  # minimum noise as a fraction of a column's range: recordings without noise are rounded
 FEWEST = 6  # minimum number of differences for an estimate of the noise
 FEWEST_WITH_JUMPS = 20  # minimum number of differences for an estimate by their median
+NEARLY = 1e-7  # [m] largest overlap of a body that rests
 MAD = 1.4826  # ratio of a normal distribution's standard deviation to the median of absolute deviations
 
 
@@ -211,7 +214,8 @@ def noise_by_differences(model: Model, pieces: Sequence[Excerpt], *, jumps: bool
 def guess_states(model: Model, piece: Excerpt, samples: NDArray[np.intp]) -> Array:
     """Guess states (len(samples), nx) at some samples by cubic fits to the samples around each.
 
-    An unmeasured velocity is the derivative of its position. An unmeasured position is the model's default.
+    An unmeasured velocity is the derivative of its position. An unmeasured position is the model's default, but bodies
+    of unmeasured height rest on what is below them at the first sample.
     """
     nq, default, coordinates = model.nq, model.default_state, coordinates_of(model)
     states = np.empty((len(samples), model.nx))
@@ -230,7 +234,63 @@ def guess_states(model: Model, piece: Excerpt, samples: NDArray[np.intp]) -> Arr
                 v[i] = fitted[0]
         slope = coordinates.motion(q) @ q_dot
         states[row] = np.concatenate([q, np.where(np.isnan(v), slope, v)])
+    for i, j in unseen_heights(model, piece) if len(samples) else ():
+        states[:, i] = _resting(model, states[0], i, j)
     return states
+
+
+def heights(model: Model) -> list[tuple[int, int]]:
+    """Return the positions along which nearly all weight acts, with the velocities of the same axes."""
+    set_state(model.double, model.default_state)
+    pulls = np.abs(model.plant.CalcGravityGeneralizedForces(model.double.context))
+    coordinates = coordinates_of(model)
+    pairs = [*coordinates.single, *((i + 6, j + 5) for i, j in coordinates.free)]
+    most = float(np.max(pulls, initial=0.0))
+    return [(i, j) for i, j in pairs if most > 0 and pulls[j] > 0.9 * most]
+
+
+def unseen_heights(model: Model, piece: Excerpt) -> list[tuple[int, int]]:
+    """Return the `heights` that are not measured, of bodies that nothing drives and that may touch others."""
+    if not model.contract.contact.collision_pairs or np.any(model.inputs.actuator < 0):
+        return []
+    driven = {int(actuator.joint().velocity_start()) for actuator in actuators(model.plant)}
+    unseen = ~np.isfinite(piece.ys).any(axis=0)
+    return [(i, j) for i, j in heights(model) if unseen[i] and j not in driven] if np.any(unseen[: model.nq]) else []
+
+
+def unseen_at_rest(model: Model, piece: Excerpt) -> list[int]:
+    """Return the velocities that begin at rest: of `unseen_heights`, and of free bodies along axes without positions.
+
+    It is empty if bodies cannot touch, or if a diagram's systems, such as propellers, move them.
+    """
+    if not model.contract.contact.collision_pairs or np.any(model.inputs.actuator < 0):
+        return []
+    seen = np.isfinite(tangent_space(model).minus(piece.ys, piece.ys)).any(axis=0)
+    free = {j for _, first in coordinates_of(model).free for j in range(first, first + 6)}
+    return [j for j in free.union(j for _, j in unseen_heights(model, piece)) if not seen[j]]
+
+
+def _resting(model: Model, x: Array, i: int, j: int) -> float:
+    """Return the position i of the body at x (nx,) at which it begins to touch others, or x[i] if it touches none."""
+    set_state(model.double, x)
+    up = -np.sign(model.plant.CalcGravityGeneralizedForces(model.double.context)[j])
+
+    def touches(rise: float) -> bool:
+        moved = x.copy()
+        moved[i] += up * rise
+        set_state(model.double, moved)
+        return bool(model.double.overlaps())
+
+    is_in = touches(0.0)
+    rises = (2.0**k if is_in else -(2.0**k) for k in range(-10, 4))  # from 1 mm to 8 m
+    end = next((rise for rise in rises if touches(rise) != is_in), None)
+    if end is None:
+        return float(x[i])
+    touching, free = (0.0, end) if is_in else (end, 0.0)
+    while abs(free - touching) > NEARLY:
+        middle = (free + touching) / 2
+        touching, free = (middle, free) if touches(middle) else (touching, middle)
+    return float(x[i] + up * touching)
 
 
 def _cubic(times: Array, y: Array, time: float) -> Any:

@@ -67,6 +67,7 @@ class Identification(ShowsItsRepr):
     motion: str  # the law of motion that was fitted
     motions: tuple[Followed, ...]  # of the fitted pieces, then of the held-out ones
     sizes: Mapping[str, Sizes] = field(default_factory=dict)  # by entry, the rms errors before and after, and the unit
+    remains: tuple[str, ...] = ()  # if not explained: where the error is, and which change of structure would reduce it
     at_half_step: Mapping[str, Any] | None = None  # through impacts, the values with half the time step, if available
     asked: Request | None = None  # the request, which `dd.save` writes and `dd.verify` repeats
 
@@ -107,6 +108,7 @@ def identification(
     errors: tuple[float, float],
     reason: str,
     sizes: Mapping[str, Sizes] | None = None,
+    held_out: bool = False,
     **rest: Any,
 ) -> Identification:
     """Return an identification of values (np,) with intervals (np, 2); it is explained if `reason` is empty."""
@@ -118,7 +120,7 @@ def identification(
         unidentifiable=open_,
         explained=not reason,
         reason=reason or NOISE_IS_LEFT,
-        sentence=identification_sentence(unknowns, values, intervals, open_, errors, sizes or {}, reason),
+        sentence=identification_sentence(unknowns, values, intervals, open_, errors, sizes or {}, reason, held_out),
         sizes=sizes or {},
         error_before=errors[0],
         error_after=errors[1],

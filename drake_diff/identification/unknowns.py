@@ -29,6 +29,8 @@ from drake_diff.model.parameters import (
 from drake_diff.model.plant import actuators, bodies, joints, labelled, radius_of_gyration, rotors
 
 MASS, CENTER, INERTIA = "mass", "center_of_mass", "inertia"
+POINT_MASS = "point_mass"  # [kg] added at the centre of mass, so that the inertia about it stays
+BODIES = (MASS, CENTER, INERTIA, POINT_MASS)
 COULOMB, STRENGTH, BIAS = "coulomb_friction", "strength", "bias"
 DELAY, LIMIT = "input_delay", "limit"  # [s] of all inputs; of one input
 FIXED_OR_FREE = ("weld", "quaternion_floating")
@@ -41,7 +43,7 @@ OF_JOINTS = {  # quantities with one number per joint, and their names in `tree.
     "spring_rest_length": "rest",
 }
 OF_TREE = (
-    MASS, CENTER, INERTIA, "damping", "offset", "spring_stiffness", "spring_rest_angle", "spring_rest_length",
+    *BODIES, "damping", "offset", "spring_stiffness", "spring_rest_angle", "spring_rest_length",
     "gear_ratio", "rotor_inertia", "gravity", COULOMB, STRENGTH, *GAINS,
 )  # fmt: skip
 OF_ALL = (MASS, CENTER, INERTIA, "damping", "spring_stiffness", "rotor_inertia")
@@ -51,12 +53,13 @@ FAR = 3.0  # prior standard deviation of a quantity's change, in units of its ow
 
 @dataclass(frozen=True)
 class RangeOptions:
-    """The physical ranges of joints, servos and delays, and the usual sizes of quantities that are 0 in the model."""
+    """The ranges of joints, servos, delays and point masses, and usual sizes of quantities that are 0 in the model."""
 
     most_rotor: float = 1000.0  # times the inertia that a joint moves: the largest reflected rotor inertia
     least_speed: float = 0.1  # [rad/s, m/s] at which the largest damping takes the largest effort
     most_gain: float = 10.0  # times the model's gain: the largest one; the smallest is the inverse
     most_delay: float = 0.2  # [s]
+    lighter: float = 1 - 1e-6  # of a body's mass: the largest negative point mass
     usual_share: float = 0.1  # of the largest effort: a usual friction, or damping at 1 rad/s or 1 m/s
     usual_delay: float = 0.02  # [s]
     pinned: float = 1e-6  # factor of the width of a quantity that the recordings do not determine
@@ -379,6 +382,8 @@ def _extra(model: Model) -> dict[str, tuple[str, Array, float]]:
                 np.zeros(1),
                 0.0,
             )  # the rest position is 0
+    for label, body in labelled(bodies(model.plant)).items():
+        quantities[f"{label}.{POINT_MASS}"] = ("kg", np.zeros(1), -RANGES.lighter * body.default_mass())
     for name in model.input_names:
         quantities[f"{name}.{STRENGTH}"] = ("1", np.ones(1), -np.inf)
     for name in (*model.position_names, *model.velocity_names):
@@ -394,11 +399,13 @@ def _why_not(model: Model, tree: Tree | None, name: str, value: Array) -> str | 
         return 'a delay, which needs motion in continuous time; see motion="continuous"'
     if tree is not None and quantity not in (*OF_TREE, BIAS, DELAY):
         return 'a quantity of contact or control, which motion in continuous time does not have; see motion="steps"'
-    if quantity in (MASS, CENTER, INERTIA) and not labelled(bodies(model.plant))[label].default_mass() > 0:
+    if quantity in BODIES and not labelled(bodies(model.plant))[label].default_mass() > 0:
         return "a body without mass"
     if quantity == INERTIA and room_of_inertia(value) <= 0:
         return "the inertia of a point or a rod"
-    if tree is not None and quantity in (MASS, CENTER, INERTIA) and tree.on[label][0] < 0:
+    if tree is not None and quantity == POINT_MASS and not np.any(tree.bodies[label].inertia):
+        return "the mass of a point, whose inertia is 0"
+    if tree is not None and quantity in BODIES and tree.on[label][0] < 0:
         return "a body that is fixed to the world"
     return None
 
@@ -411,6 +418,8 @@ def _size(model: Model, name: str, value: Array) -> float:
         return max(radius_of_gyration(body), float(np.linalg.norm(value)), 1e-3)
     if quantity == INERTIA:
         return float(np.sum(value[:3]) / 3)
+    if quantity == POINT_MASS:
+        return float(labelled(bodies(model.plant))[label].default_mass())
     if quantity == "offset":
         return max(float(np.linalg.norm(value)), 0.1)
     if quantity in ("spring_rest_angle", "spring_rest_length"):
@@ -471,9 +480,10 @@ def set_numbers(model: Model, tree: Tree, unknowns: Unknowns, values: Any) -> Nu
 
 
 def _set_bodies(tree: Tree, given: dict[str, Any], inertial: Any, *, as_in_files: bool) -> None:
-    for label in dict.fromkeys(n.rsplit(".", 1)[0] for n in given if n.rsplit(".", 1)[1] in (MASS, CENTER, INERTIA)):
+    for label in dict.fromkeys(n.rsplit(".", 1)[0] for n in given if n.rsplit(".", 1)[1] in BODIES):
         before = ten_numbers(*_central(tree, label, {}))
-        after = ten_numbers(*_central(tree, label, given, as_in_files=as_in_files))
+        mass, center, inertia = _central(tree, label, given, as_in_files=as_in_files)
+        after = ten_numbers(mass + given.get(f"{label}.{POINT_MASS}", 0.0), center, inertia)
         inertial[tree.on[label][0]] += tree.moved_by[label] @ (after - before)
 
 

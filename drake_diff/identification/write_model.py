@@ -16,29 +16,36 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.files import write_whole
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, UnknownNameError
 from drake_diff.identification.results import Identification, Request
-from drake_diff.identification.unknowns import BIAS, CENTER, COULOMB, DELAY, INERTIA, MASS, STRENGTH
+from drake_diff.identification.unknowns import BIAS, CENTER, COULOMB, DELAY, GAINS, INERTIA, MASS, POINT_MASS, STRENGTH
+from drake_diff.model.file_facts import Mjcf
 from drake_diff.model.load_file import add_packages
 from drake_diff.model.model import Model, load_model
 from drake_diff.model.parameters import applied, list_parameters, select
-from drake_diff.model.xml_text import Element, XmlText
+from drake_diff.model.plant import labelled, rotors
+from drake_diff.model.xml_text import Element, XmlText, first_number
 
-BODY = (MASS, CENTER, INERTIA)
+BODY = (MASS, CENTER, INERTIA, POINT_MASS)
 SPRING = {
     "spring_stiffness": "spring_stiffness",
     "spring_rest_angle": "spring_reference",
     "spring_rest_length": "spring_reference",
 }
 ROTOR = ("rotor_inertia", "gear_ratio")
-IN_URDF, IN_SDF = (*BODY, "damping", "offset", *ROTOR), (*BODY, "damping", *SPRING, *ROTOR)
+FRICTION = {"damping": "damping", COULOMB: "friction"}  # Drake ignores friction
+IN_MJCF = {"damping": "damping", COULOMB: "frictionloss", "spring_stiffness": "stiffness", "kp": "kp", "kd": "kv"}
+IN_FILES = {  # by the ending of a file
+    ".urdf": (*BODY, *FRICTION, "offset", *ROTOR),
+    ".sdf": (*BODY, *FRICTION, *SPRING, *ROTOR),
+    ".xml": (*BODY, *IN_MJCF, "rotor_inertia"),
+}
+IN_COMMENTS = (DELAY, *GAINS)  # quantities of commands, which `load_model` has if the file has no place for them
 SAME = 1e-9  # relative to a parameter's largest entry: rounding by printing and by shifting an inertia
 ROUNDING = 1e-13  # relative to m c^2: rounding of a zero inertia that was shifted from the body's origin
 OVERLAY = ".dmd.yaml"
-KINDS = (".urdf", ".sdf", OVERLAY)
+KINDS = (*IN_FILES, OVERLAY)
 NO_ROOM = {
-    COULOMB: "Coulomb friction, which joints in Drake do not have",
     STRENGTH: "a scale factor of an input, which model files do not have",
     BIAS: "a property of the recording",
-    DELAY: "a delay of an input, which model files do not have",
     "gravity": "an option of load_model",
 }
 
@@ -50,8 +57,9 @@ def write_model(identification: Identification, path: str | Path) -> Path:
     estimates; the file is deleted if they differ.
 
     Args:
-        identification: The result of `identify` for a model from one URDF or SDF file, or from a .dmd.yaml file that
-            adds such files. If the recordings are not explained, a comment at the top of the file says so.
+        identification: The result of `identify` for a model from one URDF, SDF or MJCF file, or from a .dmd.yaml file
+            that adds URDF or SDF files. Friction is written, though Drake ignores it. A comment at the top of the file
+            has delays, the gains if the file is URDF or SDF, and whether the recordings are explained.
         path: The file to write, of the same kind. It must not exist yet. Its mesh paths are those of the old file. For
             a .dmd.yaml file, the overlay of welds, frames and default positions is kept, and a corrected copy of each
             robot file with a changed value is written as NAME_FILE in the same folder.
@@ -80,8 +88,8 @@ def write_model(identification: Identification, path: str | Path) -> Path:
     if source is None or kind is None:
         got = "a diagram" if source is None else source.name
         raise ModelError(
-            f"{asked.model.name} is from {got}: a corrected model needs one URDF or SDF file, or a "
-            f"{OVERLAY} file that adds such files"
+            f"{asked.model.name} is from {got}: a corrected model needs one URDF, SDF or MJCF "
+            f"file, or a {OVERLAY} file that adds URDF or SDF files"
         )
     if not path.name.endswith(kind):
         raise InputError("path", got=str(path), expected=f"a {kind} file, like the model's file")
@@ -164,13 +172,15 @@ class _Corrected:
     """The text of a model file, and the changes to it."""
 
     def __init__(self, e: Identification, asked: Request, source: Path, changed: Mapping[str, Any]):
-        self.e, self.model, self.is_sdf = e, asked.model, source.suffix == ".sdf"
+        self.e, self.model, self.kind = e, asked.model, source.suffix
+        self.is_sdf, room = source.suffix == ".sdf", IN_FILES[source.suffix]
         self.xml = XmlText(source.read_bytes())
-        self.data, self.changed = _data(asked), changed
+        self.beside = {n: v for n, v in changed.items() if n.rsplit(".", 1)[1] in set(IN_COMMENTS).difference(room)}
+        self.data, self.changed = _data(asked), {n: v for n, v in changed.items() if n not in self.beside}
         for name in self.changed:
             quantity = name.rsplit(".", 1)[1]
-            if quantity not in (IN_SDF if self.is_sdf else IN_URDF):
-                kind = "SDF" if self.is_sdf else "URDF"
+            if quantity not in room:
+                kind = {".sdf": "SDF", ".urdf": "URDF"}.get(self.kind, "MJCF")
                 why = NO_ROOM.get(quantity, f"a quantity that cannot be written to {kind}")
                 raise InputError(name, got=why, expected=f"a quantity of a {kind} file; identify without it")
 
@@ -180,23 +190,22 @@ class _Corrected:
             label, quantity = name.rsplit(".", 1)
             by_label.setdefault(label, {})[quantity] = value
         for label, values in by_label.items():
-            for quantities, write in (
-                (BODY, self._write_body),
-                (("damping", *SPRING), self._write_dynamics),
-                (ROTOR, self._write_rotor),
-                (("offset",), self._write_offset),
-            ):
+            others = [((*FRICTION, *SPRING), self._write_dynamics), (ROTOR, self._write_rotor)]
+            others = [((*IN_MJCF, *ROTOR), self._write_mjcf)] if self.kind == ".xml" else others
+            for quantities, write in ((BODY, self._write_body), *others, (("offset",), self._write_offset)):
                 some = {q: v for q, v in values.items() if q in quantities}
                 if some:
                     write(label, some, self._comment_on(label, some))
-        top = _comment(f"{self.e.sentence} By drake_diff from {self.data}; {self.e.motion}.")
+        beside = "".join(f" {name} is {value:.6g} {self.e.units[name]}." for name, value in self.beside.items())
+        top = _comment(f"{self.e.sentence}{beside} By drake_diff from {self.data}; {self.e.motion}.")
         self.xml.before(self.xml.root, top + "\n")
         return str(self.xml)
 
     def _element(self, label: str, *tags: str) -> Element:
-        # A joint element without a type is a reference in a transmission.
+        # In URDF, a joint element without a type is a reference in a transmission.
         named = [element for element in self.xml.root.iter(*tags) if element.get("name") == label]
-        elements = [element for element in named if element.tag != "joint" or element.get("type")]
+        typed = self.kind != ".xml"
+        elements = [element for element in named if element.tag != "joint" or element.get("type") or not typed]
         if len(elements) != 1:
             expected = f"one element {' or '.join(tags)} of this name in the model's file, without included files"
             raise InputError(label, got=f"{len(elements)} elements", expected=expected)
@@ -219,39 +228,62 @@ class _Corrected:
         return _comment(f"drake_diff: {'; '.join(texts)}; from {self.data}") + "\n"
 
     def _write_body(self, label: str, values: dict[str, Any], comment: str) -> None:
-        inertial = self._element(label, "link").find("inertial")
-        if inertial is None:
+        link = self._element(label, "body" if self.kind == ".xml" else "link")
+        inertial = link.find("inertial")
+        if inertial is None and self.kind != ".xml":
             raise InputError(f"{label}.mass", got="a link without inertial", expected="a link with an inertial")
         mass, center, inertia = _inertia(self.model, self.e, label)
         names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
         entries = {name: inertia["xyz".index(name[1]), "xyz".index(name[2])] for name in names}
-        if self.is_sdf:
+        if self.kind == ".xml":
+            rows = _row([entries[name] for name in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")])
+            text = f'<inertial pos="{_row(center)}" mass="{_number(mass)}" fullinertia="{rows}"/>'
+        elif self.is_sdf:
             rows = "".join(f"<{name}>{_number(value)}</{name}>" for name, value in entries.items())
             inside = f"<pose>{_row(center)} 0 0 0</pose><mass>{_number(mass)}</mass><inertia>{rows}</inertia>"
+            text = f"<inertial>{inside}</inertial>"
         else:
             rows = " ".join(f'{name}="{_number(value)}"' for name, value in entries.items())
             inside = f'<origin xyz="{_row(center)}" rpy="0 0 0"/><mass value="{_number(mass)}"/><inertia {rows}/>'
-        self.xml.replace(inertial, f"{comment}<inertial>{inside}</inertial>")
+            text = f"<inertial>{inside}</inertial>"
+        if inertial is None:
+            self.xml.append(link, f"{comment}{text}")
+        else:
+            self.xml.replace(inertial, f"{comment}{text}")
 
     def _write_dynamics(self, label: str, values: dict[str, Any], comment: str) -> None:
         joint = self._element(label, "joint")
-        tags = {SPRING.get(quantity, quantity): _number(float(value)) for quantity, value in values.items()}
+        tags = {(FRICTION | SPRING)[quantity]: _number(float(value)) for quantity, value in values.items()}
         parent = joint.find("axis") if self.is_sdf else joint
         if parent is None:
             raise InputError(f"{label}.damping", got="a joint without axis", expected="a joint with an axis")
         dynamics = parent.find("dynamics")
         if dynamics is None:
             inside = "".join(f"<{tag}>{value}</{tag}>" for tag, value in tags.items())
-            attribute = f'<dynamics damping="{tags.get("damping")}"/>'
-            self.xml.append(
-                parent, f"{comment}<dynamics>{inside}</dynamics>" if self.is_sdf else f"{comment}{attribute}"
-            )
+            attributes = "".join(f' {tag}="{value}"' for tag, value in tags.items())
+            text = f"<dynamics>{inside}</dynamics>" if self.is_sdf else f"<dynamics{attributes}/>"
+            self.xml.append(parent, f"{comment}{text}")
             return
         self.xml.before(dynamics, comment)
         if self.is_sdf:
             self._set_children(dynamics, tags)
-        else:
-            self.xml.set(dynamics, "damping", tags["damping"])
+        for tag, value in {} if self.is_sdf else tags.items():
+            self.xml.set(dynamics, tag, value)
+
+    def _write_mjcf(self, label: str, values: dict[str, Any], comment: str) -> None:
+        """Set attributes of an actuator or a joint of an MJCF file; an armature is that of the rotor's joint."""
+        motor = labelled(rotors(self.model.plant)).get(label)
+        for quantity, value in values.items():
+            of_joint = quantity not in GAINS
+            name = motor.joint().name() if motor is not None and quantity == "rotor_inertia" else label
+            element = self._element(name, *(("joint",) if of_joint else ("position",)))
+            factor = motor.default_gear_ratio() ** 2 if motor is not None and of_joint else 1.0
+            if not of_joint:
+                factor = first_number(Mjcf(self.xml).attributes(element), "gear", 1.0) ** -2
+                self.xml.drop(element, "dampratio")
+            self.xml.before(element, comment)
+            comment = ""
+            self.xml.set(element, IN_MJCF.get(quantity, "armature"), _number(factor * float(value)))
 
     def _set_children(self, element: Element, tags: dict[str, str]) -> None:
         """Set the texts of an SDF element's children, or the values of a URDF element's; append missing children."""
@@ -303,6 +335,7 @@ def _inertia(model: Model, e: Identification, label: str) -> tuple[float, Array,
         spatial = model.double.body(label).CalcSpatialInertiaInBodyFrame(model.double.context)
     mass, center = float(spatial.get_mass()), np.asarray(spatial.get_com(), dtype=float)
     inertia = np.array(spatial.Shift(center).CalcRotationalInertia().CopyToFullMatrix3())
+    mass += float(e.values.get(f"{label}.{POINT_MASS}", 0.0))
     inertia[np.abs(inertia) < ROUNDING * mass * float(center @ center)] = 0.0
     return mass, center, inertia
 
@@ -314,6 +347,8 @@ def _check(e: Identification, model: Model, path: Path) -> None:
     with applied(select(model, _parameter_values(model, e))):
         for p in list_parameters(model):
             label, quantity = p.name.rsplit(".", 1)
+            if quantity in GAINS and path.suffix != ".xml":  # they are in the comment
+                continue
             wanted = np.atleast_1d(_parameter_values(model, e).get(p.name, p.value))
             size = float(np.max(np.abs(wanted)))
             if quantity in (MASS, CENTER, INERTIA):
@@ -325,6 +360,8 @@ def _check(e: Identification, model: Model, path: Path) -> None:
                     central = body.Shift(center).CalcRotationalInertia()
                     wanted = np.concatenate([central.get_moments(), central.get_products()])
                     size = float(np.max(np.abs(wanted))) + 1e-3 * body.get_mass() * float(center @ center)
+                if quantity == MASS:
+                    wanted = wanted + e.values.get(f"{label}.{POINT_MASS}", 0.0)
             if p.name not in new:
                 raise UnknownNameError(f"{path.name}: parameter", got=p.name, known=new)
             if not np.allclose(new[p.name], wanted, rtol=0, atol=SAME * size):
@@ -341,5 +378,5 @@ def _number(value: float) -> str:
     return repr(float(value))
 
 
-def _row(values: Array) -> str:
+def _row(values: Iterable[float]) -> str:
     return " ".join(_number(value) for value in values)

@@ -319,15 +319,15 @@ def has_channels(data: bytes, encoding: str) -> bool:
         return False
 
 
-def raw_messages(data: bytes, encoding: str) -> tuple[list[tuple[str, str, bytes]], dict[str, dict[str, str]]]:
-    """Return topic, schema name and bytes of all messages of an `encoding`, such as "cdr", and the metadata records.
+def raw_messages(data: bytes, encoding: str) -> tuple[list[tuple[str, str, bytes, int]], dict[str, dict[str, str]]]:
+    """Return topic, schema, bytes and log time [ns] of the messages of an `encoding`, such as "cdr", and the metadata.
 
     Only the checksums of chunks are checked, since other writers omit the rest. Raises ValueError for a damaged file.
     """
     names, topics, rows, metadata = dict[int, str](), dict[int, tuple[str, str]](), [], dict[str, dict[str, str]]()
     for opcode, body in _unpacked(data):
-        if opcode == MESSAGE_OPCODE and (number := MESSAGE.unpack_from(body)[0]) in topics:
-            rows.append((*topics[number], body[MESSAGE.size :]))
+        if opcode == MESSAGE_OPCODE and (head := MESSAGE.unpack_from(body))[0] in topics:
+            rows.append((*topics[head[0]], body[MESSAGE.size :], head[2]))
         elif opcode == SCHEMA:
             schema = kinds.Schema.read(ReadDataStream(BytesIO(body)))
             names[schema.id] = schema.name

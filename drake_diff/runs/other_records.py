@@ -81,6 +81,7 @@ class FitRecord(SealedRecord):
     motion: str = ""
     estimates: list[Estimate] = Field(default_factory=list)
     unidentifiable: list[str] = Field(default_factory=list)
+    remains: list[str] = Field(default_factory=list)  # where the error is, and which change of structure reduces it
     noise: dict[str, float] = Field(default_factory=dict)
     error_before: float | None = None  # in standard deviations of the noise; null if there was no motion to measure
     error_after: float | None = None

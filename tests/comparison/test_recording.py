@@ -602,3 +602,71 @@ def test_a_bag_without_what_the_model_has_is_refused(load, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(ArtifactError, match="not a ROS 2 bag"):
         read_recording(Path(tmp_path / "empty"), load("projectile.sdf"))
+
+
+TRAIN = """<mujoco><option timestep="0.001"/><worldbody><body name="ball" pos="0 0 3"><freejoint name="f"/>
+<geom size=".1" mass="1"/></body><body name="arm" pos="2 0 1"><joint name="k" axis="0 1 0"/>
+<geom type="capsule" size="0.03" fromto="0 0 0 0 0 -.3" mass="1"/><body name="fore" pos="0 0 -.3">
+<joint name="a" axis="0 1 0"/><geom type="capsule" size="0.03" fromto="0 0 0 0 0 -.3" mass="1"/></body></body>
+</worldbody>
+<actuator><motor name="pa" joint="a" gear="3"/><motor name="pk" joint="k"/></actuator></mujoco>"""
+
+
+def test_a_log_of_mujoco_is_the_motion_of_drake(tmp_path):
+    """The arrays are in the order of the file, with the free body first and its angular velocity in its own frame."""
+    mujoco = pytest.importorskip("mujoco", reason="no mujoco")
+    (tmp_path / "train.xml").write_text(TRAIN)
+    m = mujoco.MjModel.from_xml_string(TRAIN)
+    d, rows = mujoco.MjData(m), {"time": [], "qpos": [], "qvel": [], "ctrl": []}
+    d.qvel[:] = np.random.default_rng(0).standard_normal(m.nv)
+    for k in range(100):
+        d.ctrl[:] = 0.1 * np.sin(0.05 * k), 0.3 * np.cos(0.03 * k)
+        for name, values in rows.items():
+            values.append(np.copy(getattr(d, name)))
+        mujoco.mj_step(m, d)
+    np.savez(tmp_path / "log.npz", **rows)
+    columns = [f"{name}_{i}" for name in ("qpos", "qvel", "ctrl") for i in range(len(rows[name][0]))]
+    table = np.hstack([np.reshape(values, (100, -1)) for values in rows.values()])
+    write_csv(tmp_path / "log.csv", ["time", *columns], table.tolist())
+    model = dd.load_model(tmp_path / "train.xml", time_step=0.001)
+    recording = read_recording(tmp_path / "log.npz", model)
+    np.testing.assert_allclose(dd.rollout(model, recording.xs[0], recording.us).xs, recording.xs, atol=1e-5)
+    again = read_recording(tmp_path / "log.csv", model)
+    np.testing.assert_array_equal(again.xs, recording.xs)
+    np.testing.assert_array_equal(again.us, recording.us)
+    np.savez(tmp_path / "short.npz", time=rows["time"], qpos=np.array(rows["qpos"])[:, 1:], qvel=rows["qvel"])
+    with pytest.raises(InputError, match=r"qpos: expected \(100, 9\)"):
+        read_recording(tmp_path / "short.npz", model)
+
+
+def test_a_bag_has_commanded_positions_in_its_trajectories(load, tmp_path):
+    """A trajectory holds until the next one begins, and is linear between its points."""
+    model = load("pendulum.urdf", inputs="position", gains=(40.0, 3.0))
+
+    def states(types, k):
+        return {"name": ["hinge"], "position": np.array([0.1 * k]), "velocity": np.zeros(0), "effort": np.zeros(0)}
+
+    def trajectory(types, points):
+        point, duration = types["trajectory_msgs/msg/JointTrajectoryPoint"], types["builtin_interfaces/msg/Duration"]
+        none = np.zeros(0)
+        return {
+            "joint_names": ["hinge"],
+            "points": [point(np.array([q]), none, none, none, duration(*divmod(wait, 10**9))) for wait, q in points],
+        }
+
+    second, kind = 10**9, "trajectory_msgs/msg/JointTrajectory"
+    messages = [
+        ("/joint_states", "sensor_msgs/msg/JointState", "", (k + 1) * second // 10, lambda t, k=k: states(t, k))
+        for k in range(8)
+    ]
+    plans = {
+        second // 5: [(0, 0.5)],
+        second * 4 // 10: [(0, 0.5), (second // 5, 0.7), (second, 9.0)],
+        65 * second // 100: [(0, 0.2)],
+    }
+    messages += [("/arm/command", kind, "", at, lambda t, p=points: trajectory(t, p)) for at, points in plans.items()]
+    recording = read_recording(bag_of(tmp_path / "bag", messages), model, gaps=True)
+    np.testing.assert_allclose(recording.times, 0.1 * np.arange(7), atol=1e-12)  # from the first command on
+    np.testing.assert_allclose(recording.xs[:, 0], 0.1 * np.arange(1, 8))
+    assert np.isnan(recording.xs[:, 1]).all()
+    np.testing.assert_allclose(recording.us[:, 0], [0.5, 0.5, 0.5, 0.6, 0.7, 0.2], atol=1e-6)

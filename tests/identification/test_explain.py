@@ -228,3 +228,21 @@ def test_what_makes_no_sense_is_refused(pendulum):
     xs = np.tile(model.default_state, (20, 1))
     with pytest.raises(ModelError, match="controllers"):
         dd.explain(model, dd.Recording("lab", "1", 0.01 * np.arange(20), xs, np.zeros((19, model.nu))))
+
+
+@pytest.mark.parametrize(("body", "mass"), [("upper", 1.2), ("lower", 0.84)])
+def test_a_mass_that_changes_without_the_inertia_is_named(load, tmp_path, body, mass):
+    model = load("double_pendulum.urdf")
+    ((own,),) = (p.value for p in dd.list_parameters(model) if p.name == f"{body}.mass")
+    path = tmp_path / "heavier.urdf"
+    path.write_text(
+        (MODELS / "double_pendulum.urdf").read_text().replace(f'mass value="{own:g}"', f'mass value="{mass}"')
+    )
+    t = 0.01 * np.arange(200)
+    us = np.column_stack([6 * np.sin(2 * np.pi * 0.9 * t), 2 * np.sin(2 * np.pi * 1.7 * t + 1)])
+    truth = dd.rollout(dd.load_model(path, time_step=0.01), [0.5, -0.3, 0, 0], us, method="continuous").xs
+    measured = truth + 2e-4 * np.random.default_rng(0).standard_normal(truth.shape)
+    measured[:, 2:] = np.nan
+    w = dd.explain(model, dd.Recording("lab", "1", 0.01 * np.arange(201), measured, us))
+    assert w.names == (f"{body}.point_mass",)
+    assert_known(w, f"{body}.point_mass", mass - own)

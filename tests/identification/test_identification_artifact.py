@@ -218,3 +218,11 @@ def test_the_command_prints_the_values_and_exits_with_0_where_they_explain(log, 
         assert told in result.output
     assert dd.load_record(out).inputs.noise == {"hinge_q": 1e-3}
     assert dd.verify(out).holds
+
+
+def test_a_fit_that_its_time_limit_ended_is_neither_reproduced_nor_refuted(log, tmp_path):
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.01)
+    dd.save(dd.identify(model, log, ["hinge.damping"], time_limit=1e-6), tmp_path / "late")
+    verification = dd.verify(tmp_path / "late")
+    assert verification.verdict == "undecided"
+    assert "limit of 1e-06 s" in verification.sentence

@@ -175,3 +175,16 @@ def test_the_spread_of_a_first_state_is_that_of_first_states_by_other_noise(ball
     # For 20 flights, the root of chi^2 / 19 of all 12 numbers is within 0.55 and 1.55 with probability 0.99.
     ratio = scattered / np.sqrt(np.mean(np.square(told), axis=0))
     assert np.all((ratio > 0.55) & (ratio < 1.55)), ratio
+
+
+@pytest.mark.parametrize("columns", [("block_x",), ("block_x", "block_z")])
+def test_friction_is_that_of_a_block_on_the_ground_if_its_height_is_not_recorded(load, columns):
+    model = load("sliding_block.sdf", time_step=0.002)
+    x = model.default_state.copy()
+    x[model.state_names.index("block_z")], x[model.state_names.index("block_vx")] = 0.0495, 1.5
+    truth = dd.rollout(model, x, num_steps=300, parameters={"block.friction": 0.25}).xs[::5]
+    seen, measured = [model.state_names.index(name) for name in columns], np.full(truth.shape, np.nan)
+    measured[:, seen] = truth[:, seen] + 3e-4 * np.random.default_rng(1).standard_normal((len(truth), len(seen)))
+    log = dd.Recording("lab", "1", 0.01 * np.arange(len(truth)), measured, np.zeros((len(truth) - 1, 0)))
+    low, high = dd.identify(model, log, ["block.friction"]).intervals["block.friction"]
+    assert low < 0.25 < high < low + 0.01

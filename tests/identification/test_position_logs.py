@@ -45,7 +45,7 @@ def commands():
     return (0.6 * np.sin(2 * np.pi * (0.4 + 0.7 * t) * t))[:, None]
 
 
-def recorded(us, *, limit=np.inf, gains=(40.0, 3.0), seed=0, **changes):
+def recorded(us, *, limit=np.inf, gains=(40.0, 3.0), seed=0, more=None, **changes):
     """Return a recording of the pendulum with the true values, integrated by SciPy from one sample to the next."""
     values = TRUTH | {f"{name.replace('_', '.', 1)}": value for name, value in changes.items()}
     inertia = MASS * LENGTH**2 + values["motor.rotor_inertia"]
@@ -55,6 +55,7 @@ def recorded(us, *, limit=np.inf, gains=(40.0, 3.0), seed=0, **changes):
     def rate(t, x, u):
         effort = np.clip(kp * (u - x[0]) - kd * x[1], -limit, limit)
         friction = values["hinge.coulomb_friction"] * np.tanh(x[1] / 0.05) + values["hinge.damping"] * x[1]
+        friction += 0.0 if more is None else more(x[1], effort)
         return [x[1], (effort - friction - MASS * 9.81 * LENGTH * np.sin(x[0])) / inertia]
 
     for k in range(N - 1):
@@ -86,6 +87,25 @@ def test_wrong_gains_are_estimated(pendulum):
     assert_known(fit, "motor.kp", 33.0, 1.0)
     assert_known(fit, "motor.kd", 3.4, 0.5)
     assert_known(fit, "model.input_delay", TRUTH["model.input_delay"], 0.002)
+
+
+@pytest.mark.parametrize(
+    ("lack", "more"),
+    [
+        ("Stribeck friction", lambda v, effort: 1.5 * np.tanh(v / 0.05) * np.exp(-((v / 0.25) ** 2))),
+        ("friction that grows with the load", lambda v, effort: 0.1 * np.tanh(v / 0.05) * abs(effort)),
+        ("drag that grows with the square of speed", lambda v, effort: 0.1 * v * abs(v)),
+        ("compliance, or other gains (INPUT.kp, INPUT.strength)", lambda v, effort: 0.2 * effort),
+        ("a constant effort", lambda v, effort: 0.3),
+    ],
+)
+def test_a_fit_that_leaves_errors_names_what_the_model_lacks(pendulum, lack, more):
+    fit = dd.identify(pendulum, recorded(commands(), more=more))
+    assert not fit.explained
+    where, line = fit.remains
+    assert where.startswith("the largest error is in hinge_q: ")
+    assert line.split(": ", 1)[1].startswith(f"{lack} by ")
+    assert "of held-out samples" in fit.sentence
 
 
 def test_a_fit_ends_at_its_time_limit_and_says_so(pendulum):

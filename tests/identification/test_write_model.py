@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 from helpers.table import each_row
@@ -148,7 +149,6 @@ def test_a_recording_makes_a_file_that_has_what_was_found(load, tmp_path):
 @each_row(
     "name, words",
     [
-        ("shoulder.coulomb_friction", "Coulomb friction, which"),
         ("motor.strength", "a scale factor of an input"),
         ("shoulder_q.bias", "property of the recording"),
         ("gravity.gravity", "option of load_model"),
@@ -162,10 +162,44 @@ def test_what_a_file_cannot_carry_is_named(arm, tmp_path, name, words):
     assert not (tmp_path / "right.urdf").exists()
 
 
-def test_other_kinds_of_files_are_refused(arm, load, tmp_path):
-    acrobot = load("acrobot.xml")
-    with pytest.raises(ModelError, match="one URDF or SDF file"):
-        write_model(saying(acrobot, {"elbow.damping": 1.0}), tmp_path / "right.xml")
+SERVOS = """<mujoco><default><joint damping="0.1"/><position kp="20" dampratio="0"/></default><worldbody>
+<body name="arm"><joint name="j" axis="0 1 0" armature="0.02"/><geom size="0.03" pos="0 0 -0.2" mass="1"/>
+<body name="fore" pos="0 0 -.3"><inertial pos="0 0 -.1" mass="0.5" diaginertia=".01 .01 .002"/>
+<joint name="k" axis="0 1 0"/></body></body></worldbody>
+<actuator><position name="p" joint="j" kp="30" kv="1" gear="2"/><position name="pk" joint="k"/></actuator></mujoco>"""
+
+
+def test_an_mjcf_file_takes_what_mujoco_has_a_place_for(tmp_path):
+    (tmp_path / "arm.xml").write_text(SERVOS)
+    model = dd.load_model(tmp_path / "arm.xml", inputs="position", time_step=0.01)
+    servos = {"p.rotor_inertia": 0.05, "pk.rotor_inertia": 0.01, "p.kp": 100.0, "p.kd": 5.0, "pk.kp": 25.0}
+    values = {"j.damping": 0.3, **servos, "arm.mass": 1.3, "fore.center_of_mass": np.array([0.01, 0, -0.1])}
+    path = write_model(
+        saying(model, values | {"j.coulomb_friction": 0.2, "model.input_delay": 0.004}), tmp_path / "b.xml"
+    )
+    assert "model.input_delay is 0.004" in path.read_text()
+    m = mujoco.MjModel.from_xml_path(str(path))
+    np.testing.assert_allclose(m.dof_damping, [0.3, 0.1])
+    np.testing.assert_allclose(m.dof_frictionloss, [0.2, 0.0])
+    np.testing.assert_allclose(m.dof_armature, [0.2, 0.01])  # the gear of p is 2
+    np.testing.assert_allclose(m.actuator_gainprm[:, 0], [25.0, 25.0])
+    np.testing.assert_allclose(m.actuator_biasprm[:, 2], [-1.25, 0.0])
+    np.testing.assert_allclose(m.body_mass[1:], [1.3, 0.5])
+    again = {p.name: p.value for p in dd.list_parameters(dd.load_model(path, **model.options))}
+    for name, value in values.items():
+        np.testing.assert_allclose(again[name], value, rtol=1e-9, err_msg=name)
+
+
+def test_friction_is_in_a_urdf_file_and_what_belongs_to_commands_in_its_comment(tmp_path):
+    (tmp_path / "arm.urdf").write_text(ARM)
+    model = dd.load_model(tmp_path / "arm.urdf", time_step=0.01, inputs="position", gains=(40.0, 3.0))
+    values = {"shoulder.damping": 0.7, "shoulder.coulomb_friction": 0.4, "motor.kp": 33.0, "model.input_delay": 0.004}
+    text = write_model(saying(model, values), tmp_path / "right.urdf").read_text()
+    assert '<dynamics damping="0.7" friction="0.4"/>' in text
+    assert "motor.kp is 33 N m/rad. model.input_delay is 0.004" in text
+
+
+def test_other_kinds_of_files_are_refused(arm, tmp_path):
     found = saying(arm, {"arm.mass": 3.0})
     with pytest.raises(InputError, match=r"a \.urdf file"):
         write_model(found, tmp_path / "right.sdf")
