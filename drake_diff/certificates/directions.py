@@ -145,9 +145,10 @@ class Screen:
         self._unit = precision * (size + claim.reach)  # (m,) a unit in the last place
         self.rounding = SCREEN.rounding * self._unit
         self._hidden = _bound(np.broadcast_to(self.rounding, (SCREEN.directions, len(size))))
-        # As for single entries, a slope that is 0 at the point counts as much as 1e-5 of that over a wide step.
-        widely = np.abs(self._wide).max(axis=(0, 1), initial=0) / SCREEN.wide[0]
-        self.allowed = np.maximum(claim.allowed, LIMITS.power * LIMITS.vanishing * np.nan_to_num(widely))
+        # As for single entries, in a row of zeros a slope counts from 1e-5 of that over a wide step.
+        widely = np.nan_to_num(np.abs(self._wide).max(axis=(0, 1), initial=0) / SCREEN.wide[0])
+        least = LIMITS.power * LIMITS.vanishing * widely
+        self.allowed = np.where(claim.reach > 0, claim.allowed, np.maximum(claim.allowed, least))
         self.slopes = _one_sided(near, self._widths(self.powers))
         self._settle(first)
         self.broken, self.doubt = "", self._doubt()

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_diff._base.arrays import Array, Indices, finite_array
+from drake_diff._base.arrays import Array, Indices, finite_array, fraction
 from drake_diff._base.autodiff import called
 from drake_diff._base.differences import richardson
 from drake_diff._base.values import ShowsItsRepr
@@ -93,6 +93,7 @@ def certify_function(
     jvp: Callable[..., Any] | None = None,
     vjp: Callable[..., Any] | None = None,
     scales: ArrayLike | None = None,
+    solver_tolerance: float = 0.0,
 ) -> FunctionCertificate:
     """Certify the derivative of any function at a point: of NumPy, PyTorch, JAX, MuJoCo, Warp, CasADi, ...
 
@@ -109,6 +110,8 @@ def certify_function(
             compared through dot products.
         scales: The scales of the variables, to which steps and errors are relative, like `x` or one number. The default
             is max(1, |x|).
+        solver_tolerance: Relative tolerance of the values, if `f` is solved iteratively. The error that a solver leaves
+            is smooth, so that it cannot be measured. Derivatives of the exact solution differ from `f` by it.
 
     Returns:
         The verdict, the entries that are wrong, the smallest error that would have been noticed, and the cost. An error
@@ -131,7 +134,7 @@ def certify_function(
     given = {name: value for name, value in (("jacobian", jacobian), ("jvp", jvp), ("vjp", vjp)) if value is not None}
     if len(given) != 1:
         raise InputError("jacobian, jvp, vjp", got=", ".join(given) or "none", expected="one of them")
-    function = _Function(f, x, scales)
+    function = _Function(f, x, scales, fraction("solver_tolerance", solver_tolerance))
     ((kind, derivative),) = given.items()
     claimed = _KINDS[kind](function, derivative)
     precision = function.precision
@@ -219,6 +222,7 @@ def _compared(function: _Function, block: Block, columns: list[int], precision: 
         columns=tuple(function.columns[j] for j in columns),
         subject="the derivative",
         scale=stretch * function.scale[columns],
+        stopped=function.solver_tolerance,
         unsolved=unsolved if precision > EPS else 0.0,
         point=point,
         method="given",
@@ -266,10 +270,11 @@ def _readable(result: Any) -> Any:
 class _Function:
     """A user's function of scaled displacements (K, n) from the point, with values (K, m). `calls` are counted."""
 
-    def __init__(self, f: Any, x: ArrayLike, scales: ArrayLike | None):
+    def __init__(self, f: Any, x: ArrayLike, scales: ArrayLike | None, solver_tolerance: float):
         if not callable(f):
             raise InputError("f", got=f"{f!r:.80}", expected="a function")
         self.f, self._plain, given = f, _plain(f), np.asarray(_readable(x))
+        self.solver_tolerance = solver_tolerance
         self.shape, self.calls = given.shape, 0
         self.type = given.dtype if given.dtype.kind == "f" else np.dtype(float)
         self.point = finite_array("x", given, given.shape).ravel()
@@ -282,7 +287,9 @@ class _Function:
         value = np.asarray(self._at(self.point))
         self.value_shape, self.value = value.shape, finite_array("f(x)", value, value.shape).ravel()
         self.value_type = value.dtype if value.dtype.kind == "f" else np.dtype(float)
-        self.precision = max(EPS, *(float(np.finfo(kind).eps) for kind in (self.type, self.value_type)))
+        self.precision = max(
+            EPS, solver_tolerance, *(float(np.finfo(kind).eps) for kind in (self.type, self.value_type))
+        )
         self.rows, self.columns = _names("f", self.value_shape), _names("x", self.shape)
 
     def given(self, vector: Array) -> Any:

@@ -27,6 +27,7 @@ from rates import success_rate
 # Each is a module trust_NAME in this folder, with `measure(seed, count)` and a default COUNT.
 PARTS = (
     "certificate",
+    "checkers",
     "rollout",
     "refinement",
     "plans",
