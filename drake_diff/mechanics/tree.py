@@ -162,12 +162,6 @@ class TreeModel:
     reflected: Array  # (n,) rotor inertia times gear ratio squared
     coupling: JointCoupling | None  # if given, q, v, a and tau are in the independent coordinates
 
-    @property
-    def own_damping(self) -> Array:
-        """The damping (nv,) in the independent coordinates."""
-        coupling = self.coupling
-        return self.damping if coupling is None else np.asarray(coupling.forces(coupling.ratio_v * self.damping))
-
     def __call__(self, q: Array, v: Array, a: Array) -> InverseDynamics:
         """Compute inverse dynamics and its derivatives, in the tangent of q (N, nq), at v and a (each (N, nv))."""
         if self.coupling is None:
