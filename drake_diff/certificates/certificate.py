@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -306,8 +306,30 @@ class ModeChange:
         )
 
 
+class Verdict(ShowsItsRepr):
+    """A result with a `verdict` on a `subject`, and lines of text."""
+
+    verdict: str
+    subject: str
+
+    def require(self) -> Self:
+        """Return this certificate if every entry agrees, and raise CertificateError otherwise."""
+        if self.verdict != "agree":
+            raise CertificateError(f"{self.subject}: {self}")
+        return self
+
+    def _lines(self) -> list[str]:
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        return "; ".join(self._lines())
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__} of {self.subject}: " + "\n  ".join(self._lines())
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Certificate(ShowsItsRepr):
+class Certificate(Verdict):
     """A derivative (m, n), compared with difference quotients. `codes` (m, n) are indices into VERDICTS.
 
     The accuracy of the differences is measured at the point, from their dependence on the step size and from the
@@ -354,7 +376,7 @@ class Certificate(ShowsItsRepr):
     mode_changes: tuple[ModeChange, ...] = ()  # of contact, within 1e-4 of the point
 
     @property
-    def verdict(self) -> str:
+    def verdict(self) -> str:  # type: ignore[override]  # computed, and a field of other results
         """The worst verdict of all entries."""
         return VERDICTS[int(np.max(self.codes))] if self.codes.size else "agree"
 
@@ -395,12 +417,6 @@ class Certificate(ShowsItsRepr):
         """Return the number of entries with this verdict."""
         return int((self.codes == VERDICTS.index(verdict)).sum())
 
-    def require(self) -> Certificate:
-        """Return this certificate if every entry agrees, and raise CertificateError with the worst entry otherwise."""
-        if self.verdict != "agree":
-            raise CertificateError(f"{self.subject}: {self}")
-        return self
-
     def _lines(self) -> list[str]:
         counts = ", ".join(f"{self.count(v)} {v}" for v in VERDICTS if self.count(v))
         noticed = f", would have noticed {100 * self.power:.1g} %" if self.verdict == "agree" else ""
@@ -411,12 +427,6 @@ class Certificate(ShowsItsRepr):
             more = f" and {len(self.mode_changes) - 1} more" if len(self.mode_changes) > 1 else ""
             lines.append(f"contact changes nearby: {self.mode_changes[0]}{more}")
         return lines
-
-    def __str__(self) -> str:
-        return "; ".join(self._lines())
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__} of {self.subject}: " + "\n  ".join(self._lines())
 
 
 def certify_jacobian(

@@ -91,7 +91,7 @@ def certify(
     if not thorough:
         with applied(vector) as applied_model:
             derivatives = derivatives or step_jacobians(applied_model, vector, x, u, method)
-            sure = StepLook.at(applied_model, vector, x, u, derivatives).certificate
+            sure = StepLook.of_step(applied_model, vector, x, u, derivatives).certificate
         if sure is not None:
             return sure
     return _certified(model, x, u, vector, method, derivatives, look_beside)
@@ -350,7 +350,7 @@ class StepLook:
     doubt: str
 
     @classmethod
-    def at(cls, model: Model, vector: ParameterVector, x: Array, u: Array, d: StepDerivatives) -> StepLook:
+    def of_step(cls, model: Model, vector: ParameterVector, x: Array, u: Array, d: StepDerivatives) -> StepLook:
         """Screen the derivatives `d` of the step from x (nx,) under u (nu,), while `vector` is applied."""
         step = StepAround.of_point(model, vector, x, u)
         return cls(step, d, *step.screened(step.jacobian(d, x)))
@@ -370,7 +370,7 @@ def first_looks(model: Model, xs: Array, us: Array, parameters: Parameters) -> l
     vector = select(model, parameters)
     with applied(vector) as model:
         derivatives = derivatives_along(model, xs[0], us, vector=vector, xs=xs)
-        return [StepLook.at(model, vector, *step) for step in zip(xs, us, derivatives, strict=True)]
+        return [StepLook.of_step(model, vector, *step) for step in zip(xs, us, derivatives, strict=True)]
 
 
 def differences_of_solved(left: float) -> str:

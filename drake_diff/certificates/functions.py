@@ -13,11 +13,19 @@ from numpy.typing import ArrayLike
 from drake_diff._base.arrays import Array, Indices, finite_array, fraction
 from drake_diff._base.autodiff import called
 from drake_diff._base.differences import richardson
-from drake_diff._base.values import ShowsItsRepr
-from drake_diff.certificates.certificate import EPS, LIMITS, VERDICTS, Certificate, Entry, Flags, certify_displacement
+from drake_diff.certificates.certificate import (
+    EPS,
+    LIMITS,
+    VERDICTS,
+    Certificate,
+    Entry,
+    Flags,
+    Verdict,
+    certify_displacement,
+)
 from drake_diff.certificates.differences import noise_of
 from drake_diff.certificates.directions import SCREEN, Claim, Screen, first_power, least_size, normals, resolution
-from drake_diff.exceptions import CertificateError, InputError, ShapeError
+from drake_diff.exceptions import InputError, ShapeError
 
 
 @dataclass(frozen=True)
@@ -39,15 +47,8 @@ OPTIONS = FunctionOptions()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FunctionCertificate(ShowsItsRepr):
-    """The verdict on a function's derivative, as in `Certificate`, and the `entries` that do not agree, worst first.
-
-    The verdict is
-
-    - "agree": the derivative has the slopes that differences measure, and an error of 1 % would have been noticed;
-    - "disagree": the `entries` are wrong;
-    - "discontinuous": the function has a corner, a jump or a staircase; `why` and the `entries` say where;
-    - "undecided": `why` says what differences cannot tell.
+class FunctionCertificate(Verdict):
+    """The verdict on a function's derivative, with the meaning that it has in `Certificate`.
 
     Example:
         >>> found = dd.certify_function(np.sin, [0.0, 1.0], jacobian=lambda x: np.diag(np.cos(x)) * [1.0, 1.01])
@@ -56,8 +57,8 @@ class FunctionCertificate(ShowsItsRepr):
     """
 
     verdict: str
-    entries: tuple[Entry, ...]
-    why: str
+    entries: tuple[Entry, ...]  # that do not agree, the worst first
+    why: str  # it is undecided, or where the function is discontinuous beside the entries
     power: float  # the smallest error that would have been noticed in every entry, relative to its size
     least: float  # relative to the largest entry of its row: the size of an entry is this at least
     noise: float  # relative scatter of the function's values
@@ -65,24 +66,12 @@ class FunctionCertificate(ShowsItsRepr):
     derivative_calls: int
     subject: str
 
-    def require(self) -> FunctionCertificate:
-        """Return this certificate if the verdict is "agree", and raise CertificateError otherwise."""
-        if self.verdict != "agree":
-            raise CertificateError(f"{self.subject}: {self}")
-        return self
-
     def _lines(self) -> list[str]:
         cost = f"{self.evaluations} evaluations, {self.derivative_calls} calls of the derivative"
         lines = [f"{self.verdict} ({cost}, noise {self.noise:.1g}, would have noticed {100 * self.power:.1g} %)"]
         lines += [str(entry) for entry in self.entries[:3]]
         lines += [f"and {len(self.entries) - 3} more entries"] if len(self.entries) > 3 else []
         return lines + [self.why] * bool(self.why)
-
-    def __str__(self) -> str:
-        return "; ".join(self._lines())
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__} of {self.subject}: " + "\n  ".join(self._lines())
 
 
 def certify_function(
@@ -135,8 +124,7 @@ def certify_function(
     if len(given) != 1:
         raise InputError("jacobian, jvp, vjp", got=", ".join(given) or "none", expected="one of them")
     function = _Function(f, x, scales, fraction("solver_tolerance", solver_tolerance))
-    ((kind, derivative),) = given.items()
-    claimed = _KINDS[kind](function, derivative)
+    claimed = _Claimed(function, *given.popitem())
     precision = function.precision
     if not (function.rows and function.columns):
         return _certificate(claimed, "agree", precision=precision)
@@ -206,9 +194,7 @@ def _compared(function: _Function, block: Block, columns: list[int], precision: 
     """Compare the slopes of a block with differences, entry by entry."""
     project, slopes, names = block
     stretch = OPTIONS.stretch if precision > OPTIONS.double else 1.0
-    point = function.point[columns] / (stretch * function.scale[columns])
-    size = np.abs(project(function.values(np.zeros((1, len(function.point)))))[0])
-    unsolved = OPTIONS.unsolved * precision * (size + np.abs(slopes) @ np.abs(function.point / function.scale)[columns])
+    size = np.abs(project(function.value[None])[0]) + np.abs(slopes) @ np.abs(function.point / function.scale)[columns]
 
     def values(displacements: Array) -> Array:
         everywhere = np.zeros((len(displacements), len(function.point)))
@@ -221,11 +207,10 @@ def _compared(function: _Function, block: Block, columns: list[int], precision: 
         rows=names,
         columns=tuple(function.columns[j] for j in columns),
         subject="the derivative",
-        scale=stretch * function.scale[columns],
-        stopped=function.solver_tolerance,
-        unsolved=unsolved if precision > EPS else 0.0,
-        point=point,
         method="given",
+        scale=stretch * function.scale[columns],
+        unsolved=OPTIONS.unsolved * precision * size,
+        stopped=function.solver_tolerance,
     )
 
 
@@ -253,12 +238,7 @@ def _certificate(
 
 def _plain(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return the function with results that NumPy can read: tensors of PyTorch and arrays of Warp are converted."""
-
-    @wraps(function)
-    def converted(*arguments: Any) -> Any:
-        return _readable(function(*arguments))
-
-    return converted
+    return wraps(function)(lambda *arguments: _readable(function(*arguments)))
 
 
 def _readable(result: Any) -> Any:
@@ -284,7 +264,7 @@ class _Function:
             if np.any(scale <= 0):
                 raise InputError("scales", got=f"{np.min(scale):g}", expected="numbers above 0")
             self.scale = np.broadcast_to(scale, self.shape).ravel()
-        value = np.asarray(self._at(self.point))
+        value = np.asarray(self._evaluate(self.point))
         self.value_shape, self.value = value.shape, finite_array("f(x)", value, value.shape).ravel()
         self.value_type = value.dtype if value.dtype.kind == "f" else np.dtype(float)
         self.precision = max(
@@ -297,13 +277,13 @@ class _Function:
         shaped = vector.reshape(self.shape).astype(self.type)
         return shaped if self.shape else shaped[()]
 
-    def _at(self, point: Array) -> Any:
+    def _evaluate(self, point: Array) -> Any:
         self.calls += 1
         return called("f", self._plain, self.given(point))
 
     def values(self, displacements: Array) -> Array:
         """Return the values (K, m) at displacements (K, n)."""
-        values = [np.asarray(self._at(self.point + self.scale * d), dtype=float) for d in displacements]
+        values = [np.asarray(self._evaluate(self.point + self.scale * d), dtype=float) for d in displacements]
         for value in values:
             if value.shape != self.value_shape:
                 raise ShapeError("f(x)", got=value.shape, expected=self.value_shape)
@@ -315,127 +295,91 @@ def _names(letter: str, shape: tuple[int, ...]) -> tuple[str, ...]:
 
 
 class _Claimed:
-    """A Jacobian `matrix` (m, n) by scaled displacements. `calls` counts calls of the user's derivative."""
+    """A user's derivative by scaled displacements. `calls` are counted.
 
-    def __init__(self, function: _Function, given: Any):
-        self.function, self._given, self.calls = function, given, 0
-        shapes = (len(function.rows), len(function.columns)), function.value_shape + function.shape
-        matrix = self._ask("jacobian", function.given(function.point)) if callable(given) else _readable(given)
-        shape = np.shape(matrix)
-        if shape not in shapes:
-            raise ShapeError("jacobian", got=shape, expected=shapes[0])
-        self.matrix = finite_array("jacobian", matrix, shape).reshape(shapes[0]) * function.scale
+    A VJP of many values gives the Jacobian of a few random combinations of the values, with weights `mixed` (k, m).
+    """
 
-    def _ask(self, name: str, *arguments: Any, shape: tuple[int, ...] | None = None) -> Array:
+    def __init__(self, function: _Function, kind: str, given: Any):
+        self.function, self.kind, self._given, self.calls = function, kind, given, 0
+        m, n = len(function.rows), len(function.columns)
+        self.mixed, self.matrix = np.eye(m), np.zeros((m, n))
+        if kind == "jacobian":
+            shapes = (m, n), function.value_shape + function.shape
+            matrix = self._ask(function.given(function.point)) if callable(given) else _readable(given)
+            if np.shape(matrix) not in shapes:
+                raise ShapeError("jacobian", got=np.shape(matrix), expected=shapes[0])
+            self.matrix = finite_array("jacobian", matrix, np.shape(matrix)).reshape(m, n) * function.scale
+        elif kind == "vjp":
+            self.mixed = normals(m) / self._sizes() if m > OPTIONS.rows and n else self.mixed
+            self.matrix = self._rows(self.mixed)
+
+    def _ask(self, *arguments: Any, shape: tuple[int, ...] | None = None) -> Array:
         self.calls += 1
-        result = called(name, _plain(self._given), *arguments, shape=shape)
-        return finite_array(f"{name}(x)", np.asarray(result), np.shape(result))
-
-    def screen(self, precision: float) -> Screen:
-        """Screen the derivative, for values of this relative precision."""
-        least = least_size(np.abs(self.matrix).max(axis=1), self.function.value, precision)
-        claim = Claim.of_matrix(self.matrix, least=least[:, None], still=1.0)
-        return Screen(claim, self.function.values, precision=precision)
-
-    def blocks(self, columns: list[int], rows: Flags) -> Iterator[Block]:
-        """Yield the slopes of values along `columns`, to compare them entry by entry. `rows` (m,) are in doubt."""
-        yield self._block(self.matrix[:, columns], np.flatnonzero(rows))
-
-    def _block(self, slopes: Array, rows: Indices) -> Block:
-        return lambda values: values[:, rows], slopes[rows], tuple(self.function.rows[i] for i in rows)
-
-
-class _ByProducts(_Claimed):
-    """A Jacobian that is known by its products J v."""
-
-    def __init__(self, function: _Function, given: Any):
-        self.function, self._given, self.calls = function, given, 0
-        self._known: dict[bytes, Array] = {}
+        result = called(self.kind, _plain(self._given), *arguments, shape=shape)
+        return finite_array(f"{self.kind}(x)", np.asarray(result), np.shape(result))
 
     def _along(self, directions: Array) -> Array:
-        return np.array([self._product(d) for d in directions]).reshape(len(directions), -1)
+        """Return the slopes (K, k) along `directions` (K, n)."""
+        if self.kind != "jvp":
+            return directions @ self.matrix.T
+        given, shape, scale = self.function.given, self.function.value_shape, self.function.scale
+        point, tangents = given(self.function.point), [given(scale * direction) for direction in directions]
+        slopes = [self._ask(point, tangent, shape=shape).ravel() for tangent in tangents]
+        return np.array(slopes).reshape(len(directions), -1)
 
-    def _product(self, direction: Array) -> Array:
-        key, function = direction.tobytes(), self.function
-        if key not in self._known:
-            point, tangent = (function.given(v) for v in (function.point, function.scale * direction))
-            self._known[key] = self._ask("jvp", point, tangent, shape=function.value_shape).ravel()
-        return self._known[key]
-
-    def screen(self, precision: float) -> Screen:
-        n = len(self.function.columns)
-        norm = np.sqrt((self._along(normals(n)) ** 2).mean(axis=0))  # about that of each row
-        size = least_size(norm, self.function.value, precision)
-        claim = Claim(self._along, np.ones(n), LIMITS.power * size, np.sqrt(n) * norm, size[:, None])
-        return Screen(claim, self.function.values, precision=precision)
-
-    def blocks(self, columns: list[int], rows: Flags) -> Iterator[Block]:
-        units = np.eye(len(self.function.columns))[columns]
-        yield self._block(self._along(units).T, np.flatnonzero(rows))
-
-
-class _ByTransposedProducts(_Claimed):
-    """A Jacobian that is known by its products w J, compared as that of a few random combinations of the values."""
-
-    def __init__(self, function: _Function, given: Any):
-        self.function, self._given, self.calls = function, given, 0
-        m, n = len(function.rows), len(function.columns)
-        self._mixed = np.eye(m)
-        if m > OPTIONS.rows and n:
-            self._mixed = normals(m) / self._sizes()
-        self.matrix = self._rows(self._mixed)
+    def _rows(self, cotangents: Array) -> Array:
+        """Return the products (k, n) of cotangents (k, m) and the Jacobian."""
+        function, rows = self.function, []
+        for w in cotangents:
+            cotangent = w.astype(function.value_type).reshape(function.value_shape)
+            asked = function.given(function.point), cotangent if function.value_shape else cotangent[()]
+            rows.append(self._ask(*asked, shape=function.shape).ravel() * function.scale)
+        return np.array(rows).reshape(len(cotangents), -1)
 
     def _sizes(self) -> Array:
-        """Return (m,) the slopes of the values along a line, which balance their combinations."""
+        """Return (m,) the slopes of the values along two directions, which balance their combinations."""
         width = 10.0 ** (-first_power(self.function.precision) / 2)
         ends = self.function.values(width * normals(len(self.function.columns))[:2])
         sizes = np.abs(ends - self.function.value).max(axis=0) / width
         return np.maximum(sizes, SCREEN.flat * np.max(sizes, initial=0.0)) + float(not np.any(sizes))
 
-    def _rows(self, cotangents: Array) -> Array:
-        """Return the products (k, n) of cotangents (k, m) and the Jacobian, by scaled displacements."""
-        function, shape = self.function, self.function.value_shape
-        point, rows = function.given(function.point), []
-        for w in cotangents:
-            cotangent = w.astype(function.value_type).reshape(shape)
-            product = self._ask("vjp", point, cotangent if shape else cotangent[()], shape=function.shape)
-            rows.append(product.ravel() * function.scale)
-        return np.array(rows).reshape(len(cotangents), -1)
-
     def _mix(self, values: Array) -> Array:
-        return values @ self._mixed.T
+        return values @ self.mixed.T
 
     def screen(self, precision: float) -> Screen:
-        if len(self._mixed) == len(self.function.rows):
-            return super().screen(precision)
-        a, values = self.matrix, np.abs(self._mixed) @ np.abs(self.function.value)
-        size = least_size(np.abs(a).max(axis=1), values, precision)  # an entry is a small part of a combination's
-        claim = Claim(lambda z: z @ a.T, np.ones(a.shape[1]), LIMITS.power * size, np.abs(a).sum(axis=1), size[:, None])
+        """Screen the derivative, for values of this relative precision."""
+        n, values = len(self.function.columns), np.abs(self.mixed) @ np.abs(self.function.value)
+        if self.kind == "jvp" or len(self.mixed) < len(self.function.rows):  # the entries themselves are not known
+            norm = np.sqrt((self._along(normals(n)) ** 2).mean(axis=0))  # about that of each row
+            size = least_size(norm, values, precision)
+            claim = Claim(self._along, np.ones(n), LIMITS.power * size, np.sqrt(n) * norm, size[:, None])
+        else:
+            least = least_size(np.abs(self.matrix).max(axis=1), values, precision)
+            claim = Claim.of_matrix(self.matrix, least=least[:, None], still=1.0)
         return Screen(claim, lambda d: self._mix(self.function.values(d)), precision=precision)
 
     def blocks(self, columns: list[int], rows: Flags) -> Iterator[Block]:
-        """Yield the rows that the gaps of the combinations point to, then the combinations themselves."""
-        m = len(self.function.rows)
-        if len(self._mixed) == m:
-            yield from super().blocks(columns, rows)
-            return
-        slopes, suspects = np.zeros((m, len(columns))), self._suspected_rows(columns)
-        slopes[suspects] = self._rows(np.eye(m)[suspects])[:, columns]
-        yield self._block(slopes, suspects)
-        yield self._mix, self.matrix[:, columns], tuple(f"combination {k} of f" for k in range(len(self._mixed)))
+        """Yield the slopes along `columns` of values in doubt, `rows` (k,).
 
-    def _suspected_rows(self, columns: list[int]) -> Indices:
-        """Return the rows whose parts in the combinations are most like the gaps, two for each column."""
-        function = self.function
-        power = first_power(function.precision)
+        With combinations, these are first the values to which their gaps point, and then the combinations.
+        """
+        names, m = self.function.rows, len(self.function.rows)
+        if len(self.mixed) < m:
+            suspects = self._suspects(columns)
+            slopes = self._rows(np.eye(m)[suspects])[:, columns]
+            yield lambda values: values[:, suspects], slopes, tuple(names[i] for i in suspects)
+            names = tuple(f"combination {k} of f" for k in range(len(self.mixed)))
+        slopes = self._along(np.eye(len(self.function.columns))[columns]).T[rows]
+        yield lambda values: self._mix(values)[:, rows], slopes, tuple(names[i] for i in np.flatnonzero(rows))
+
+    def _suspects(self, columns: list[int]) -> Indices:
+        """Return the values whose parts in the combinations are most like the gaps, two for each column."""
+        power, units = first_power(self.function.precision), np.eye(len(self.function.columns))[columns]
         widths = 10.0 ** (-np.array([power - 1, power]) / 2)
-        units = np.eye(len(function.columns))[columns]
-        ends = function.values(np.vstack([side * w * units for w in widths for side in (1.0, -1.0)]))
+        ends = self.function.values(np.vstack([side * w * units for w in widths for side in (1.0, -1.0)]))
         ahead, behind = ends.reshape(2, 2, len(columns), -1).swapaxes(0, 1)
         slopes = richardson((ahead - behind) / (2 * widths[:, None, None]))[0]  # (columns, m)
         gap = self.matrix[:, columns] - self._mix(slopes).T  # (k, columns)
-        alike = np.abs(self._mixed.T @ gap) / np.linalg.norm(self._mixed, axis=0)[:, None]
+        alike = np.abs(self.mixed.T @ gap) / np.linalg.norm(self.mixed, axis=0)[:, None]
         return np.unique(np.argsort(-alike, axis=0)[:2])
-
-
-_KINDS = {"jacobian": _Claimed, "jvp": _ByProducts, "vjp": _ByTransposedProducts}

@@ -114,16 +114,14 @@ def certify_function(
     """
     from drake_diff.certificates.functions import certify_function as certify_derivative
 
-    name, colon, attribute = function.partition(":")
-    if not (name and colon and attribute):
-        raise InputError("MODULE:FUNCTION", got=repr(function), expected="the names of a module and of its function")
+    name, _, attribute = function.partition(":")
     sys.path.insert(0, str(Path.cwd()))
     try:
         module = import_module(name)
-    except ModuleNotFoundError as error:
-        if error.name != name:
+    except (ModuleNotFoundError, ValueError) as error:  # ValueError: an empty name
+        if getattr(error, "name", name) != name:
             raise
-        raise InputError("MODULE:FUNCTION", got=repr(name), expected="a module in this folder or installed") from error
+        raise InputError("MODULE:FUNCTION", got=repr(function), expected="a module here or installed") from error
 
     def named(option: str, word: str | None) -> Any:
         if word is None or not word.isidentifier():
@@ -132,9 +130,9 @@ def certify_function(
             raise UnknownNameError(option, got=word, known=[key for key in vars(module) if not key.startswith("_")])
         return getattr(module, word)
 
-    given = {key: named(f"--{key}", word) for key, word in (("jacobian", jacobian), ("jvp", jvp), ("vjp", vjp))}
-    point, sizes = named("--x", x), named("--scales", scales)
-    certificate = certify_derivative(named("MODULE:FUNCTION", attribute), point, scales=sizes, **given)
+    words = {"jacobian": jacobian, "jvp": jvp, "vjp": vjp, "scales": scales}
+    given = {key: named(f"--{key}", word) for key, word in words.items()}
+    certificate = certify_derivative(named("MODULE:FUNCTION", attribute), named("--x", x), **given)
     show(judged(certificate.verdict), str(certificate).removeprefix(certificate.verdict).strip())
     conclude(certificate.verdict == "agree")
 

@@ -1,6 +1,6 @@
 """Checks of a solution's own states and inputs, without replays."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -278,10 +278,6 @@ def telling_knots(problem: Problem, xs: Array) -> Indices:
     return np.unique([0, *knots.tolist(), count - 1]).astype(np.intp)
 
 
-def _near(f: Callable[[Array], Array], point: Array, scale: Array, displacements: Array) -> Array:
-    return f(point + scale * displacements)
-
-
 def certify_equations(
     problem: Problem,
     jacobian: Any,
@@ -315,8 +311,10 @@ def certify_equations(
         f = system.at_step(k).values if isinstance(system, DiscreteMap) else values
         derivative = partial(jacobian, k=k) if is_map else jacobian
         matrix = np.asarray(derivative(point), dtype=float)
-        finite, near = bool(np.all(np.isfinite(matrix))), partial(_near, f, point, scale)
-        screen = Screen(Claim.of_matrix(matrix * scale), near) if finite else None
+        screen = None
+        if np.all(np.isfinite(matrix)):
+            near = lambda d, f=f, point=point, scale=scale: f(point + scale * d)  # noqa: E731
+            screen = Screen(Claim.of_matrix(matrix * scale), near)
         if screen is None or screen.doubt:
             certificates.append(certify_jacobian(f, point, derivative, batched=True, scale=scale, **named))
         else:
