@@ -1,9 +1,11 @@
 """Measure gradients of a batch of rollouts through PyTorch and JAX, next to a loop of `differentiate_rollout`.
 
-    python tests/benchmarks/batch_gradients.py [--library torch jax] [--rollouts 64] [--steps 100]
+    python tests/benchmarks/batch_gradients.py [--library torch jax mjx] [--rollouts 64] [--steps 100]
 
 A Go2 stands on four spherical feet, with random torques. The loss is the squared norm of the last state. All times are
-of the processor. The overhead is that of a gradient of one step of a pendulum over `differentiate_step`.
+of the processor, and those of compilations are left out. The overhead is that of a gradient of one step of a pendulum
+over `differentiate_step`. MJX simulates the same robot with MuJoCo's contact. As reverse mode does not support its
+solver, it has the Jacobians of steps in forward mode, and a reverse pass over them.
 """
 
 import argparse
@@ -67,9 +69,44 @@ def through_jax() -> tuple[Any, Callable[..., Any]]:
     return (step, rollout), gradients
 
 
+def through_mjx(model: dd.Model, x0: np.ndarray, us: np.ndarray) -> Callable[[], Any]:
+    """Return the gradients of all rollouts by MJX, compiled."""
+    import jax
+    from mujoco import mjx
+
+    from drake_diff.engines.mjx import MjxEngine
+
+    jax.config.update("jax_enable_x64", True)
+    engine, jnp = MjxEngine(model), jax.numpy
+    states = np.array([np.concatenate(engine.native.to_native(x)) for x in x0])
+    controls = np.array([[engine.native.control(u) for u in inputs] for inputs in us])
+    nq, nx = engine.mjx.nq, states.shape[1]
+
+    def step(point: Any) -> Any:
+        data = engine.data.replace(qpos=point[:nq], qvel=point[nq:nx], ctrl=point[nx:])
+        after = mjx.step(engine.mjx, data)
+        return jnp.concatenate([after.qpos, after.qvel])
+
+    def forward(x: Any, u: Any) -> Any:
+        point = jnp.concatenate([x, u])
+        return step(point), jax.jacfwd(step)(point)
+
+    def backward(by_x: Any, jacobian: Any) -> Any:
+        row = by_x @ jacobian
+        return row[:nx], row[nx:]
+
+    @jax.jit
+    @jax.vmap
+    def gradient(x: Any, inputs: Any) -> Any:
+        last, jacobians = jax.lax.scan(forward, x, inputs)
+        return jax.lax.scan(backward, 2 * last, jacobians, reverse=True)
+
+    return lambda: jax.block_until_ready(gradient(states, controls))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--library", nargs="+", default=["torch", "jax"], choices=["torch", "jax"])
+    parser.add_argument("--library", nargs="+", default=["torch", "jax"], choices=["torch", "jax", "mjx"])
     parser.add_argument("--rollouts", type=int, default=64)
     parser.add_argument("--steps", type=int, default=100)
     args = parser.parse_args()
@@ -83,8 +120,12 @@ def main() -> None:
     x, u = np.array([0.1, 0.2]), np.array([0.3])
     single = seconds(lambda: dd.differentiate_step(pendulum, x, u), 1000)
     for name in args.library:
-        if importlib.util.find_spec(name) is None:
+        if importlib.util.find_spec({"mjx": "mujoco.mjx"}.get(name, name)) is None:
             print(f"{name}: not installed")
+            continue
+        if name == "mjx":
+            batch = seconds(through_mjx(go2, x0, us), repeats=1)
+            print(f"mjx: {args.rollouts / batch:.1f} gradients per second")
             continue
         (step, rollout), gradients = {"torch": through_torch, "jax": through_jax}[name]()
         batch = seconds(lambda g=gradients, f=rollout: g(f, go2, x0, us), repeats=1)
