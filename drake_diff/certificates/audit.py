@@ -398,19 +398,21 @@ def _ignored(point: Point) -> Found:
 def _zero_limits(point: Point) -> Found:
     kinds: dict[tuple[str, str], list[str]] = {}
     for row in point.joints:
-        joint, mended = row.joint, "mimic" if row.follows else "" if row.driven else "actuators"
+        joint, mended = row.joint, "mimic" if row.follows else ""
         low, high = float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
         if joint.velocity_lower_limits()[0] == 0 == joint.velocity_upper_limits()[0]:
             kinds.setdefault(("the velocity limit is 0", mended), []).append(row.name)
         if low == high:
-            mended = "" if mended == "actuators" and low else mended
+            mended = mended or ("" if low else "actuators")
             kinds.setdefault((f"the position limits are both {low:g}", mended), []).append(row.name)
     for (kind, mended), names in kinds.items():
         arguments = _fixed(point, names)
         remedy = "load_model(..., fix_joints=) fixes these joints" if arguments else "give it limits in the file"
         if mended == "actuators":
             arguments = {"actuators": names}
-            remedy = "load_model(..., actuators=) removes limits of 0 of the joints that it drives; or fix_joints="
+            remedy = (
+                "load_model(..., actuators=) removes ranges from 0 to 0 of the joints that it names; or fix_joints="
+            )
         elif mended == "mimic":
             remedy, arguments = 'load_model(..., mimic="fix") welds joints that follow others', {"mimic": "fix"}
         yield Finding("error", "zero_limit", listed(names), f"{kind}: no plan can move these joints", remedy, arguments)

@@ -50,6 +50,7 @@ class VerdictOptions:
     significant: float = 30.0  # multiple of the scatter above which a change is significant
     jitter_change: float = 0.1  # relative to an entry: change at a distance of 1e-9 from the point
     mixed: float = 1e-9  # relative to the largest entry of all: effect of a mixed derivative of that size at 1e-9
+    solved: float = 1e-13  # relative to the largest change: rounding of a row that linear equations make constant
     jitter: float = 1e-9  # relative to the scale: distance from the point at which the derivative is taken again
 
 
@@ -103,10 +104,11 @@ def judge(
     codes[(gap <= tolerance) & (noticeable <= LIMITS.power * size)] = AGREE
     # The function does not depend on the variable if its values at all steps are identical to the last bit.
     unchanged = np.all((around.forward == 0) & (around.backward == 0), axis=0)
-    left_out = (a == 0) & unchanged & (noticeable <= LIMITS.exact * np.abs(difference).max(initial=0))
+    left_out = (a == 0) & unchanged | _only_rounding(around, a) & (np.abs(difference) <= LIMITS.trusted * doubt)
+    left_out &= noticeable <= LIMITS.exact * np.abs(difference).max(initial=0)
+    codes[(gap > doubtful) & (tells | (gap > LIMITS.doubtless * tolerance))] = DISAGREE
     codes[left_out] = AGREE
     size = np.where(left_out, np.maximum(size, noticeable / LIMITS.power), size)
-    codes[(gap > doubtful) & (tells | (gap > LIMITS.doubtless * tolerance))] = DISAGREE
     reasons = _beside(around, a, gap, codes)
     reasons |= _stairs(around, size) | _broken(around, a, difference, size)
     if beside is not None:
@@ -115,6 +117,13 @@ def judge(
     for entry in reasons:
         codes[entry] = DISCONTINUOUS
     return Judgement(difference, tolerance, noticeable, size, codes, reasons)
+
+
+def _only_rounding(around: Neighbourhood, a: Array) -> Flags:
+    """Return the rows (m, 1) whose changes and derivative are the rounding of another row, as of a fixed velocity."""
+    changes = np.maximum(np.abs(around.forward), np.abs(around.backward)) * np.array(DIFFERENCES.steps)[:, None, None]
+    of_rows = np.maximum(changes.max(axis=(0, 2), initial=0), DIFFERENCES.steps[0] * np.abs(a).max(axis=1, initial=0))
+    return np.asarray(of_rows <= LIMITS.solved * of_rows.max(initial=0))[:, None]
 
 
 def _nearest(around: Neighbourhood, a: Array, second: Scales | None) -> tuple[Array, Array]:

@@ -5,6 +5,7 @@ program computes forces at the soles and inputs that hold it. From there, Gauss-
 model does not change. It is an equilibrium of the steps and not of a formula.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -48,6 +49,9 @@ AT_REST = 1e-7  # [rad/s or m/s] largest velocity after a step
 # weight, and contact relaxes in RELAXES steps. Drake's own dissipation would cut off a foot's force as it lifts off.
 SINK, RELAXES, DISSIPATION, NEAR_RIGID = 0.0625, 2.5, 0.5, 0.1  # DISSIPATION is in s/m
 FIRST_SINK = 1e-4  # [m] least initial depth, because a sole in the air has no derivative
+# A motion to a posture of least cost: shares of the way that are tried, the share of the steps that holds the end, the
+# least way [rad or m], and relative limits of a way that moves the feet and of a cost's curvature.
+SHARES, HELD, LEAST_WAY, FIXED, FLAT = (1.0, 0.5, 0.25), 0.1, 1e-4, 1e-6, 1e-6
 # A motion from rest to rest.
 DURATIONS, HOLDING = (0.6, 1.0, 1.6), 0.3  # [s] of the motion, and of holding its end
 SIZES = ((1.0, 1.0), (1.0, 0.2), (0.5, 0.2), (0.25, 0.1), (0.12, 0.0))  # factors on a random shift of base and arms
@@ -399,8 +403,7 @@ def random_shift(legs: Legs, start: Rest, seed: Sequence[int], depth: Callable[[
     deepest = max(depth(q0), 1e-4)
     legs.put(q0)
     tall = float(legs.center_of_mass()[2])
-    unit = np.full(model.nv, FREE_JOINT)
-    unit[base : base + 6] = np.repeat([BASE_TURN, BASE_PLACE], 3)
+    unit = _base_first(legs)
     arms = np.array([v not in {i for foot in legs.feet for i in foot.joints} for v in legs.joint_v])
     ranges = (legs.upper - legs.lower)[legs.joint_q][arms]
     margin, why = _margin(legs, INSIDE / 2), Refusal("")
@@ -452,10 +455,60 @@ def shift_to(legs: Legs, start: Rest, frames: Mapping[str, Array], joints: Mappi
     )
 
 
-def _shift_to(
-    legs: Legs, start: Rest, wish: Wish, lower: Array, upper: Array, others: Sequence[PointTarget] = ()
+def shift_of(
+    legs: Legs, start: Rest, steps: int, expand: Callable[[Array], tuple[Array, Array]], least: float = LEAST_WAY
 ) -> Shift | Refusal:
-    """Return a motion from rest to the posture nearest to a wish, with fixed feet and the targets `others`."""
+    """Return a motion of a number of steps to the posture of least cost, or part of the way there, with fixed feet.
+
+    `expand` returns the gradient (nv,) and the Hessian (nv, nv) of the cost in a posture (nq,). There is no motion to a
+    posture nearer than `least` [rad or m].
+    """
+    model, q0 = legs.model, start.x[: legs.model.nq]
+    unit, margin, q = _base_first(legs), _margin(legs, INSIDE / 2), q0
+    for _ in range(ROUNDS):
+        gradient, hessian = expand(q)
+        legs.put(q)
+        _, sizes, ways = np.linalg.svd(legs.jacobian().reshape(-1, model.nv))
+        free = ways[np.count_nonzero(sizes > FIXED * sizes[0]) :].T
+        curvature = free.T @ hessian @ free
+        curvature += FLAT * np.trace(curvature) / len(curvature) * np.eye(len(curvature))
+        way = -free @ np.linalg.lstsq(curvature, free.T @ gradient, rcond=None)[0]
+        targets = legs.at(legs.points_in(q0), ON_GROUND, rolls=range(len(legs.owners)))
+        wish = Wish(legs.moved(q, way), unit)
+        q = inverse_kinematics(model, q, targets, wish, legs.lower + margin, legs.upper - margin)
+    way, holding = legs.apart(q, q0), math.ceil(HELD * steps)
+    if np.max(np.abs(way)) < least:
+        return Refusal("the posture of least cost is the first one")
+    why = Refusal("")
+    for share in SHARES:
+        wish, spans = Wish(legs.moved(q0, share * way), unit), [(steps - holding, holding)]
+        shift = _shift_to(legs, start, wish, legs.lower + margin, legs.upper - margin, spans=spans)
+        if not isinstance(shift, Refusal):
+            return shift
+        why = shift
+    return why
+
+
+def _base_first(legs: Legs) -> Array:
+    """Return (nv,) the deviations [rad or m] that cost 1, for a required pose of the base."""
+    unit = np.full(legs.model.nv, FREE_JOINT)
+    unit[legs.base_v : legs.base_v + 6] = np.repeat([BASE_TURN, BASE_PLACE], 3)
+    return unit
+
+
+def _shift_to(
+    legs: Legs,
+    start: Rest,
+    wish: Wish,
+    lower: Array,
+    upper: Array,
+    others: Sequence[PointTarget] = (),
+    spans: Sequence[tuple[int, int]] = (),
+) -> Shift | Refusal:
+    """Return a motion from rest to the posture nearest to a wish, with fixed feet and the targets `others`.
+
+    `spans` are the steps of the motion and of holding its end, the first feasible of which are used.
+    """
     q0 = start.x[: legs.model.nq]
     feet, q, soles = legs.points_in(q0), q0, legs
     for _ in range(ROUNDS):  # a foot of several spheres rolls from one to the next
@@ -473,9 +526,9 @@ def _shift_to(
     end = stance if isinstance(stance, Refusal) else settled(soles, stance)
     if isinstance(end, Refusal):
         return end
-    why, nq = Refusal(""), legs.model.nq
-    for duration in DURATIONS:
-        shift = _between(legs, start, end, duration)
+    why, nq, h = Refusal(""), legs.model.nq, legs.model.time_step
+    for moving, holding in spans or [(round(duration / h), round(HOLDING / h)) for duration in DURATIONS]:
+        shift = _between(legs, start, end, moving, holding)
         if isinstance(shift, Refusal):
             why = shift
             continue
@@ -487,14 +540,13 @@ def _shift_to(
     return why
 
 
-def _between(legs: Legs, start: Rest, end: Rest, duration: float) -> Shift | Refusal:
-    """Return the model's own steps from one rest to (nearly) another in `duration` [s], with the feet on the ground.
+def _between(legs: Legs, start: Rest, end: Rest, moving: int, holding: int) -> Shift | Refusal:
+    """Return the model's own steps from one rest to (nearly) another, in steps `moving` and `holding`, on its feet.
 
     The inputs produce a smooth motion of the posture, with forces shared among the feet. A regulator keeps the steps
     near this motion.
     """
     model, h = legs.model, legs.model.time_step
-    moving, holding = round(duration / h), round(HOLDING / h)
     q0, q1 = start.x[: model.nq], end.x[: model.nq]
     s = smooth(np.linspace(0, 1, moving + 1))
     feet = [legs.points_in(q) for q in (q0, q1)]  # round ones roll as the legs turn
@@ -544,7 +596,7 @@ def _regulated(legs: Legs, xs: Array, us: Array) -> Shift | Refusal:
         return Refusal(f"Drake cannot take the steps of the motion: {error}")
     terms = [*model.contract.positions, *model.contract.velocities]
     low, high = np.array([t.lower for t in terms]), np.array([t.upper for t in terms])
-    beyond = (low < high) & np.any((np.array(states) < low) | (np.array(states) > high), axis=0)
+    beyond = np.any((np.array(states) < low) | (np.array(states) > high), axis=0)
     if np.any(beyond):
         return Refusal(f"{model.state_names[int(np.argmax(beyond))]} would leave its limits")
     lifted = np.min(depths, axis=0) < FIRM * depths[0]

@@ -72,6 +72,7 @@ from drake_diff.model.repairs import (
     position_in_file,
     still_moving,
     take_away_contact,
+    take_away_speeds_of_zero,
     touch_the_world_alone,
     uncoupled,
     weld_link,
@@ -538,7 +539,9 @@ def load_model(
         gravity: (3,) Gravity [m/s^2], instead of Drake's (0, 0, -9.81).
         actuators: The joints to drive in addition to those that the file drives: "all" revolute and prismatic joints
             without a mimic, a list of names, or a mapping from names to effort limits [N or N m]. The default limit is
-            the file's, or none if it is 0 or missing. A file without transmissions or actuators has no input.
+            the file's, or none if it is 0 or missing. A range from 0 to 0 of such a joint is removed, also if the file
+            drives it; Drake locks other joints at 0. A velocity limit of 0 is removed from every joint. A file without
+            transmissions or actuators has no input.
         base: "weld" welds floating mechanisms with joints to the world at their pose in the file. The name of a frame
             welds that frame to the world's origin. "free" refuses a file with a fixed base.
         fix_joints: The joints to replace by welds at their default positions, or the nearest positions within limits.
@@ -853,6 +856,7 @@ def _repaired(
         else:
             reduced = couple(plant, mimics)
             notes += reduced if choice == "reduce" else ()
+        notes += take_away_speeds_of_zero(plant)
         notes += add_actuators(plant, options["actuators"], facts)
         notes += add_servos(plant, options["inputs"], options["gains"], facts)
         if weld_base is not None:

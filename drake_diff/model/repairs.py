@@ -20,7 +20,7 @@ is the step of the reduced equations up to rounding, without contacts and active
 belong to its own v', which differs from E v'_own by the compliance of the near-rigid constraint.
 """
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -102,7 +102,7 @@ def add_actuators(plant: MultibodyPlant, asked: Actuated, facts: FileFacts) -> t
     """Add an actuator to each joint of `asked` that has none, and return notes on the changes.
 
     An actuator has the name of its joint. Its effort limit defaults to the file's; a limit of 0 means no limit. For
-    such a joint, a velocity limit of 0 or a range from 0 to 0 also means no limit: it is a placeholder in the file.
+    all joints of `asked`, with or without an actuator before, a range from 0 to 0 also means no limit.
     """
     if asked is None:
         return ()
@@ -115,13 +115,15 @@ def add_actuators(plant: MultibodyPlant, asked: Actuated, facts: FileFacts) -> t
         limit = given if given is not None and given > 0 else np.inf
         if given_here and says is not None:
             facts.joints[key_of(joint)] = replace(says, sides=None)
+        if joint.position_upper_limits()[0] == 0 == joint.position_lower_limits()[0]:
+            joint.set_position_limits([-np.inf], [np.inf])
+            opened.append(name)
         if joint.index() in driven:
             notes += _limit_again(driven[joint.index()], limit) if given_here else []
             continue
         actuator = plant.AddJointActuator(joint.name(), joint, limit)
         if says is not None and says.armature:
             actuator.set_default_rotor_inertia(says.armature)
-        opened += [f"{name} ({what})" for what in _open(joint)]
         added[name] = limit
     limited = [f"{name} ({limit:g})" for name, limit in added.items() if np.isfinite(limit)]
     unlimited = [name for name, limit in added.items() if not np.isfinite(limit)]
@@ -130,7 +132,7 @@ def add_actuators(plant: MultibodyPlant, asked: Actuated, facts: FileFacts) -> t
         *notes,
         *note(f"{len(limited)} actuators added, with the effort limits {whose}", limited),
         *note(f"{len(unlimited)} actuators added without an effort limit, {why}", unlimited),
-        *note("Limits of 0 of driven joints removed", opened),
+        *note("Ranges from 0 to 0 of driven joints removed", opened),
     )
 
 
@@ -216,8 +218,7 @@ def _chosen(
     possible = {name: joint for name, joint in labelled(joints(plant)).items() if can_be_driven(joint)}
     copies = {name for name, joint in possible.items() if key_of(joint) in facts.followers}
     if asked == "all":
-        driven = [actuator.joint().index() for actuator in actuators(plant)]
-        return {name: j for name, j in possible.items() if j.index() not in driven and name not in copies}
+        return {name: joint for name, joint in possible.items() if name not in copies}
     for name in asked:
         if name not in possible:
             raise UnknownNameError(f"{subject}: revolute or prismatic joint", got=name, known=possible)
@@ -226,14 +227,16 @@ def _chosen(
     return {name: possible[name] for name in asked}
 
 
-def _open(joint: Any) -> Iterator[str]:
-    """Remove limits of 0 from a driven joint, and yield which limits were removed."""
-    if joint.velocity_upper_limits()[0] == 0 == joint.velocity_lower_limits()[0]:
+def take_away_speeds_of_zero(plant: MultibodyPlant) -> tuple[str, ...]:
+    """Remove velocity limits of 0 from all joints: they are placeholders in files, and Drake's steps ignore them."""
+    stopped = {
+        name: joint
+        for name, joint in labelled(joints(plant)).items()
+        if joint.num_velocities() == 1 and joint.velocity_upper_limits()[0] == 0 == joint.velocity_lower_limits()[0]
+    }
+    for joint in stopped.values():
         joint.set_velocity_limits([-np.inf], [np.inf])
-        yield "velocity"
-    if joint.position_upper_limits()[0] == 0 == joint.position_lower_limits()[0]:
-        joint.set_position_limits([-np.inf], [np.inf])
-        yield "position"
+    return note("Velocity limits of 0 removed", list(stopped))
 
 
 def position_in_file(plant: MultibodyPlant, facts: FileFacts, joint: Any) -> float:

@@ -12,14 +12,17 @@ from pydrake.trajectories import PiecewisePolynomial, StackedTrajectory, Traject
 from scipy.integrate import solve_ivp
 
 from drake_diff._base.arrays import Array, finite_array, positive_float
+from drake_diff._base.values import Refusal
 from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import DrakeDiffError, InputError, ShapeError
+from drake_diff.legs.feet import Legs, find_feet
+from drake_diff.legs.standing import AT_REST, Rest, Shift, ranges, shift_of
 from drake_diff.mechanics.clearance import OfShapes
 from drake_diff.model.assembly import closed
 from drake_diff.model.contact import penetration
 from drake_diff.model.model import Model
 from drake_diff.model.plant import joints
-from drake_diff.model.step import set_state
+from drake_diff.model.step import advance, set_state
 from drake_diff.model.tangent import tangent_space
 from drake_diff.optimize.problem.cost import TimedCost
 from drake_diff.optimize.problem.obstacles import clearances
@@ -33,6 +36,7 @@ ROUNDED = 1e-6  # inputs below this fraction of the largest holding input count 
 NOISE = 1e-3  # noise on a stationary guess, as a fraction of the input limits, to break its symmetry
 WANDER = (1.0, 0.3)  # deviation of a random guess from the straight line, as a fraction of max(1, distance to the goal)
 WAVES = 4
+GOAL = 1e6  # weight of a goal beside the cost, for a posture
 LONGER = 3.0  # largest factor between a random horizon and the first horizon, in both directions
 FORMS = "None, (xs, us), two Drake trajectories (state, input), one of states or positions, or a Solution"
 
@@ -204,6 +208,8 @@ def _line(problem: Problem, method: str, seed: int) -> Guess:
     """Return a straight line to the goal or the reference, with the problem's inputs or inputs near zero."""
     xs, followed = _way(problem)
     us = np.array(problem.us)
+    if method != "collocation" and followed is None and (shift := on_feet(problem)) is not None:
+        return Guess(shift.xs, np.clip(shift.us, problem.bounds.u_lower, problem.bounds.u_upper))
     if method == "collocation" and followed is None and not us.any() and _keeps_shapes_clear(problem):
         xs, us = _from_rest_to_rest(problem)
     if problem.optimizes_controls and not us.any() and followed is not None:
@@ -338,6 +344,38 @@ def _holding(problem: Problem, xs: Array) -> Array:
     inputs = np.clip(np.linalg.lstsq(by_u, missing, rcond=None)[0], bounds.u_lower, bounds.u_upper)
     held = np.where(np.abs(inputs) > ROUNDED * np.abs(inputs).max(), inputs, none)
     return np.where(model.inputs.commanded, model.neutral_input(xs[1:]), held)
+
+
+def on_feet(problem: Problem) -> Shift | None:
+    """Return a motion on fixed feet to the posture of least cost, for a robot at rest on its feet in x0, or None."""
+    model = problem.model if isinstance(problem.system, Model) else None
+    given = problem.initial_state_is_given and problem.optimizes_controls and not problem.us.any()
+    if model is None or not (given and problem.has_cost and model.inputs.plain and _stands(model, problem.x0)):
+        return None
+    from drake_diff.optimize.knots import costs_of  # loads CasADi
+
+    count, h, q = problem.num_steps, model.time_step, problem.x0[: model.nq]
+    feet, u = find_feet(model, q), _holding(problem, problem.x0[None].repeat(2, axis=0))[0]
+    try:
+        speeds = np.array(advance(model.double, problem.x0, u))[model.nq :]
+        if isinstance(feet, Refusal) or np.max(np.abs([*problem.x0[model.nq :], *speeds])) > AT_REST:
+            return None
+        legs = Legs(model, feet, *ranges(model, np.pi)).on_lowest(q)
+        goal = np.where(np.isnan(problem.goal), 0.0, GOAL)
+
+        def expand(q: Array) -> tuple[Array, Array]:
+            x = np.concatenate([q, np.zeros(model.nv)])
+            xs, us = np.tile(x, (count + 1, 1)), np.tile(u, (count, 1))
+            slopes = costs_of(problem, xs, us, h).expand(xs, us)
+            gradient, hessian = (terms.sum(axis=0)[..., : model.nx] for terms in slopes)
+            moved = legs.space.derivative_of_plus(x)[:, : model.nv]
+            gradient = gradient + goal * np.nan_to_num(x - problem.goal)
+            return moved.T @ gradient, moved.T @ (hessian[: model.nx] + np.diag(goal)) @ moved
+
+        shift = shift_of(legs, Rest(problem.x0, u), count, expand)
+    except DrakeDiffError:
+        return None
+    return None if isinstance(shift, Refusal) else shift
 
 
 def _stands(model: Model, x: Array) -> bool:

@@ -19,7 +19,7 @@ from drake_diff.model.step import set_state
 from drake_diff.motion.intervals import roll
 from drake_diff.motion.rollout import CONTINUOUS
 from drake_diff.optimize.continuation import check_schedule
-from drake_diff.optimize.guess import another_guess, first_guess, first_guesses, other_guess, sampled
+from drake_diff.optimize.guess import another_guess, first_guess, first_guesses, on_feet, other_guess, sampled
 from drake_diff.optimize.ilqr.ilqr import check_problem, takes
 from drake_diff.optimize.options import Options
 from drake_diff.optimize.path_timing import PathTiming
@@ -42,6 +42,7 @@ OTHER_GUESS = "another first guess"
 OTHER_STARTS = {"method": "collocation", "reason": "other first guesses"}
 MOST_VERIFIED = 3  # of the cheaper motions from random guesses
 REFINING = 50  # iterations from a collocated plan to the optimum in steps; many take ten, a Panda at its bounds 45
+ON_FEET = 2.0  # largest cost of a motion on fixed feet, relative to one that was not verified
 NOT_FOUND = (Status.INFEASIBLE, Status.ITERATION_LIMIT, Status.DIVERGED, Status.FAILED)
 BLIND = (Status.NO_GRADIENT, Status.DIVERGED)
 ENDED = (Status.CONVERGED, Status.INTERRUPTED, Status.TIME_LIMIT)
@@ -580,6 +581,7 @@ def _attempts(problem: Any, asked: Attempt, given: Any, solutions: list[Any]) ->
     if method == "collocation":
         yield from _other_guesses(problem, first, given, solutions)
         yield from _kept_apart(problem, first, solutions)
+    yield from _near_feet(problem, first, given, solutions[-1])
     if solutions[-1].status is Status.NO_GRADIENT and method == "ilqr":
         touching = replace(first.options, continuation="auto")
         yield replace(first, reason="the guess has no gradient", options=touching), given
@@ -594,6 +596,20 @@ def _attempts(problem: Any, asked: Attempt, given: Any, solutions: list[Any]) ->
             guess = solutions[-1]
         after = "collocation" if method == "collocation" else "shooting"
         yield asked.by(after, "from the motion that iLQR found"), guess
+
+
+def _near_feet(problem: Problem, first: Attempt, given: Any, stalled: Solution) -> Iterator[tuple[Attempt, Any]]:
+    """Yield a search for the motion that is nearest to the one on fixed feet, if it costs little more than `stalled`.
+
+    The least cost is often at a jump: a robot that moves as fast as possible lifts its feet.
+    """
+    by_default = stalled.method == "ilqr" and given is None and stalled.status not in ENDED
+    shift = on_feet(problem) if by_default and np.all(np.isfinite(stalled.xs)) else None
+    if shift is None:
+        return
+    motion = replace(stalled, xs=shift.xs, us=shift.us, certificates=(), iterations=())
+    if motion.cost <= ON_FEET * stalled.cost:
+        yield replace(first, reason="the motion nearest to one on fixed feet", closest=True), motion
 
 
 def _by_ilqr_first(problem: Problem, first: Attempt, given: Any) -> Iterator[tuple[Attempt, Any]]:

@@ -23,7 +23,7 @@ REFINED = "raise max_num_steps, or take more steps (num_steps)"  # if the mesh w
 SHORTER = "take a smaller time step"
 _ALIKE = ("ITERATION_LIMIT", "TIME_LIMIT", "INFEASIBLE", "INTERRUPTED", "DIVERGED", "NO_GRADIENT", "FAILED")
 # The solver stopped before it met its own tolerance, and independent measures decide whether the plan is a solution.
-NEAR = "a motion near the collocated optimum, but not an optimum in these steps"
+NEAR = "a motion near an earlier one, but not an optimum in these steps"
 LOCAL = "a local optimum"
 DEARER = 0.25  # of a plan's cost; motions near plans of the task benchmark cost up to 15 % more in coarse steps
 STOPPED = (Outcome.INACCURATE, Outcome.ITERATION_LIMIT, Outcome.NO_GRADIENT, Outcome.FAILED)

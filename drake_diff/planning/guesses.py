@@ -443,9 +443,9 @@ class MotionGuess:
 
 
 def speed_limits(model: Model) -> Array:
-    """Return speed limits (nv,) for initial guesses; FASTEST for joints with a velocity limit of 0 or none."""
+    """Return speed limits (nv,) for initial guesses; FASTEST for joints without a velocity limit."""
     limits = np.array([min(abs(v.lower), abs(v.upper)) for v in model.contract.velocities])
-    return np.where((limits > 0) & np.isfinite(limits), np.minimum(OF_SPEED * limits, 5 * FASTEST), FASTEST)
+    return np.where(np.isfinite(limits), np.minimum(OF_SPEED * limits, 5 * FASTEST), FASTEST)
 
 
 def along(robot: Robot, line: PostureLine, *, slower: float = 1.0) -> MotionGuess:

@@ -373,7 +373,7 @@ def _of_driven(robot: Robot, task: Goals, least: str | None, seed: int) -> Itera
 
 def _check_that_limits_bound_time(model: Model) -> None:
     """Raise InputError if speed is unlimited: without effort or speed limits there is no least time."""
-    fast = [v.name for v in model.contract.velocities if not v.lower < v.upper or np.isinf([v.lower, v.upper]).any()]
+    fast = [v.name for v in model.contract.velocities if np.isinf([v.lower, v.upper]).any()]
     strong = [u.name for u in model.contract.inputs if np.isinf([u.lower, u.upper]).any()]
     if model.inputs.commanded.any():
         expected = "efforts as inputs, as collocation finds the least time and does not support servos"
@@ -441,9 +441,7 @@ def _problem(robot: Robot, task: Goals, guess: MotionGuess, x_goal: Array, **ask
         x_goal = np.where(np.concatenate([coordinates_of(guess.model, counted), counted]), x_goal, np.nan)
         x_goal[list(task.joints)] = list(task.joints.values())  # the guess may have missed them
     asked = {"num_steps": guess.num_steps, **asked}
-    return Problem(
-        guess.model, x0=guess.xs[0], x_goal=x_goal, goals=[*goals, *task.avoid], bounds=_bounds(guess.model), **asked
-    )
+    return Problem(guess.model, x0=guess.xs[0], x_goal=x_goal, goals=[*goals, *task.avoid], **asked)
 
 
 def _of_reachable(robot: Robot, task: Goals, seed: int) -> Iterator[_Attempt]:
@@ -510,7 +508,6 @@ def _of_passive(robot: Robot, task: Goals) -> Iterator[_Attempt]:
             x0=x0,
             x_goal=goal,
             num_steps=steps,
-            bounds=_bounds(model),
             goals=task.avoid,
             running_cost=_effort(model),
         )
@@ -525,26 +522,16 @@ def _effort(model: Model) -> QuadraticCost:
     return QuadraticCost(Q=np.diag(speeds), R=np.diag(1.0 / size**2))
 
 
-def _bounds(model: Model, near: Array | None = None) -> Bounds | None:
-    """Return the model's limits, without velocity limits of 0, which no motion satisfies.
-
-    With postures (K, nq) in `near`, each joint stays within their range plus a margin.
-    """
-    dead = np.array([v.lower >= v.upper for v in model.contract.velocities])
-    if near is None and not np.any(dead):
-        return None
-    lower, upper = np.full(model.nx, np.nan), np.full(model.nx, np.nan)
-    lower[model.nq :][dead], upper[model.nq :][dead] = -np.inf, np.inf
-    if near is not None:
-        limits = model.contract.positions
-        lower[: model.nq] = np.maximum([p.lower for p in limits], np.min(near, axis=0) - BESIDE)
-        upper[: model.nq] = np.minimum([p.upper for p in limits], np.max(near, axis=0) + BESIDE)
-    return Bounds(x_lower=lower, x_upper=upper)
+def _bounds(model: Model, near: Array) -> Bounds:
+    """Return the model's limits, with each joint within the range of the postures `near` (K, nq) plus a margin."""
+    free, (lower, upper) = np.full(model.nv, np.nan), model.position_limits
+    low, high = np.maximum(lower, np.min(near, axis=0) - BESIDE), np.minimum(upper, np.max(near, axis=0) + BESIDE)
+    return Bounds(x_lower=np.concatenate([low, free]), x_upper=np.concatenate([high, free]))
 
 
 def _goes(guess: MotionGuess) -> bool:
-    """Return whether the motion is large enough and within the model's limits, except velocity limits of 0."""
+    """Return whether the motion is large enough and within the model's limits."""
     terms = [*guess.model.contract.positions, *guess.model.contract.velocities]
     low, high = np.array([t.lower for t in terms]), np.array([t.upper for t in terms])
     goes = np.max(np.ptp(guess.xs[:, : guess.model.nq], axis=0)) >= SMALLEST_WAY
-    return bool(goes and np.all((low >= high) | ((guess.xs >= low) & (guess.xs <= high))))
+    return bool(goes and np.all((guess.xs >= low) & (guess.xs <= high)))

@@ -185,6 +185,10 @@ def _add_motors(draft: _Draft) -> None:
             begin = f"only {had} joints had a motor" if had else "no joint had a motor"
             repair = f"{begin}: motors were added, {driven.nu} in total (actuators='all')"
             draft.mend(repair, driven, actuators="all")
+    driven_joints = [actuator.joint() for actuator in actuators(draft.model.plant)]
+    locked = [j.name() for j in driven_joints if j.position_lower_limits()[0] == 0 == j.position_upper_limits()[0]]
+    if locked:
+        draft.mend(f"the range from 0 to 0 of {_few(locked)} was removed (actuators=)", actuators=tuple(locked))
 
 
 def _movable(model: Model) -> int:

@@ -16,7 +16,7 @@ INERTIA = '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>'
 INERTIAL = f'<inertial><mass value="1"/>{INERTIA}</inertial>'
 BOX = '<collision><geometry><box size="0.06 0.06 0.06"/></geometry></collision>'
 LIMIT = '<limit effort="7" velocity="1" lower="-2" upper="2"/>'
-LIMIT_OF_0 = '<limit effort="1" velocity="0" lower="-1" upper="1"/>'
+LIMIT_OF_0 = '<limit effort="1" velocity="1" lower="0" upper="0"/>'
 DRIVE = (
     '<transmission><type>SimpleTransmission</type><joint name="hinge"/><actuator name="motor"/></transmission></robot>'
 )
@@ -97,7 +97,7 @@ FILES = {
     "unread_compliance 2": sdf("", "<drake:relaxation_time>3</drake:relaxation_time>"),
     "ignored": ARM.replace("</joint>", '<dynamics friction="2"/></joint>'),
     "ignored 2": ARM.replace("</joint>", "<safety_controller/></joint>", 1),
-    "zero_limit": ARM.replace(DRIVE, "</robot>").replace('velocity="1"', 'velocity="0"'),
+    "zero_limit": ARM.replace('lower="-2" upper="2"', 'lower="0" upper="0"'),
     "zero_limit 2": ARM.replace(DRIVE, "</robot>").replace('lower="-2" upper="2"', 'lower="0" upper="0"'),
     "corners_miss": GRASP,
     "undriven": with_more(ARM, TIP, WRIST),
@@ -140,7 +140,7 @@ TRAPS = [
      "lagged read hunt_crossley", {"contact_approximation": "sap"}),
     ("ignored", "warning", "ignored", {}, r"friction\): Drake does not read this part of the file \(1 times\)", None),
     ("ignored", "info", "ignored 2", {}, "safety_controller", None),
-    ("zero_limit", "error", "zero_limit", {}, "the velocity limit is 0", {"actuators": ["hinge"]}),
+    ("zero_limit", "error", "zero_limit", {}, "limits are both 0", {"actuators": ["hinge"]}),
     ("zero_limit", "error", "zero_limit 2", {}, "limits are both 0", {"actuators": ["hinge"]}),
     ("corners_miss", "warning", "corners_miss", {"contact_geometry": "corner_spheres"}, "block - left",
      {"contact_geometry": "differences"}),
@@ -166,7 +166,7 @@ TRAPS = [
     ("ignored", "warning", "ignored 3", {}, r"the friction of a joint, 0\.3, is ignored", None),
     ("ignored", "warning", "ignored 4", {}, "1 <contact> are ignored", None),
     ("ignored", "info", "ignored 5", {}, "1 <gazebo> are ignored", None),
-    ("zero_limit", "error", "zero_limit 5", {}, r"wrist\): the velocity limit is 0", {"mimic": "fix"}),
+    ("zero_limit", "error", "zero_limit 5", {}, r"wrist\): the position limits are both 0", {"mimic": "fix"}),
     ("left_out", "warning", "left_out", {}, r"1 actuators left out, .*: servo \(damper of j, line 1\)",
      {"actuators": ["j"]}),
     ("left_out", "warning", "left_out 2", {}, r"pull \(motor of no joint, line 1\)", None),

@@ -321,3 +321,24 @@ def test_a_standing_robot_is_held_by_the_default_guess():
     lifted = x0 + 0.1 * np.eye(model.nx)[6]  # in the air, nothing holds it
     free = first_guess(dd.Problem(model, x0=lifted, num_steps=20, running_cost=effort), "ilqr", None, 0)
     assert not np.any(free.us)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["solo12", "a1"])
+def test_a_robot_on_its_feet_is_lowered_by_a_plain_cost(name):
+    """For A1, the least cost is at a jump, where a foot lifts off. The plan is then near the first guess."""
+    options = {"base": "free", "ground": True, "contact": "ground", "actuators": "all", "time_step": 0.01}
+    file = robot_file(f"{name}.urdf")
+    robot = dd.legs.stand(dd.load_model(file, meshes="spheres", contact_geometry="corner_spheres", **options))
+    model, z = robot.model, 6
+    lower = robot.x0 - 0.04 * np.eye(model.nx)[z]
+    weights = np.zeros(model.nx)
+    weights[:4], weights[4:7], weights[model.nq :] = 10.0, 100.0, 0.01
+    inputs = 1e-3 / np.max(np.abs(robot.u)) ** 2 * np.eye(model.nu)
+    running = dd.QuadraticCost(Q=np.diag(weights), R=inputs, x_ref=lower)
+    final = dd.QuadraticCost(Q=10 * np.diag(weights), x_ref=lower)
+    solution = dd.solve(dd.Problem(model, x0=robot.x0, num_steps=50, running_cost=running, final_cost=final))
+    assert solution.success, solution.message
+    assert np.linalg.norm((solution.xs[-1] - lower)[4:7]) < 1e-3  # [m]
+    assert solution.options["chain"][-1]["method"] == "ilqr"
+    assert any("not an optimum" in note for note in solution.notes) == (name == "a1")

@@ -82,10 +82,29 @@ def test_a_joint_without_a_limit_or_with_one_of_zero_gets_none_and_that_is_told(
     model, _ = load(write(robot(joint("shoulder", "base", "upper", "continuous", ""), zero)), actuators="all")
     assert [math.isinf(a.effort_limit) for a in model.contract.actuators] == [True, True]
     assert model.notes == (
+        "Velocity limits of 0 removed: elbow.",
         "2 actuators added without an effort limit, as the file has no limit or 0: shoulder, elbow.",
-        "Limits of 0 of driven joints removed: elbow (velocity).",
     )
     assert model.contract.velocities[-1].upper == math.inf
+
+
+def test_limits_of_zero_have_one_rule_for_driven_and_passive_joints(write):
+    """A speed of 0 is no limit of any joint; a range of 0 is removed from each joint of `actuators`, driven or not."""
+    zero = '<limit effort="7" velocity="0" lower="0" upper="0"/>'
+    drive = (
+        '<transmission><type>transmission_interface/SimpleTransmission</type><joint name="elbow">'
+        '<hardwareInterface>EffortJointInterface</hardwareInterface></joint><actuator name="elbow"/></transmission>'
+    )
+    chain = robot(joint("shoulder", "base", "upper", limit=zero), joint("elbow", "upper", "lower", limit=zero))
+    file = write(chain.replace("</robot>", drive + "</robot>"))
+
+    def ranges(model):
+        return [(p.lower, v.upper) for p, v in zip(model.contract.positions, model.contract.velocities, strict=True)]
+
+    asked = [(-math.inf, math.inf)] * 2
+    assert ranges(load(file, base="weld")[0]) == [(0.0, math.inf)] * 2
+    assert ranges(load(file, base="weld", actuators="all")[0]) == asked
+    assert ranges(load(file, base="weld", actuators=["shoulder", "elbow"])[0]) == asked
 
 
 def test_actuators_by_name_and_by_effort(write):

@@ -87,6 +87,20 @@ def test_motion_and_forces_are_those_of_drakes_matrices(name, frame, point, axes
         np.testing.assert_allclose(contacts.linearize(knot)[1][0] / scale, np.array(differences).T / scale, atol=1e-7)
 
 
+@pytest.mark.parametrize("error", [0.0, 0.1])
+def test_the_rows_of_a_velocity_that_contacts_fix_agree(error):
+    """The acceleration of a fixed cart is 0, up to the rounding of a linear solve."""
+    model = dd.load_model(MODELS / "cart_pole.urdf", time_step=0.01, contact=False)
+    contacts = dd.optimize.FixedContacts(model, {"cart": [0, 0, 0]}, axes="x")
+    knot = np.array([0.3, -0.4, 0.5, 0.6, 1.0])
+    wrong = np.zeros((4, 5))
+    wrong[2, 4] = error * 1e-3
+    certificate = dd.certificates.certify_jacobian(
+        contacts.values, knot, lambda z: contacts.linearize(z[None])[1][0] + wrong, batched=True
+    )
+    assert certificate.verdict == ("disagree" if error else "agree")
+
+
 def test_a_leg_of_two_links_is_held(leg_file):
     model = dd.load_model(leg_file, time_step=0.01, actuators={"hip_j": 60, "knee": 60})
     contacts = dd.optimize.FixedContacts(model, {"shin": [0, 0, -0.3]})

@@ -16,7 +16,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import chain
 from drake_diff._base.clock import now
 from drake_diff.exceptions import ModelError
-from drake_diff.model.contact import Separation, distances, separations
+from drake_diff.model.contact import distances, gaps, separation_at
 from drake_diff.model.model import Model
 from drake_diff.model.step import set_state
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr
@@ -74,8 +74,8 @@ class ContactHold:
 
         def distance(x: Any) -> Any:
             if x.dtype == float:
-                return _separation(model, x, self.pair).distance
-            separation = _separation(model, ExtractValue(x.reshape(-1, 1)).ravel(), self.pair)
+                return separation_at(model, x, self.pair).distance
+            separation = separation_at(model, ExtractValue(x.reshape(-1, 1)).ravel(), self.pair)
             return chain(separation.distance, np.pad(separation.gradient, (0, model.nv)), x)
 
         sides = {"lower": MARGIN} if self.apart else {"upper": -MARGIN}
@@ -122,7 +122,7 @@ def solve_through_jumps(
         ahead = _beginnings_or_none(problem, xs, report)
         stuck, holds, values = ahead == holds, ahead, result.parameters
     pressing = [
-        str(h) for h in holds if abs(_separation(problem.model, xs[h.knot], h.pair).distance) < PRESSING * MARGIN
+        str(h) for h in holds if abs(separation_at(problem.model, xs[h.knot], h.pair).distance) < PRESSING * MARGIN
     ]
     if result.outcome is Outcome.SOLVED and pressing:
         result = replace(result, note=f"a minimum for its own sequence of contacts, held by {'; '.join(pressing)}")
@@ -143,22 +143,17 @@ def beginnings(problem: Problem, xs: Array) -> tuple[ContactHold, ...]:
 
     A given initial state is omitted, because nothing changes it, and so is the last state, on which no force acts.
     """
-    distances = []
+    rows = []
     for x in xs[:-1]:
         set_state(problem.model.double, x)
-        distances.append([s.distance for s in separations(problem.model.double)])
-    phi, names = np.array(distances), [s.bodies for s in separations(problem.model.double)]
+        rows.append(gaps(problem.model.double))
+    phi, names = np.array([[distance for _, distance in row] for row in rows]), [pair for pair, _ in rows[0]]
     holds = list[ContactHold]()
     for before, pair in np.argwhere((phi[:-1] >= 0) & (phi[1:] < 0)):
         for k, apart in ((int(before), True), (int(before) + 1, False)):
             if k or not problem.initial_state_is_given:
                 holds.append(ContactHold(int(pair), names[pair], k, apart))
     return tuple(holds)
-
-
-def _separation(model: Model, x: Array, pair: int) -> Separation:
-    set_state(model.double, x)
-    return separations(model.double)[pair]
 
 
 def miss_of(problem: Problem, xs: Array) -> float:
