@@ -213,6 +213,8 @@ def what_acts(model: Model, pieces: Sequence[Excerpt]) -> str:
             beyond = np.any((q < lower) | (q > upper), axis=0)
         if np.any(beyond):
             return f"{model.position_names[int(np.argmax(beyond))]} is beyond its limit"
+        if not model.contract.contact.collision_pairs:
+            continue
         if any(overlaps_along(model, guess_states(model, piece, np.arange(len(piece.times))))):
             return TOUCH
     return ""
@@ -409,7 +411,8 @@ class Problem:
         held_out = any(motion.piece.held_out for motion in predicted.motions)
         if reason:
             judged = [(m.piece.ys, m.xs) for m in predicted.motions if m.piece.held_out or not held_out]
-            falls = lacks(fit, solved, predicted.fit if held_out else None, predicted.solved)
+            late = self.watch.is_late
+            falls = {} if late else lacks(fit, solved, predicted.fit if held_out else None, predicted.solved)
             remains = (*where_left(self.model, judged), *([structure_line(falls, held_out)] if falls else ()))
         return identification(
             unknowns,
