@@ -2,7 +2,8 @@
 
 The states are those of `trust_certificate`. The error is in an entry of at least 1e-3 of the largest of its row, with
 positions in 0.1 and velocities and inputs in 1 SI unit. Each check gets the same step, as a function of displacements
-on the tangent space, and uses its own default steps and tolerances. Checks that are not installed are left out.
+on the tangent space, and uses its own default steps and tolerances. Checks that are not installed are left out. In
+contact, Drake's solver leaves an error of 1e-6, for which a check of Drake's own steps may not accept the exact one.
 """
 
 import contextlib
@@ -202,20 +203,25 @@ def measure(seed, count):
             verdict = ours.verdict(a)
             tally["certify", "alarms"] += verdict in ("disagree", "discontinuous")
             tally["certify", "undecided"] += verdict == "undecided"
-            tally["certify", "seen"] += sum(ours.verdict(wrong) != "agree" for wrong in errors)
+            rejected = sum(ours.verdict(wrong) != "agree" for wrong in errors)
+            tally["certify", "seen"] += rejected
+            tally["certify", "apart"] += rejected * (verdict == "agree")
             for check in checks:
-                tally[check.name, "alarms"] += not check.accepts(change, a)
-                tally[check.name, "seen"] += sum(not check.accepts(change, wrong) for wrong in errors)
+                right = check.accepts(change, a)
+                rejected = sum(not check.accepts(change, wrong) for wrong in errors)
+                tally[check.name, "alarms"] += not right
+                tally[check.name, "seen"] += rejected
+                tally[check.name, "apart"] += rejected * right
     figures = [
         Figure("certify: an exact Jacobian is undecided", tally["certify", "undecided"], tally["states"], 0.03, False)
     ]
     for name in ("certify", *(check.name for check in checks)):
         ours = name == "certify"
-        seen, alarms = tally[name, "seen"], tally[name, "alarms"]
+        seen, apart, alarms = (tally[name, what] for what in ("seen", "apart", "alarms"))
+        wrongly = "called wrong" if ours else "not accepted"
         figures += [
             Figure(f"{name}: an entry 1 % off is not accepted", seen, tally["errors"], 0.995 if ours else 0.0, True),
-            Figure(
-                f"{name}: an exact Jacobian is called wrong", alarms, tally["states"], 0.005 if ours else 1.0, False
-            ),
+            Figure(f"{name}: ... while the exact Jacobian is", apart, tally["errors"], 0.97 if ours else 0.0, True),
+            Figure(f"{name}: an exact Jacobian is {wrongly}", alarms, tally["states"], 0.005 if ours else 1.0, False),
         ]
     return figures
