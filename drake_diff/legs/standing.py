@@ -516,7 +516,7 @@ def _shift_to(
         q = inverse_kinematics(legs.model, q, targets, wish, lower, upper)
         off, soles = miss(legs.model, targets), soles.on_lowest(q)
         low = soles.points_in(q)
-        off = max(off, -float(np.min(low[:, 2])))
+        off = max(off, float(np.min(feet[:, 2]) - np.min(low[:, 2])))
         if off <= FEET_STAY:
             break
         feet = np.column_stack([low[:, :2], feet[:, 2]])

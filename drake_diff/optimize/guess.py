@@ -32,6 +32,7 @@ from drake_diff.optimize.program import Multipliers
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.transcription.collocation import Collocated
 
+NEWTON = 4  # steps towards the inputs that hold a state
 ROUNDED = 1e-6  # inputs below this fraction of the largest holding input count as zero
 NOISE = 1e-3  # noise on a stationary guess, as a fraction of the input limits, to break its symmetry
 WANDER = (1.0, 0.3)  # deviation of a random guess from the straight line, as a fraction of max(1, distance to the goal)
@@ -336,12 +337,15 @@ def _holding(problem: Problem, xs: Array) -> Array:
         return np.zeros((len(xs) - 1, problem.nu)) if model is None else model.neutral_input(xs[1:])
     bounds, still = problem.bounds, np.concatenate([problem.x0[: model.nq], np.zeros(model.nv)])
     none = np.clip(np.zeros(model.nu), bounds.u_lower, bounds.u_upper)
+    inputs, rounds = none, NEWTON if model.contract.contact.collision_pairs else 1
     try:
-        d = differentiate_step(model, still, none)
+        for _ in range(rounds):  # the force of a contact is not linear in the inputs
+            d = differentiate_step(model, still, inputs)
+            missing = d.B[model.nq :] @ inputs - d.x_next[model.nq :]
+            best = np.linalg.lstsq(d.B[model.nq :], missing, rcond=None)[0]
+            inputs = np.clip(best, bounds.u_lower, bounds.u_upper)
     except DrakeDiffError:
         return np.tile(none, (len(xs) - 1, 1))
-    by_u, missing = d.B[model.nq :], d.B[model.nq :] @ none - d.x_next[model.nq :]
-    inputs = np.clip(np.linalg.lstsq(by_u, missing, rcond=None)[0], bounds.u_lower, bounds.u_upper)
     held = np.where(np.abs(inputs) > ROUNDED * np.abs(inputs).max(), inputs, none)
     return np.where(model.inputs.commanded, model.neutral_input(xs[1:]), held)
 
