@@ -209,7 +209,7 @@ def _line(problem: Problem, method: str, seed: int) -> Guess:
     """Return a straight line to the goal or the reference, with the problem's inputs or inputs near zero."""
     xs, followed = _way(problem)
     us = np.array(problem.us)
-    if method != "collocation" and followed is None and (shift := on_feet(problem)) is not None:
+    if method != "collocation" and followed is None and (shift := on_feet(problem, fast=False)) is not None:
         return Guess(shift.xs, np.clip(shift.us, problem.bounds.u_lower, problem.bounds.u_upper))
     if method == "collocation" and followed is None and not us.any() and _keeps_shapes_clear(problem):
         xs, us = _from_rest_to_rest(problem)
@@ -350,8 +350,11 @@ def _holding(problem: Problem, xs: Array) -> Array:
     return np.where(model.inputs.commanded, model.neutral_input(xs[1:]), held)
 
 
-def on_feet(problem: Problem) -> Shift | None:
-    """Return a motion on fixed feet to the posture of least cost, for a robot at rest on its feet in x0, or None."""
+def on_feet(problem: Problem, *, fast: bool) -> Shift | None:
+    """Return a motion on fixed feet to the posture of least cost, for a robot at rest on its feet in x0, or None.
+
+    A slow motion is the better guess for a search, and a `fast` one often costs less.
+    """
     model = problem.model if isinstance(problem.system, Model) else None
     given = problem.initial_state_is_given and problem.optimizes_controls and not problem.us.any()
     if model is None or not (given and problem.has_cost and model.inputs.plain and _stands(model, problem.x0)):
@@ -376,7 +379,7 @@ def on_feet(problem: Problem) -> Shift | None:
             gradient = gradient + goal * np.nan_to_num(x - problem.goal)
             return moved.T @ gradient, moved.T @ (hessian[: model.nx] + np.diag(goal)) @ moved
 
-        shift = shift_of(legs, Rest(problem.x0, u), count, expand)
+        shift = shift_of(legs, Rest(problem.x0, u), count, expand, fast=fast)
     except DrakeDiffError:
         return None
     return None if isinstance(shift, Refusal) else shift
