@@ -49,9 +49,9 @@ AT_REST = 1e-7  # [rad/s or m/s] largest velocity after a step
 # weight, and contact relaxes in RELAXES steps. Drake's own dissipation would cut off a foot's force as it lifts off.
 SINK, RELAXES, DISSIPATION, NEAR_RIGID = 0.0625, 2.5, 0.5, 0.1  # DISSIPATION is in s/m
 FIRST_SINK = 1e-4  # [m] least initial depth, because a sole in the air has no derivative
-# A motion to a posture of least cost: shares of the way that are tried, the share of the steps that holds the end, the
-# least way [rad or m], and relative limits of a way that moves the feet and of a cost's curvature.
-SHARES, HELD, LEAST_WAY, FIXED, FLAT = (1.0, 0.5, 0.25), 0.1, 1e-4, 1e-6, 1e-6
+# A motion to a posture of least cost: shares of the way and fractions of the steps that are tried, the least way
+# [rad or m], and relative limits of a way that moves the feet and of a cost's curvature.
+SHARES, PARTS, LEAST_WAY, FIXED, FLAT = (1.0, 0.5, 0.25), (0.25, 0.5, 0.9), 1e-4, 1e-6, 1e-6
 # A motion from rest to rest.
 DURATIONS, HOLDING = (0.6, 1.0, 1.6), 0.3  # [s] of the motion, and of holding its end
 SIZES = ((1.0, 1.0), (1.0, 0.2), (0.5, 0.2), (0.25, 0.1), (0.12, 0.0))  # factors on a random shift of base and arms
@@ -456,12 +456,12 @@ def shift_to(legs: Legs, start: Rest, frames: Mapping[str, Array], joints: Mappi
 
 
 def shift_of(
-    legs: Legs, start: Rest, steps: int, expand: Callable[[Array], tuple[Array, Array]], least: float = LEAST_WAY
+    legs: Legs, start: Rest, steps: int, expand: Callable[[Array], tuple[Array, Array]], *, fast: bool
 ) -> Shift | Refusal:
     """Return a motion of a number of steps to the posture of least cost, or part of the way there, with fixed feet.
 
-    `expand` returns the gradient (nv,) and the Hessian (nv, nv) of the cost in a posture (nq,). There is no motion to a
-    posture nearer than `least` [rad or m].
+    `expand` returns the gradient (nv,) and the Hessian (nv, nv) of the cost in a posture (nq,). A `fast` motion takes
+    as few of the steps as the feet allow, and holds its end. Otherwise, it takes most of the steps.
     """
     model, q0 = legs.model, start.x[: legs.model.nq]
     unit, margin, q = _base_first(legs), _margin(legs, INSIDE / 2), q0
@@ -476,12 +476,15 @@ def shift_of(
         targets = legs.at(legs.points_in(q0), ON_GROUND, rolls=range(len(legs.owners)))
         wish = Wish(legs.moved(q, way), unit)
         q = inverse_kinematics(model, q, targets, wish, legs.lower + margin, legs.upper - margin)
-    way, holding = legs.apart(q, q0), math.ceil(HELD * steps)
-    if np.max(np.abs(way)) < least:
+    way, spans = (
+        legs.apart(q, q0),
+        [(moving := math.ceil(fraction * steps), steps - moving) for fraction in PARTS[0 if fast else -1 :]],
+    )
+    if np.max(np.abs(way)) < LEAST_WAY:
         return Refusal("the posture of least cost is the first one")
     why = Refusal("")
     for share in SHARES:
-        wish, spans = Wish(legs.moved(q0, share * way), unit), [(steps - holding, holding)]
+        wish = Wish(legs.moved(q0, share * way), unit)
         shift = _shift_to(legs, start, wish, legs.lower + margin, legs.upper - margin, spans=spans)
         if not isinstance(shift, Refusal):
             return shift
@@ -516,7 +519,7 @@ def _shift_to(
         q = inverse_kinematics(legs.model, q, targets, wish, lower, upper)
         off, soles = miss(legs.model, targets), soles.on_lowest(q)
         low = soles.points_in(q)
-        off = max(off, -float(np.min(low[:, 2])))
+        off = max(off, float(np.min(feet[:, 2]) - np.min(low[:, 2])))
         if off <= FEET_STAY:
             break
         feet = np.column_stack([low[:, :2], feet[:, 2]])

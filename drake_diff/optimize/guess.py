@@ -32,6 +32,7 @@ from drake_diff.optimize.program import Multipliers
 from drake_diff.optimize.solution import Solution
 from drake_diff.optimize.transcription.collocation import Collocated
 
+NEWTON = 4  # steps towards the inputs that hold a state
 ROUNDED = 1e-6  # inputs below this fraction of the largest holding input count as zero
 NOISE = 1e-3  # noise on a stationary guess, as a fraction of the input limits, to break its symmetry
 WANDER = (1.0, 0.3)  # deviation of a random guess from the straight line, as a fraction of max(1, distance to the goal)
@@ -208,7 +209,7 @@ def _line(problem: Problem, method: str, seed: int) -> Guess:
     """Return a straight line to the goal or the reference, with the problem's inputs or inputs near zero."""
     xs, followed = _way(problem)
     us = np.array(problem.us)
-    if method != "collocation" and followed is None and (shift := on_feet(problem)) is not None:
+    if method != "collocation" and followed is None and (shift := on_feet(problem, fast=False)) is not None:
         return Guess(shift.xs, np.clip(shift.us, problem.bounds.u_lower, problem.bounds.u_upper))
     if method == "collocation" and followed is None and not us.any() and _keeps_shapes_clear(problem):
         xs, us = _from_rest_to_rest(problem)
@@ -336,18 +337,24 @@ def _holding(problem: Problem, xs: Array) -> Array:
         return np.zeros((len(xs) - 1, problem.nu)) if model is None else model.neutral_input(xs[1:])
     bounds, still = problem.bounds, np.concatenate([problem.x0[: model.nq], np.zeros(model.nv)])
     none = np.clip(np.zeros(model.nu), bounds.u_lower, bounds.u_upper)
+    inputs, rounds = none, NEWTON if model.contract.contact.collision_pairs else 1
     try:
-        d = differentiate_step(model, still, none)
+        for _ in range(rounds):  # the force of a contact is not linear in the inputs
+            d = differentiate_step(model, still, inputs)
+            missing = d.B[model.nq :] @ inputs - d.x_next[model.nq :]
+            best = np.linalg.lstsq(d.B[model.nq :], missing, rcond=None)[0]
+            inputs = np.clip(best, bounds.u_lower, bounds.u_upper)
     except DrakeDiffError:
         return np.tile(none, (len(xs) - 1, 1))
-    by_u, missing = d.B[model.nq :], d.B[model.nq :] @ none - d.x_next[model.nq :]
-    inputs = np.clip(np.linalg.lstsq(by_u, missing, rcond=None)[0], bounds.u_lower, bounds.u_upper)
     held = np.where(np.abs(inputs) > ROUNDED * np.abs(inputs).max(), inputs, none)
     return np.where(model.inputs.commanded, model.neutral_input(xs[1:]), held)
 
 
-def on_feet(problem: Problem) -> Shift | None:
-    """Return a motion on fixed feet to the posture of least cost, for a robot at rest on its feet in x0, or None."""
+def on_feet(problem: Problem, *, fast: bool) -> Shift | None:
+    """Return a motion on fixed feet to the posture of least cost, for a robot at rest on its feet in x0, or None.
+
+    A slow motion is the better guess for a search, and a `fast` one often costs less.
+    """
     model = problem.model if isinstance(problem.system, Model) else None
     given = problem.initial_state_is_given and problem.optimizes_controls and not problem.us.any()
     if model is None or not (given and problem.has_cost and model.inputs.plain and _stands(model, problem.x0)):
@@ -372,7 +379,7 @@ def on_feet(problem: Problem) -> Shift | None:
             gradient = gradient + goal * np.nan_to_num(x - problem.goal)
             return moved.T @ gradient, moved.T @ (hessian[: model.nx] + np.diag(goal)) @ moved
 
-        shift = shift_of(legs, Rest(problem.x0, u), count, expand)
+        shift = shift_of(legs, Rest(problem.x0, u), count, expand, fast=fast)
     except DrakeDiffError:
         return None
     return None if isinstance(shift, Refusal) else shift

@@ -604,7 +604,7 @@ def _near_feet(problem: Problem, first: Attempt, given: Any, stalled: Solution) 
     The least cost is often at a jump: a robot that moves as fast as possible lifts its feet.
     """
     by_default = stalled.method == "ilqr" and given is None and stalled.status not in ENDED
-    shift = on_feet(problem) if by_default and np.all(np.isfinite(stalled.xs)) else None
+    shift = on_feet(problem, fast=True) if by_default and np.all(np.isfinite(stalled.xs)) else None
     if shift is None:
         return
     motion = replace(stalled, xs=shift.xs, us=shift.us, certificates=(), iterations=())
