@@ -7,7 +7,7 @@ time grows with the square of the motion's length. autograd needs only one forwa
 import inspect
 import sys
 from collections.abc import Callable, Sequence
-from functools import partial, update_wrapper
+from functools import update_wrapper
 from numbers import Real
 from pathlib import Path
 from typing import Any, NoReturn
@@ -92,99 +92,89 @@ def carrying(subject: str, function: Callable[..., Any], *arguments: Any) -> Any
         raise
     except Exception as error:
         if returns_jax(subject, function, *map(plain, arguments)):
-            return JaxFunction(function, compiled=False).chained(*arguments)
+            return chained_by_jax(function, *arguments)
         what = f"{named(subject, function)} lost its derivatives: {type(error).__name__}: {error!s:.200}"
         raise GradientError(f"{what}; write it with {ORDINARY}") from error
 
 
 def returns_jax(subject: str, function: Callable[..., Any], *arguments: Any) -> bool:
-    """Return whether a function of arrays of numbers is written in JAX; raise InputError if in single precision."""
+    """Return whether a function of arrays of numbers is written in JAX, or calls a user's function that is.
+
+    Raises InputError for a result in single precision.
+    """
     if "jax" not in sys.modules:
         return False
-    calls = JaxFunction.calls
+    before = UserFunction.calls_in_jax
     try:
         result = function(*arguments)
     except Exception:  # the caller reports the error of its own call
         return False
-    if not isinstance(result, sys.modules["jax"].Array):
-        return JaxFunction.calls > calls
-    if result.dtype != FLOAT:
-        expected = 'double precision: jax.config.update("jax_enable_x64", True)'
-        raise InputError(named(subject, function), got=f"a JAX array of {result.dtype}", expected=expected)
-    return True
+    for part in result if isinstance(result, (list, tuple)) else [result]:
+        if not _is_of_jax(part):
+            continue
+        if part.dtype.kind == "f" and part.dtype != FLOAT:
+            expected = 'double precision: jax.config.update("jax_enable_x64", True)'
+            raise InputError(named(subject, function), got=f"a JAX array of {part.dtype}", expected=expected)
+    return _is_of_jax(result) or UserFunction.calls_in_jax > before
 
 
-class JaxFunction:
-    """A function written in JAX, of numbers or AutoDiffXd. If it is compiled, JAX traces it once."""
+def _is_of_jax(result: Any) -> bool:
+    """Return whether a result is an array of JAX, or a list that contains one."""
+    if "jax" not in sys.modules:
+        return False
+    parts = result if isinstance(result, (list, tuple)) else [result]
+    return any(isinstance(part, sys.modules["jax"].Array) for part in parts)
 
-    calls = 0  # of all these functions for plain numbers, so that a function that calls one is recognized
 
-    def __init__(self, function: Callable[..., Any], compiled: bool):
-        jax: Any = sys.modules["jax"]
+def chained_by_jax(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Return the result of a function written in JAX with the derivatives that its arguments carry.
 
-        def evaluate(*arguments: Any) -> Any:  # a new function, as JAX keeps the compiled code of a known one
-            return function(*arguments)
+    It is not compiled, since compiled code would keep the globals and attributes that it read at first.
+    """
+    jax: Any = sys.modules["jax"]
 
-        def linearize(*arguments: Any) -> Any:
-            def twice(*arguments: Any) -> Any:
-                result = function(*arguments)
-                return result, result
+    def twice(*arguments: Any) -> Any:
+        result = jax.numpy.asarray(function(*arguments), dtype=float)
+        return result, result
 
-            return jax.jacrev(twice, argnums=tuple(range(len(arguments))), has_aux=True)(*arguments)
-
-        compiler = jax.jit if compiled else lambda function: function
-        self._evaluate, self._linearize = compiler(evaluate), compiler(linearize)
-
-    def evaluated(self, *arguments: Any) -> Any:
-        """Return the result for plain numbers."""
-        JaxFunction.calls += 1
-        result = np.asarray(self._evaluate(*arguments))
-        return result if result.ndim else result.item()
-
-    def chained(self, *arguments: Any) -> Any:
-        """Return the result with the derivatives that the arguments carry."""
-        jacobians, value = self._linearize(*map(plain, arguments))
-        shape, variables = value.shape, np.concatenate([np.ravel(argument) for argument in arguments])
-        columns = [np.asarray(j).reshape(value.size, -1) for j in jacobians]
-        rows = chain_rows(np.ravel(value), np.hstack(columns), variables + AutoDiffXd(0.0))
-        return rows.reshape(shape) if shape else rows[0]
+    each = tuple(range(len(arguments)))
+    jacobians, value = jax.jacrev(twice, argnums=each, has_aux=True)(*map(plain, arguments))
+    variables = np.concatenate([np.ravel(argument) for argument in arguments]) + AutoDiffXd(0.0)
+    columns = [np.asarray(j).reshape(value.size, -1) for j in jacobians]
+    rows = chain_rows(np.ravel(value), np.hstack(columns), variables)
+    return rows.reshape(value.shape) if value.ndim else rows[0]
 
 
 class UserFunction:
     """A user's function of arrays, called by `called` for plain numbers and by `carrying` for AutoDiffXd.
 
     Its first argument has `ndim` dimensions. Other arguments, such as symbols or batches, are passed on unchanged.
-    A function written in JAX is compiled once for these numbers and for its derivatives.
     """
+
+    calls_in_jax = 0  # calls for plain numbers with a result of JAX, by which functions of such functions are known
 
     def __init__(self, subject: str, function: Any, shape: Shape | None, ndim: int):
         update_wrapper(self, function, updated=())
         self.subject, self.function, self.shape, self.ndim = subject, function, shape, ndim
-        self._by_jax: JaxFunction | None = None
-        self._is_known = False
-
-    def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"_by_jax": None, "_is_known": False}
+        self._is_in_jax = False
 
     def __repr__(self) -> str:
         return repr(self.function)
 
     def __call__(self, *arguments: Any) -> Any:
         x = arguments[0]
-        if not (isinstance(x, np.ndarray) and x.ndim == self.ndim):
-            return self.function(*arguments)
-        carries = bool(x.size) and isinstance(x.flat[0], AutoDiffXd)
-        if not (carries or x.dtype == FLOAT):
-            return self.function(*arguments)
-        if not self._is_known:
-            self._is_known = True
-            if returns_jax(self.subject, self.function, *map(plain, arguments)):
-                self._by_jax = JaxFunction(self.function, compiled=True)
-        if carries:
-            run = partial(carrying, self.subject, self.function) if self._by_jax is None else self._by_jax.chained
-            return run(*arguments)
-        function = self.function if self._by_jax is None else self._by_jax.evaluated
-        return called(self.subject, function, *arguments, shape=self.shape)
+        if isinstance(x, np.ndarray) and x.ndim == self.ndim:
+            if x.dtype == FLOAT:
+                result = called(self.subject, self.function, *arguments, shape=self.shape)
+                if type(result) is not float and _is_of_jax(result):
+                    UserFunction.calls_in_jax += 1
+                    self._is_in_jax = True
+                return result
+            if x.size and isinstance(x.flat[0], AutoDiffXd):
+                if self._is_in_jax and returns_jax(self.subject, self.function, *map(plain, arguments)):
+                    return chained_by_jax(self.function, *arguments)
+                return carrying(self.subject, self.function, *arguments)
+        return self.function(*arguments)
 
 
 def user_function(subject: str, function: Any, shape: Shape | None = (), ndim: int = 1) -> Any:

@@ -1,7 +1,5 @@
 """Functions that a user writes in JAX give the plans and gradients of the same functions in NumPy."""
 
-import warnings
-
 import cloudpickle
 import numpy as np
 import pytest
@@ -11,7 +9,7 @@ from helpers.table import each_row
 import drake_diff as dd
 from drake_diff._base.autodiff import UserFunction
 from drake_diff._base.jax_rows import in_jax
-from drake_diff.exceptions import GradientError, GradientWarning, InputError
+from drake_diff.exceptions import GradientError, InputError
 from drake_diff.motion import ParametricPolicy
 
 jax = pytest.importorskip("jax", reason="pip install 'drake-diff[jax]'")
@@ -128,19 +126,89 @@ def test_a_function_that_jax_cannot_trace_is_called():
     assert in_jax("cost", lambda x, u: np.sum(x**2), 2, 1, np.ones((3, 3))) is None
 
 
-def test_a_slope_that_jax_does_not_see_is_reported():
-    """JAX has the slope 0 behind `stop_gradient`. A corner at one of the points is no reason for a warning."""
+def rows_of(cost, points):
+    user = UserFunction("running_cost", cost, (), 1)
+    return in_jax("running_cost", lambda x, rest: user(x, rest), 2, 1, points)
 
+
+POINTS = np.array([[1.0, 2.0, 3.0], [0.5, 0.1, 0.2], [3.0, 2.0, 1.0]])
+
+
+@each_row("hidden", [lambda x: x[0], lambda x: jnp.where(x[0] > 0.9, x[1], 0.0)], ids=["everywhere", "in a region"])
+def test_a_slope_that_jax_does_not_see_is_refused(hidden):
+    """JAX has the slope 0 behind `stop_gradient`."""
+    with pytest.raises(GradientError, match=r"running_cost: JAX gives value 0 the slope .* dd\.certify_function"):
+        rows_of(lambda x, u: jnp.sum(x**2) + 3 * jax.lax.stop_gradient(hidden(x)), POINTS)
+
+
+def test_a_slope_that_jax_does_not_see_beside_the_first_points_is_refused():
     def cost(x, u):
-        return jnp.sum(x**2) + 3 * jax.lax.stop_gradient(x[0])
+        return jnp.sum(x**2) + jax.lax.stop_gradient(jnp.where(x[0] > 5, x[0], 0.0))
 
-    user, points = UserFunction("running_cost", cost, (), 1), np.array([[1.0, 2.0, 3.0], [0.5, 0.1, 0.2], [3, 2, 1]])
-    with pytest.warns(GradientWarning, match="certify_function"):
-        in_jax("cost", lambda x, rest: user(x, rest), 2, 1, points)
-    corner = UserFunction("running_cost", lambda x, u: jnp.abs(x[0] - 1) + x[1] ** 3, (), 1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert in_jax("cost", lambda x, rest: corner(x, rest), 2, 1, points) is not None
+    rows = rows_of(cost, POINTS)
+    with pytest.raises(GradientError, match="certify_function"):
+        rows.jacobians(POINTS + 5.0)
+
+
+@each_row(
+    "cost",
+    [
+        lambda x, u: jnp.abs(x[0] - 1) + jnp.sum(jnp.abs(u - 3)),  # with corners at the first point
+        lambda x, u: jnp.sum((x - 7.0001e6) ** 2),
+        lambda x, u: 1e8 + jnp.sum(x**2),
+        lambda x, u: jnp.sum(jnp.tanh(x.astype(jnp.float32)).astype(jnp.float64)),
+        lambda x, u: jnp.sum(u) - jnp.sum(u) + 0.0 * x[0],
+    ],
+)
+@each_row("size", [1e-3, 1e6])
+def test_the_slopes_of_jax_are_accepted_at_corners_and_in_any_unit(cost, size):
+    assert rows_of(cost, POINTS * size) is not None
+
+
+@pytest.mark.solve
+@each_row("names", [None, ["k"], ["c", "k"]])
+def test_parameters_of_dynamics_have_their_own_values(names):
+    """The first derivative by the input is the parameter k."""
+
+    def rates(x, u, p):
+        return jnp.stack([x[1], u[0] * p[0] - p[1] * jnp.sin(x[1])])
+
+    system = dd.Dynamics(rates, nx=2, nu=1, parameters={"k": 2.0, "c": 0.1})
+    if names is not None:
+        system = system.with_parameters(names)
+    assert system.derivatives([0.3, 0.4], [0.5])[2][1, 0] == pytest.approx(2.0, rel=1e-12)
+    cost = dd.QuadraticCost(Q=np.eye(2), R=np.eye(1))
+    given = {} if names is None else {"parameters": names}
+    problem = dd.Problem(system, num_steps=10, horizon=1.0, x0=[1.0, 0.0], running_cost=cost, **given)
+    assert dd.solve(problem, restarts=0).cost == pytest.approx(plan_of_numpy(cost).cost, rel=1e-9)
+
+
+def plan_of_numpy(cost):
+    def rates(x, u, p):
+        return np.array([x[1], u[0] * p[0] - p[1] * np.sin(x[1])])
+
+    system = dd.Dynamics(rates, nx=2, nu=1, parameters={"k": 2.0, "c": 0.1})
+    return dd.solve(dd.Problem(system, num_steps=10, horizon=1.0, x0=[1.0, 0.0], running_cost=cost), restarts=0)
+
+
+def test_a_function_is_not_frozen_at_its_first_call():
+    target = np.array([0.5])
+    limit = dd.Constraint(lambda x: jnp.sum(x[:1]) - jnp.asarray(target)[0], lower=0.0)
+    assert float(limit.function(np.array([2.0, 0.0]))) == 1.5
+    target[0] = 1.9
+    assert float(limit.function(np.array([2.0, 0.0]))) == pytest.approx(0.1)
+
+
+def test_a_map_branches_on_its_step():
+    jump = dd.optimize.DiscreteMap(lambda x, u, k: jnp.stack([x[0] + (5.0 if k == 2 else 0.0) - u[0]]), nx=1, nu=1)
+    assert jump.values(np.array([[1.0, 0.5], [1.0, 0.5]]), np.array([1, 2])).ravel().tolist() == [0.5, 5.5]
+
+
+def test_a_list_with_numbers_of_jax_is_an_array():
+    system = dd.Dynamics(lambda x, u: [x[1], jnp.sin(x[0]) + u[0]], nx=2, nu=1)
+    _, A, B = system.derivatives([0.3, 0.4], [0.5])
+    np.testing.assert_allclose(A, [[0, 1], [np.cos(0.3), 0]], atol=1e-15)
+    np.testing.assert_allclose(B, [[0], [1]])
 
 
 def test_a_function_that_returns_no_numbers_is_refused_by_its_name():

@@ -267,7 +267,7 @@ class Dynamics:
         """Return the form for other parameters p, where `whole` computes all parameters of these dynamics from p."""
         f, nu = self.form.f, self.nu
         form = copy.copy(self.form)
-        form.takes_columns = False
+        form.takes_columns, form.compiled = False, None  # both are of the earlier arguments
         form.f = lambda x, z: f(x, np.concatenate([z[:nu], np.array(whole(z[nu:]))]))
         return form
 

@@ -100,7 +100,7 @@ class Problem(PicklesItsFields, ShowsItsRepr):
             `optimize.TrackingCost`, or a list of such costs, which are added; or, with `horizon`, a number [per s]:
             with 1.0 the cost is the time itself.
         final_cost: a function x -> scalar, or a QuadraticCost. This and any other function of a problem may be written
-            in JAX in double precision. JAX compiles it once, with the values of its globals at that time.
+            in JAX in double precision, and is compiled for each solve.
         x_goal: (nx,) final state, a hard equality, NaN for free entries. Or a mapping as for `x0`; the rest is free.
         goal_tolerance: allowed distance of the replay's final state from `x_goal`: a mapping from names as for `x0`, or
             (nx,), NaN where not given, in the states' units. The default is 1 % of the state's required change.

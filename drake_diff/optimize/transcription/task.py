@@ -202,11 +202,15 @@ def constraint_form(c: Constraint, nx: int, probe: Array) -> Pointwise:
     size = len(c.lower)
     return Pointwise(
         f"constraint {c.label}",
-        lambda x, u: np.asarray(function(x, u)).reshape(size, *x.shape[1:]),
+        lambda x, u: _as_array(function(x, u)).reshape(size, *x.shape[1:]),
         nx,
         (size,),
         probe,
     )
+
+
+def _as_array(result: Any) -> Any:
+    return result if hasattr(result, "reshape") else np.asarray(result)  # also an array of JAX
 
 
 def user_rate(problem: Problem, probe: Array) -> AtPlaces | None:
