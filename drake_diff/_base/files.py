@@ -18,7 +18,7 @@ import re
 import shutil
 import stat
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from hashlib import sha256
@@ -330,10 +330,10 @@ def _finite(text: str) -> float:
     return value
 
 
-def arrays_of(path: Path, most: int = MOST_ARRAYS) -> dict[str, Array]:
+def arrays_of(path: Path, most: int = MOST_ARRAYS, only: Collection[str] | None = None) -> dict[str, Array]:
     """Return the float64 arrays of an .npz file, read-only, by name; raise ArtifactError if it is invalid or too large.
 
-    The archive's index and every array's header are read first, and only the declared sizes are unpacked.
+    Headers are read first, and only the declared sizes are unpacked. Arrays not in `only` are not read.
     """
     data = read_plain(path, most)
     try:
@@ -346,7 +346,8 @@ def arrays_of(path: Path, most: int = MOST_ARRAYS) -> dict[str, Array]:
             whole = sum(member.file_size for member in members)
             if whole > most:
                 raise ValueError(f"expected at most {most} bytes after decompression, got {whole}")
-            return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
+            named = {m.filename.removesuffix(".npy"): m for m in members}
+            return {name: _array(archive, m) for name, m in named.items() if only is None or name in only}
     except ArtifactError:
         raise
     except Exception as error:  # zipfile and NumPy raise many errors for invalid files

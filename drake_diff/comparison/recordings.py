@@ -14,7 +14,7 @@ import json
 import math
 import re
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from itertools import chain, count, islice
@@ -32,11 +32,12 @@ from drake_diff.exceptions import ArtifactError, InputError, MissingDependencyEr
 from drake_diff.logs.mcap_file import has_channels, raw_messages, read_mcap
 from drake_diff.mechanics.coordinates import rotation
 from drake_diff.mechanics.description import Link, describe_tree, describe_whole
-from drake_diff.model.file_facts import Mjcf
+from drake_diff.model.file_facts import Mjcf, joints_below
+from drake_diff.model.mjcf_repairs import CtrlInput, inputs_of_ctrl
 from drake_diff.model.model import Model
 from drake_diff.model.plant import actuators, joints, labelled
 from drake_diff.model.tangent import tangent_space
-from drake_diff.model.xml_text import XmlText, first_number
+from drake_diff.model.xml_text import Element
 
 JOINTS, ODOMETRY = "sensor_msgs/msg/JointState", "nav_msgs/msg/Odometry"
 POSE, TWIST = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TwistStamped"
@@ -64,8 +65,10 @@ def read_ros2(path: Path, model: Model, gaps: bool = False) -> tuple[Motion, Map
         message = store.deserialize_cdr(data, kind)
         stamp = message.header.stamp
         source, time = (topic, _frame_of_body(kind, message)), stamp.sec * 1_000_000_000 + stamp.nanosec
-        time = logged if kind == COMMANDS and not time else time  # without a stamp, a trajectory begins at once
-        log.sources[kind].setdefault(source, {})[time] = message
+        if kind == COMMANDS:
+            log.commands.append((time or logged, message))  # without a stamp, a trajectory begins at once
+        else:
+            log.sources[kind].setdefault(source, {})[time] = message
     return log.motion(), facts
 
 
@@ -103,6 +106,7 @@ class _Found:
         self.path, self.model, self.gaps = path, model, gaps
         self.description = describe_tree(model) if np.any(model.inputs.commanded) else describe_whole(model)
         self.sources: dict[str, dict[Source, Stamped]] = {kind: {} for kind in USED}
+        self.commands: list[tuple[int, Any]] = []  # begin [ns] and trajectory
         followers = {follower.joint for follower in self.description.followers}
         moving = [link for link in self.description.moving if link.joint not in followers]
         self.singles = [x for x in moving if x.kind != "quaternion_floating"]
@@ -140,20 +144,26 @@ class _Found:
         return np.array([time - stamps[0] for time in stamps]) / 1e9, xs, us
 
     def _commands(self) -> dict[str, tuple[list[int], list[float]]]:
-        """Return times [ns] and commanded positions of each joint, linear in between."""
+        """Return times [ns] and commanded positions of each commanded joint, linear in between."""
         commands: dict[str, tuple[list[int], list[float]]] = {}
-        messages = [pair for source in self.sources[COMMANDS].values() for pair in source.items()]
-        for begin, message in sorted(messages, key=lambda pair: pair[0]):
-            for i, joint in enumerate(message.joint_names):
+        commanded = {self.description.actuated[i] for i in np.flatnonzero(self.model.inputs.commanded)}
+        for begin, message in sorted(self.commands, key=lambda pair: pair[0]):
+            for i, joint in ((i, joint) for i, joint in enumerate(message.joint_names) if joint in commanded):
                 times, values = commands.setdefault(joint, ([], []))
-                if times:  # the command until now ends just before this one begins
-                    until = float(np.interp(begin - 1, times, values))
-                    before = sum(time < begin - 1 for time in times)
-                    times[before:], values[before:] = [begin - 1], [until]
+                before = sum(time < begin - 1 for time in times)
+                # The command until now ends just before this one begins; before its first point, none is known.
+                until = [float(np.interp(begin - 1, times, values))] if times and times[0] < begin else []
+                times[before:], values[before:] = [begin - 1] * len(until), until
                 for point in message.points:
-                    wait = point.time_from_start
-                    times.append(begin + wait.sec * 1_000_000_000 + wait.nanosec)
-                    values.append(float(point.positions[i]))
+                    wait, positions = point.time_from_start, np.asarray(point.positions)
+                    time = begin + wait.sec * 1_000_000_000 + wait.nanosec
+                    subject = f"{self.path}: JointTrajectory at {begin} ns, point at {time} ns"
+                    if len(positions) != len(message.joint_names) or not np.all(np.isfinite(positions)):
+                        raise InputError(subject, got=f"positions {positions}", expected="a finite one for each joint")
+                    if time < max([begin, *times[-1:]]):
+                        raise InputError(subject, got="an earlier point before it", expected="times that increase")
+                    times.append(time)
+                    values.append(float(positions[i]))
         return {joint: pair for joint, pair in commands.items() if pair[0]}
 
     def _common(self, parts: Mapping[str, Mapping[int, Any]]) -> list[int]:
@@ -249,6 +259,8 @@ POSITION, VELOCITY = ("position", "pos", "q"), ("velocity", "vel", "v", "dq", "q
 COMMAND = ("q_desired", "q_des", "desired_position", "position_command", "command", "target")
 EFFORT = ("effort", "torque", "tau")
 UNUSED = " effort of "  # of a joint with a servo: no model reads it; with a space, as no name in a file begins with one
+KINDS = ("an effort", "a commanded position")  # of inputs
+OF_MUJOCO = ("time", "t", "qpos", "qvel", "ctrl")  # arrays
 NUMBERED = ("{}{}", "{}_{}", "{}[{}]")  # a quantity and the number of a joint
 CLOCK_TOLERANCE = 1e-3  # relative to a time step: allows printed times and nanoseconds
 
@@ -361,8 +373,11 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None, g
     are constant until the next sample and may be empty in the last row. With `gaps`, columns of sensors are allowed,
     with names as in `Recording`. An MCAP file has the channels /state and /input as written by this package, or ROS 2
     messages (JointState, JointTrajectory, Odometry, PoseStamped and TwistStamped). An .npz file has MuJoCo's arrays
-    time (n,), qpos, and with `gaps` perhaps no qvel, and ctrl (n or n - 1, nu); a CSV file may have such columns, as
-    qpos_0. Their order is that of the model's MJCF file, or that of the model.
+    time (n,), qpos, qvel and ctrl (n or n - 1, ...), and a CSV file may have their columns, as qpos_0; only with `gaps`
+    may qvel be missing. For a model from an MJCF file, they are in MuJoCo's order of that file, and each ctrl is
+    converted to the model's input: an effort, or a servo's commanded position. For other models, the order is that of
+    the model, and ctrl are its inputs. A free joint's position is first in qpos, and its angular velocity last in qvel
+    and in the body's frame, as MuJoCo has them.
 
     Facts of the engine are in a JSON object in NAME.contract.json in the folder of the recording NAME, or in the
     metadata record "contract" of the MCAP file: any of the facts of `Recording`, and "engine" and "version".
@@ -402,7 +417,7 @@ def read_recording(path: str | Path, model: Model, *, name: str | None = None, g
         elif path.is_dir() or (path.suffix == ".mcap" and has_channels(read_plain(path, links=True), ROS2)):
             motion, facts = read_ros2(path, model, gaps)
         elif path.suffix == ".npz":
-            motion = _of_mujoco(str(path), arrays_of(path), model, gaps)
+            motion = _of_mujoco(str(path), arrays_of(path, only=OF_MUJOCO), model, gaps)
         elif path.suffix == ".mcap":
             motion, facts = _read_mcap(path, model)
         else:
@@ -466,7 +481,9 @@ def _read_csv(path: Path, model: Model, gaps: bool) -> tuple[Motion, dict[str, A
         raise InputError(str(path), got="an empty file", expected="a header row and samples")
     texts = [text.strip() for text in header]
     if any(form.format("qpos", 0) in texts for form in NUMBERED):
-        return _of_mujoco(str(path), _arrays_in(path, rows, texts), model, gaps), {}
+        arrays = _arrays_in(path, rows, texts, gaps)
+        sensors = {name: frozen(values) for name, values in arrays.items() if name not in OF_MUJOCO}
+        return _of_mujoco(str(path), arrays, model, gaps), sensors
     outputs = tuple(text.strip() for text in header if gaps and is_output(text.strip()))
     wanted = ("time", *model.state_names, *model.input_names, *outputs)
     places = np.array(_columns(path, model, header, wanted, model.state_names if gaps else ()))
@@ -486,52 +503,80 @@ def _read_csv(path: Path, model: Model, gaps: bool) -> tuple[Motion, dict[str, A
     return motion, {name: frozen(table[:, last + i]) for i, name in enumerate(outputs)}
 
 
-def _arrays_in(path: Path, rows: Iterator[tuple[int, list[str]]], header: list[str]) -> dict[str, Array]:
-    """Return the arrays of numbered columns, as qpos_0 and qpos_1, by name."""
-    _, cells = _numbers_of(path, rows, [(name, i) for i, name in enumerate(header)], len(header))
-    arrays = {}
-    for name in ("qpos", "qvel", "ctrl"):
-        columns = [f for form in NUMBERED for k in range(len(header)) if (f := form.format(name, k)) in header]
-        arrays[name] = cells[:, [header.index(column) for column in columns]]
-    arrays |= {name: cells[:, header.index(name)] for name in ("time", "t") if name in header}
-    return {name: values for name, values in arrays.items() if values.shape[-1]}
+def _arrays_in(path: Path, rows: Iterator[tuple[int, list[str]]], header: list[str], gaps: bool) -> dict[str, Array]:
+    """Return the arrays of numbered columns, as qpos_0 and qpos_1, by name, the time, and with `gaps` the sensors."""
+    columns = {text: [i] for i, text in enumerate(header) if text in ("time", "t") or (gaps and is_output(text))}
+    for name in OF_MUJOCO[2:]:
+        numbered = {form.format(name, k): k for form in NUMBERED for k in range(len(header))}
+        here = sorted((numbered[text], i) for i, text in enumerate(header) if text in numbered)
+        if [k for k, _ in here] != list(range(len(here))):
+            got = ", ".join(header[i] for _, i in here)
+            raise InputError(f"{path} line 1, columns of {name}", got=got, expected=f"{name}_0 and so on, each once")
+        columns |= {name: [i for _, i in here]} if here else {}
+    for i in sorted(set(range(len(header))) - {i for places in columns.values() for i in places})[:1]:
+        expected = "time, qpos_0, qvel_0, ctrl_0 and so on, each once, and with gaps=True sensors"
+        raise InputError(f"{path} line 1, column", got=header[i][:80], expected=expected)
+    _, cells = _numbers_of(path, rows, [(text, i) for i, text in enumerate(header)], len(header))
+    return {name: cells[:, places if name in OF_MUJOCO[2:] else places[0]] for name, places in columns.items()}
 
 
 def _of_mujoco(subject: str, arrays: Mapping[str, Array], model: Model, gaps: bool) -> Motion:
     """Return the motion with MuJoCo's qpos, qvel and ctrl in the order of the model's MJCF file, or of the model."""
-    times, qpos = arrays.get("time", arrays.get("t", np.zeros(0))), arrays.get("qpos", np.zeros(0))
-    n = len(times)
-    qvel, ctrl = arrays.get("qvel", np.full((n, model.nv), np.nan)), arrays.get("ctrl", np.zeros((n, model.nu)))
-    if "qvel" not in arrays and not gaps:
-        raise InputError(subject, got=f"arrays {', '.join(arrays)}", expected="arrays time, qpos, qvel and ctrl")
-    for name, values, width in (("qpos", qpos, model.nq), ("qvel", qvel, model.nv), ("ctrl", ctrl, model.nu)):
-        if values.shape[1:] != (width,) or len(values) not in (n, n - (name == "ctrl")):
-            raise InputError(f"{subject}: {name}", got=values.shape, expected=f"({n}, {width}), as time and model have")
-    labels, i, j = labelled(joints(model.plant)), 0, 0
-    places = {label: ends for label, joint in labels.items() if (ends := model.places(joint))[0]}
-    order, us = sorted(places, key=lambda label: places[label][0].start), np.array(ctrl[: n - 1])
-    if model.source is not None and model.source.suffix == ".xml":
-        mjcf = Mjcf(XmlText(model.source.read_bytes()))
-        elements = mjcf.root.of_world("joint", "freejoint")
-        free = [e.tag == "freejoint" or mjcf.attributes(e).get("type") == "free" for e in elements]
-        order = [str((e.parent if f and e.parent else e).get("name")) for e, f in zip(elements, free, strict=True)]
-        for k, element in enumerate(mjcf.root.findall("actuator", "*")):
-            says = mjcf.attributes(element)
-            gear = first_number(says, "gear", 1.0)
-            factor = 1 / gear if element.tag == "position" else gear * first_number(says, "gainprm", 1.0)
-            us[:, model.input_names.index(says.get("name", ""))] = factor * ctrl[: n - 1, k]
-    xs = np.full((n, model.nx), np.nan)
-    for label in order:
-        if label not in places:
-            raise UnknownNameError(f"{subject}: joint of the model's file", got=label, known=places)
-        q, v = places[label]
+    arrays = {"time": arrays["t"], **arrays} if "t" in arrays else arrays
+    wanted = ("time", "qpos", *([] if gaps else ["qvel"]), *(["ctrl"] if model.nu else []))
+    if not arrays.keys() >= set(wanted):
+        raise InputError(subject, got=f"arrays {', '.join(arrays)}", expected=f"arrays {', '.join(wanted)}")
+    times, qpos = arrays["time"], arrays["qpos"]
+    places = {name: ends for name, j in labelled(joints(model.plant)).items() if (ends := model.places(j))[0]}
+    order, inputs = sorted(places, key=lambda name: places[name][0].start), [(i, 1.0, 0.0) for i in range(model.nu)]
+    if model.source is not None and model.source.suffix in (".xml", ".mjcf"):
+        mjcf, rows = inputs_of_ctrl(model.source)
+        order = [_joint_of(model, mjcf, element, places) for element in joints_below(mjcf.root)]
+        inputs = [_input_of(model, row) for row in rows]
+    missing = [name for name in places if name not in order]
+    missing += [name for k, name in enumerate(model.input_names) if k not in [index for index, _, _ in inputs]]
+    if missing:
+        raise InputError(f"{model.source}", got=f"none for {missing[0]}", expected="joints and actuators of the model")
+    n, nv, nu = times.size, model.nv, len(inputs)
+    qvel, ctrl = arrays.get("qvel", np.full((n, nv), np.nan)), arrays.get("ctrl", np.zeros((n, nu)))
+    widths = {"time": (), "qpos": (model.nq,), "qvel": (nv,), "ctrl": (nu,)}
+    for (name, width), values in zip(widths.items(), (times, qpos, qvel, ctrl), strict=True):
+        if values.shape[1:] != width or values.shape[:1] not in ((n,), (n - (name == "ctrl"),)):
+            raise InputError(f"{subject}: {name}", got=values.shape, expected=f"{(n, *width)}, as time and model have")
+    us, xs, i, j = np.zeros((max(n - 1, 0), model.nu)), np.full((n, model.nx), np.nan), 0, 0
+    for k, (index, scale, offset) in enumerate(inputs):
+        us[:, index] = scale * ctrl[: n - 1, k] + offset
+    for name in order:
+        q, v = places[name]
         there, speed = qpos[:, i : i + len(q)], qvel[:, j : j + len(v)]
         if len(q) == 7:  # MuJoCo has the position first, and the angular velocity in the body's frame
             spin = np.array([rotation(turn) @ w for turn, w in zip(there[:, 3:], speed[:, 3:], strict=True)])
-            there, speed = np.roll(there, 4, axis=1), np.hstack([spin, speed[:, :3]])
+            there, speed = np.roll(there, 4, axis=1), np.hstack([spin.reshape(n, 3), speed[:, :3]])
         xs[:, q], xs[:, [model.nq + k for k in v]] = there, speed
         i, j = i + len(q), j + len(v)
     return times, xs, us
+
+
+def _joint_of(model: Model, mjcf: Mjcf, element: Element, names: Container[str]) -> str:
+    """Return the name of a joint of the file, or of the free body, after checking that it is in the model's state."""
+    is_free = element.tag == "freejoint" or mjcf.attributes(element).get("type") == "free"
+    name = (element.parent if is_free and element.parent else element).get("name")
+    if name not in names:
+        got = f"{name or 'one without a name'} (line {element.line}), not in the model's state"
+        raise InputError(f"{model.source}: joints", got=got, expected="named joints, none fixed, welded or reduced")
+    return name
+
+
+def _input_of(model: Model, row: CtrlInput) -> tuple[int, float, float]:
+    """Return the index of the input that an actuator of the model's file is, and scale and offset of its ctrl."""
+    actuator, key, scale, offset = row
+    motors, subject = actuators(model.plant), f"{model.source}: {actuator.kind} {actuator.name} (line {actuator.line})"
+    is_motor = isinstance(key, int) and key < len(motors) and motors[key].joint().name() == actuator.joint
+    here = [i for i in range(model.nu) if (model.inputs.actuator[i] if is_motor else model.input_names[i]) == key]
+    given = [KINDS[int(model.inputs.commanded[i])] for i in here]
+    if given != [wanted := KINDS[actuator.kind == "position"]]:
+        raise InputError(subject, got="".join(given) or "none", expected=f"{wanted} as its input of the model")
+    return here[0], scale, offset
 
 
 def _rows_of_csv(path: Path) -> Iterator[tuple[int, list[str]]]:

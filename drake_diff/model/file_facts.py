@@ -286,8 +286,13 @@ class Mjcf:
             control = middle - half, middle + half
         return (min(e / gear for e in control), max(e / gear for e in control)) if control and gear else None
 
-    def thrusters(self) -> Iterator[tuple[Element, dict[str, Any]]]:
-        """Yield motors of sites with a force along a line, and possibly a moment about it, as fields of a BodyForce."""
+    @cached_property
+    def in_drakes_order(self) -> list[FileActuator]:
+        """The actuators that Drake reads, in Drake's order."""
+        return [actuator for kind in KINDS for actuator in self.actuators if actuator.read and actuator.kind == kind]
+
+    def thrusters(self) -> Iterator[tuple[Element, dict[str, Any], float]]:
+        """Yield motors of sites with a force on a line, and a moment about it: BodyForce's fields, and force / ctrl."""
         for element in self.root.findall("actuator", "*"):
             says = self.attributes(element)
             site, bias = self.sites.get(says.get("site", "")), says.get("biastype", "none")
@@ -310,7 +315,7 @@ class Mjcf:
                 "direction": (self._turn(pose) @ force / size).tolist(),
                 "moment_ratio": float(force @ moment) / size**2,
             }
-            yield element, fields | {"lower": lower, "upper": upper}
+            yield element, fields | {"lower": lower, "upper": upper}, size * gain
 
     def loops(self, instance: str) -> Iterator[tuple[Element, HeldBodies | None]]:
         """Yield each <connect> and <weld> with the bodies that it connects, or None if it is not active."""
@@ -414,6 +419,19 @@ class Mjcf:
         return tuple(name for name in FLAGS if any(flag.get(name) == "disable" for flag in flags))
 
 
+def children_of(body: Element, *tags: str) -> Iterator[Element]:
+    """Yield the children of a body with these tags, including those in its frames."""
+    for child in body.children:
+        yield from children_of(child, *tags) if child.tag == "frame" else [child][: child.tag in tags]
+
+
+def joints_below(body: Element) -> Iterator[Element]:
+    """Yield the joints of a body, or of the root, in the order of MuJoCo's qpos: before those of the bodies in it."""
+    yield from children_of(body, "joint", "freejoint")
+    for inner in children_of(body, "body", "worldbody"):
+        yield from joints_below(inner)
+
+
 def _within(ranges: Iterable[tuple[Range | None, float]]) -> Range:
     """Return the range within all given ranges times their factors; it is infinite without a range."""
     scaled = [sorted(factor * end for end in ends) for ends, factor in ranges if ends]
@@ -506,7 +524,7 @@ def _read_mjcf(mjcf: Mjcf, name: str, facts: FileFacts) -> None:
     facts.followers.update({(name, mimic.follower): mimic for mimic in mjcf.mimics(name)})
     facts.disabled.update(mjcf.disabled)
     facts.touching[name] = mjcf.touching
-    for element, thruster in list(mjcf.thrusters()):
+    for element, thruster, _ in list(mjcf.thrusters()):
         facts.thrusters.append(thruster)
         mjcf.xml.remove(element)
     for element, loop in list(mjcf.loops(name)):

@@ -17,7 +17,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains
 
 from drake_diff.exceptions import ModelError
-from drake_diff.model.file_facts import FRAME, KINDS, MAIN, PLACE, SHARED, Mjcf
+from drake_diff.model.file_facts import FRAME, MAIN, PLACE, SHARED, Attributes, FileActuator, Mjcf, children_of
 from drake_diff.model.plant import actuators, note
 from drake_diff.model.xml_text import Element, XmlText, first_number, numbers_in
 
@@ -25,6 +25,8 @@ POSES = ("pos", "quat", "axisangle", "euler", "xyaxes", "zaxis")
 GAINS = {"general": ("gainprm", "biasprm"), "position": ("kp", "kv"), "velocity": ("kv",)}
 OF_MASSES = ("boundmass", "boundinertia", "settotalmass")  # attributes of the compiler
 MOST_INCLUDES = 100
+# An actuator, its number in Drake (or a BodyForce's name, or None), scale, offset: the input is scale ctrl + offset.
+CtrlInput = tuple[FileActuator, int | str | None, float, float]
 UNSEEN = 2**30  # a mask that matches no other; Drake makes no collision shape of a geom with both masks 0
 
 
@@ -93,24 +95,17 @@ def _without_mass(xml: XmlText) -> tuple[str, ...]:
     by_shapes = Mjcf(xml).by_shapes
     for body in xml.root.of_world("body"):
         inertial = body.find("inertial")
-        if inertial is not None and by_shapes and any(_geoms_of(body)):
+        if inertial is not None and by_shapes and any(children_of(body, "geom")):
             xml.remove(inertial)
         elif inertial is not None and numbers_in(inertial.get("mass")) == [0.0]:
             turns = any(numbers_in(inertial.get("diaginertia") or inertial.get("fullinertia")))
             xml.remove(inertial)
-            for geom in _geoms_of(body):
+            for geom in children_of(body, "geom"):
                 xml.set(geom, "mass", "0")
             massless.append(body.get("name", "?") + " (its inertia without mass is ignored)" * turns)
     for compiler in xml.root.findall("compiler") if by_shapes else ():
         xml.drop(compiler, "inertiafromgeom")
     return note("Bodies without mass, as in their <inertial>", massless)
-
-
-def _geoms_of(body: Element) -> Iterator[Element]:
-    """Yield the geoms of a body, including those in its frames."""
-    yield from body.findall("geom")
-    for frame in body.findall("frame"):
-        yield from _geoms_of(frame)
 
 
 def _poses_of_several_joints(xml: XmlText) -> tuple[str, ...]:
@@ -200,8 +195,7 @@ def _motors_and_servos(xml: XmlText) -> tuple[str, ...]:
     mjcf, written = Mjcf(xml), list[str]()
     for element in xml.root.findall("actuator", "general"):
         says = mjcf.attributes(element)
-        gear, gain = first_number(says, "gear", 1.0), first_number(says, "gainprm", 1.0)
-        bias = [*numbers_in(says.get("biasprm", "0")), 0.0, 0.0, 0.0][:3] if says.get("biastype") == "affine" else [0.0]
+        gear, (gain, bias, (scale, offset)) = first_number(says, "gear", 1.0), _gain_and_bias(says)
         fixed = says.get("dyntype", "none") == "none" and says.get("gaintype", "fixed") == "fixed" and gain > 0
         if not (says.get("joint") and fixed and says.get("biastype", "none") in ("none", "affine")):
             continue
@@ -211,8 +205,8 @@ def _motors_and_servos(xml: XmlText) -> tuple[str, ...]:
             kind, more = "motor", {"gear": repr(gear * gain)} | ({"forcerange": force} if force else {})
         elif bias[1] < 0 and (bias[2] <= 0 or gain == -bias[1]):
             kind, more = "position", {"kp": repr(-bias[1]), "kv" if bias[2] <= 0 else "dampratio": repr(abs(bias[2]))}
-            if (gain, 0.0) != (-bias[1], bias[0]) and (ends := numbers_in(says.get("ctrlrange", ""))):
-                more["ctrlrange"] = " ".join(repr((gain * end + bias[0]) / -bias[1]) for end in ends)
+            if (scale, offset) != (1.0, 0.0) and (ends := numbers_in(says.get("ctrlrange", ""))):
+                more["ctrlrange"] = " ".join(repr(scale * end + offset) for end in ends)
         else:
             continue
         for name, value in (shared | more).items():
@@ -223,6 +217,28 @@ def _motors_and_servos(xml: XmlText) -> tuple[str, ...]:
         written.append(f"{says.get('name', '?')} ({kind})")
     what = "<general> actuators became motors and servos; the input of a servo is (gain ctrl + bias) / (kp gear)"
     return note(what, written)
+
+
+def _gain_and_bias(says: Attributes) -> tuple[float, list[float], tuple[float, float]]:
+    """Return gain g and bias (b, -k, -d) of a <general>, and scale g / k and offset b / k of its commanded position."""
+    words = says.get("biasprm", "") if says.get("biastype") == "affine" else ""
+    gain, bias = first_number(says, "gainprm", 1.0), [*numbers_in(words), 0.0, 0.0, 0.0][:3]
+    return gain, bias, (gain / -bias[1], bias[0] / -bias[1]) if bias[1] else (gain, 0.0)
+
+
+def inputs_of_ctrl(path: Path) -> tuple[Mjcf, list[CtrlInput]]:
+    """Return the MJCF file at `path` as Drake reads it, and the input of each of its actuators, in the file's order."""
+    given = Mjcf(with_includes(XmlText(path.read_bytes()), path))
+    mjcf, rows = Mjcf(as_mujoco_means(XmlText(path.read_bytes()), path, []).read_again()), list[CtrlInput]()
+    numbers = {id(actuator): i for i, actuator in enumerate(mjcf.in_drakes_order)}
+    forces = {id(element): (fields["name"], scale, 0.0) for element, fields, scale in mjcf.thrusters()}
+    olds, news = (x.root.findall("actuator", "*") for x in (given, mjcf))
+    for old, new, actuator in zip(olds, news, mjcf.actuators, strict=True):
+        gear = first_number(mjcf.attributes(new), "gear", 1.0)
+        scale, offset = _gain_and_bias(given.attributes(old))[2] if old.tag != new.tag == "position" else (1.0, 0.0)
+        scale, offset = (scale / gear, offset / gear) if new.tag == "position" else (gear, 0.0)
+        rows.append((actuator, *forces.get(id(new), (numbers.get(id(actuator)), scale, offset))))
+    return mjcf, rows
 
 
 def _unread(mjcf: "Mjcf", path: Path) -> Iterator[str]:
@@ -264,8 +280,8 @@ def _included(element: Element, path: Path) -> Path | None:
 def correct(plant: MultibodyPlant, instance: ModelInstanceIndex, mjcf: Mjcf) -> tuple[str, ...]:
     """Give the actuators of an unfinalized plant the limits and gains of the file; return notes on the changes."""
     motors = [actuator for actuator in actuators(plant) if actuator.model_instance() == instance]
-    says = [actuator for kind in KINDS for actuator in mjcf.actuators if actuator.read and actuator.kind == kind]
-    if [a.joint().name() for a in motors] != [a.joint for a in says]:  # in Drake's order
+    says = mjcf.in_drakes_order
+    if [a.joint().name() for a in motors] != [a.joint for a in says]:
         raise ModelError(
             f"expected the {len(says)} motors and position actuators of the file, Drake read {len(motors)}"
         )

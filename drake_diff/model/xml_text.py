@@ -203,7 +203,7 @@ class XmlText:
     def __str__(self) -> str:
         """Return the text with all changes; an outer change overrides the changes inside it."""
         parts, end_of_last = [], 0
-        for start, end, new in sorted(self._changes, key=lambda change: (change[0], -change[1])):
+        for start, end, new in sorted(self._changes, key=lambda c: (c[0], c[1] > c[0], -c[1])):  # insertions first
             if start >= end_of_last:
                 parts += [self.data[end_of_last:start], new]
                 end_of_last = end

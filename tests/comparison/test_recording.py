@@ -634,39 +634,257 @@ def test_a_log_of_mujoco_is_the_motion_of_drake(tmp_path):
     again = read_recording(tmp_path / "log.csv", model)
     np.testing.assert_array_equal(again.xs, recording.xs)
     np.testing.assert_array_equal(again.us, recording.us)
-    np.savez(tmp_path / "short.npz", time=rows["time"], qpos=np.array(rows["qpos"])[:, 1:], qvel=rows["qvel"])
+    np.savez(tmp_path / "short.npz", **(rows | {"qpos": np.array(rows["qpos"])[:, 1:]}))
     with pytest.raises(InputError, match=r"qpos: expected \(100, 9\)"):
         read_recording(tmp_path / "short.npz", model)
 
 
-def test_a_bag_has_commanded_positions_in_its_trajectories(load, tmp_path):
-    """A trajectory holds until the next one begins, and is linear between its points."""
+@pytest.fixture
+def commanded(load, tmp_path):
+    """Return a function that reads a bag of 8 samples of a pendulum, 0.1 s apart from 0.1 s on, with trajectories.
+
+    A trajectory is (stamp [ms], points (wait [ms], positions), joints).
+    """
     model = load("pendulum.urdf", inputs="position", gains=(40.0, 3.0))
+    ms, none = 10**6, np.zeros(0)
 
-    def states(types, k):
-        return {"name": ["hinge"], "position": np.array([0.1 * k]), "velocity": np.zeros(0), "effort": np.zeros(0)}
-
-    def trajectory(types, points):
+    def trajectory(types, points, names):
         point, duration = types["trajectory_msgs/msg/JointTrajectoryPoint"], types["builtin_interfaces/msg/Duration"]
-        none = np.zeros(0)
-        return {
-            "joint_names": ["hinge"],
-            "points": [point(np.array([q]), none, none, none, duration(*divmod(wait, 10**9))) for wait, q in points],
-        }
+        waits = [duration(*divmod(wait * ms, 10**9)) for wait, _ in points]
+        positions = [np.array(q, dtype=float) for _, q in points]
+        made = [point(q, none, none, none, wait) for q, wait in zip(positions, waits, strict=True)]
+        return {"joint_names": names, "points": made}
 
-    second, kind = 10**9, "trajectory_msgs/msg/JointTrajectory"
-    messages = [
-        ("/joint_states", "sensor_msgs/msg/JointState", "", (k + 1) * second // 10, lambda t, k=k: states(t, k))
-        for k in range(8)
-    ]
-    plans = {
-        second // 5: [(0, 0.5)],
-        second * 4 // 10: [(0, 0.5), (second // 5, 0.7), (second, 9.0)],
-        65 * second // 100: [(0, 0.2)],
-    }
-    messages += [("/arm/command", kind, "", at, lambda t, p=points: trajectory(t, p)) for at, points in plans.items()]
-    recording = read_recording(bag_of(tmp_path / "bag", messages), model, gaps=True)
+    def read(*trajectories):
+        messages = [
+            (
+                "/joint_states",
+                "sensor_msgs/msg/JointState",
+                "",
+                100 * k * ms,
+                joints(["hinge"], [0.1 * k - 0.1], [], []),
+            )
+            for k in range(1, 9)
+        ]
+        kind = "trajectory_msgs/msg/JointTrajectory"
+        for begin, points, *names in trajectories:
+            fields = lambda types, points=points, names=names: trajectory(types, points, names or ["hinge"])  # noqa: E731
+            messages.append(("/arm/command", kind, "", begin * ms, fields))
+        path = tmp_path / f"bag_{len(list(tmp_path.iterdir()))}"
+        return read_recording(bag_of(path, messages), model, gaps=True)
+
+    return read
+
+
+def test_a_bag_has_commanded_positions_in_its_trajectories(commanded):
+    """A trajectory holds until the next one begins, and is linear between its points."""
+    plans = (200, [(0, [0.5])]), (400, [(0, [0.5]), (200, [0.7]), (1000, [9.0])]), (650, [(0, [0.2])])
+    recording = commanded(*plans)
     np.testing.assert_allclose(recording.times, 0.1 * np.arange(7), atol=1e-12)  # from the first command on
     np.testing.assert_allclose(recording.xs[:, 0], 0.1 * np.arange(1, 8))
     assert np.isnan(recording.xs[:, 1]).all()
     np.testing.assert_allclose(recording.us[:, 0], [0.5, 0.5, 0.5, 0.6, 0.7, 0.2], atol=1e-6)
+
+
+def test_no_command_is_known_before_the_first_point_that_was_reached(commanded):
+    """The first trajectory is replaced before its only point, and the second reaches its point at 0.7 s."""
+    recording = commanded((100, [(1000, [1.0])]), (200, [(500, [0.0])]))
+    np.testing.assert_allclose(recording.xs[:, 0], [0.6, 0.7], atol=1e-12)
+    np.testing.assert_array_equal(recording.us, [[0.0]])
+
+
+def test_commands_of_other_joints_change_nothing(commanded):
+    """They have the same stamp in the same topic, a later begin than the samples, or no positions."""
+    others = (100, [(0, [0.7])], "other"), (700, [(0, [0.7])], "gripper"), (300, [(0, [])], "wheel")
+    recording = commanded((100, [(0, [0.5])]), *others)
+    np.testing.assert_array_equal(recording.us, np.full((7, 1), 0.5))
+
+
+@each_row(
+    "points, names, match",
+    [
+        ([(500, [0.5]), (0, [0.0])], ["hinge"], r"point at 100000000 ns: expected times that increase"),
+        ([(0, [])], ["hinge"], r"at 100000000 ns.* expected a finite one for each joint, got positions \[\]"),
+        ([(0, [0.5])], ["other", "hinge"], r"expected a finite one for each joint, got positions \[0\.5\]"),
+        ([(0, [np.nan])], ["hinge"], r"expected a finite one for each joint, got positions \[nan\]"),
+    ],
+)
+def test_a_wrong_trajectory_is_named(commanded, points, names, match):
+    with pytest.raises(InputError, match=match):
+        commanded((100, points, *names))
+
+
+# ---- logs of MuJoCo ----------------------------------------------------------------------------------------------
+
+INERTIAL = '<inertial pos="0 0 -.2" mass="1" diaginertia=".02 .02 .01"/>'
+COUNT = 5
+QPOS, QVEL = np.tile([0.1, 0.2], (COUNT, 1)), np.tile([1.0, 2.0], (COUNT, 1))
+LOG = {"time": H * np.arange(COUNT), "qpos": QPOS, "qvel": QVEL, "ctrl": np.tile([0.3, 0.4], (COUNT, 1))}
+MOTORS = '<motor name="x" joint="a"/><motor name="y" joint="b"/>'
+JOINT_A, JOINT_B = (f'<joint name="{name}" axis="0 1 0"/>' for name in "ab")
+NESTED = f'<body name="A">{JOINT_A}{INERTIAL}<body name="B" pos="0 0 -.4">{JOINT_B}{INERTIAL}</body></body>'
+
+
+def logged(tmp_path, bodies=NESTED, actuators=MOTORS, log=LOG, gaps=False, **options):
+    """Return the recording of an .npz log of joints a and b, with the model of these bodies and actuators."""
+    path = tmp_path / "two.xml"
+    world = f'<compiler angle="radian"/><worldbody>{bodies}</worldbody><actuator>{actuators}</actuator>'
+    path.write_text(f"<mujoco>{world}</mujoco>")
+    np.savez(tmp_path / "log.npz", **log)
+    return read_recording(tmp_path / "log.npz", dd.load_model(path, time_step=H, **options), gaps=gaps)
+
+
+SERVO = '<general name="{}" joint="{}" gainprm="{}" biastype="affine" biasprm="{} -100 -5" gear="{}"/>'
+
+
+@each_row(
+    "actuators, u",
+    [
+        (SERVO.format("x", "a", 100, 0, 1) + SERVO.format("y", "b", 100, 0, 2), [0.3, 0.2]),
+        (SERVO.format("x", "a", 50, 3, 1) + '<motor name="y" joint="b"/>', [0.4, (50 * 0.3 + 3) / 100]),  # motors first
+        ('<velocity name="x" joint="a" kv="10" gear="2"/><motor name="y" joint="b" gear="3"/>', [6.0, 1.2]),
+        ('<general name="x" joint="a" gainprm="5" gear="2"/><motor name="y" joint="b"/>', [3.0, 0.4]),
+        ('<motor joint="b" gear="7"/><motor joint="a"/>', [2.1, 0.4]),  # without names
+        ('<position name="x" joint="a" kp="9" kv="1" gear="2"/><motor joint="b"/>', [0.4, 0.15]),
+    ],
+)
+def test_ctrl_is_converted_to_the_inputs_of_the_rewritten_actuators(tmp_path, actuators, u):
+    np.testing.assert_allclose(logged(tmp_path, actuators=actuators).us, np.tile(u, (COUNT - 1, 1)), atol=1e-15)
+
+
+@pytest.mark.parametrize("kind", ['general gainprm="50" biastype="affine" biasprm="3 -100 -5"', 'velocity kv="10"'])
+def test_drake_follows_mujoco_with_the_converted_ctrl(tmp_path, kind):
+    mujoco = pytest.importorskip("mujoco", reason="no mujoco")
+    path, h = tmp_path / "servo.xml", 0.0005
+    body = f'<body name="A">{JOINT_A}{INERTIAL}</body>'
+    path.write_text(
+        f'<mujoco><option timestep="{h}" integrator="implicitfast"/><worldbody>{body}</worldbody>'
+        f'<actuator><{kind} name="x" joint="a"/></actuator></mujoco>'
+    )
+    m = mujoco.MjModel.from_xml_path(str(path))
+    d, rows = mujoco.MjData(m), {"time": [], "qpos": [], "qvel": [], "ctrl": []}
+    for k in range(400):
+        d.ctrl[:] = 0.3 * np.sin(0.02 * k)
+        for name, values in rows.items():
+            values.append(np.copy(getattr(d, name)))
+        mujoco.mj_step(m, d)
+    np.savez(tmp_path / "log.npz", **rows)
+    model = dd.load_model(path, time_step=h)
+    recording = read_recording(tmp_path / "log.npz", model)
+    xs = dd.rollout(model, recording.xs[0], recording.us).xs
+    np.testing.assert_allclose(xs[:, 0], recording.xs[:, 0], atol=2e-3)  # the servos' laws differ by one step; q is 0.1
+
+
+def test_the_ctrl_of_motors_at_sites_is_a_force_on_a_body(tmp_path):
+    site = '<site name="s" pos="0 0 0.1"/></body>'
+    actuators = '<motor name="up" site="s" gear="0 0 2 0 0 0.1"/><motor name="y" joint="b"/>'
+    recording = logged(tmp_path, NESTED.removesuffix("</body>") + site, actuators)
+    np.testing.assert_allclose(recording.us[0], [0.4, 0.6], atol=1e-15)  # y, up
+
+
+@each_row(
+    "actuators, options, match",
+    [
+        (f'{MOTORS}<damper name="z" joint="a" kv="1" ctrlrange="0 1"/>', {}, r"damper z .*as its input of the model"),
+        ('<motor name="x" joint="a"/>', {"body_forces": [dd.model.BodyForce("jet", "A")]}, "got none for jet"),
+        (MOTORS, {"inputs": "position", "gains": (9.0, 1.0)}, r"motor x .* an effort .*got a commanded position"),
+        (
+            '<position name="x" joint="a" kp="9" kv="1"/><motor name="y" joint="b"/>',
+            {"inputs": "effort"},
+            r"position x .* a commanded position .*got an effort",
+        ),
+        (MOTORS, {"fix_joints": ["a"]}, r"none fixed, welded or reduced, got a \(line 1\), not in the model"),
+    ],
+)
+def test_an_actuator_or_joint_of_the_file_that_the_model_has_not_is_named(tmp_path, actuators, options, match):
+    with pytest.raises(InputError, match=match):
+        logged(tmp_path, actuators=actuators, **options)
+
+
+def test_a_joint_without_a_name_is_refused(tmp_path):
+    with pytest.raises(InputError, match="got one without a name"):
+        logged(tmp_path, NESTED.replace('name="b" ', ""), '<motor name="x" joint="a"/>')
+
+
+@each_row(
+    "bodies",
+    [
+        f'<body name="A">{INERTIAL}<body name="B" pos="0 0 -.4">{JOINT_B}{INERTIAL}</body>{JOINT_A}</body>',
+        f'<body name="A">{INERTIAL}<frame><body name="B">{JOINT_B}{INERTIAL}</body></frame>{JOINT_A}</body>',
+        f'<include file="a.xml"/><body name="B">{JOINT_B}{INERTIAL}</body>',
+    ],
+)
+def test_joints_are_in_mujoco_s_order(tmp_path, bodies):
+    """A body's joints come before those of the bodies in it, and an included body is at its place."""
+    (tmp_path / "a.xml").write_text(f'<mujoco><body name="A">{JOINT_A}{INERTIAL}</body></mujoco>')
+    recording = logged(tmp_path, bodies)
+    model = dd.load_model(tmp_path / "two.xml", time_step=H)
+    by_name = dict(zip(model.state_names, recording.xs[0], strict=True))
+    assert by_name == {"a_q": 0.1, "b_q": 0.2, "a_w": 1.0, "b_w": 2.0}
+    mujoco = pytest.importorskip("mujoco", reason="no mujoco")
+    m = mujoco.MjModel.from_xml_path(str(tmp_path / "two.xml"))
+    assert [m.joint(i).name for i in range(m.njnt)] == ["a", "b"]
+
+
+def test_included_actuators_have_their_gear(tmp_path):
+    (tmp_path / "x.xml").write_text('<mujoco><motor name="x" joint="a" gear="3"/></mujoco>')
+    recording = logged(tmp_path, actuators='<include file="x.xml"/><motor name="y" joint="b"/>')
+    np.testing.assert_allclose(recording.us[0], [0.9, 0.4], atol=1e-15)
+
+
+@each_row(
+    "changes, match",
+    [
+        ({"ctrl": None}, r"expected arrays time, qpos, qvel, ctrl, got arrays time, qpos, qvel$"),
+        ({"qvel": None}, r"expected arrays time, qpos, qvel, ctrl"),
+        ({"time": None}, r"expected arrays time"),
+        ({"time": np.array(1.0)}, r"time: expected \(1,\), .*got \(\)"),
+        ({"time": LOG["time"][:, None]}, r"time: expected \(5,\), .*got \(5, 1\)"),
+        ({"ctrl": LOG["ctrl"][:, :1]}, r"ctrl: expected \(5, 2\)"),
+    ],
+)
+def test_arrays_that_a_log_lacks_are_named(tmp_path, changes, match):
+    log = {name: values for name, values in (LOG | changes).items() if values is not None}
+    with pytest.raises(InputError, match=match):
+        logged(tmp_path, log=log)
+
+
+def test_other_arrays_of_a_log_are_not_read(tmp_path):
+    names, objects = np.array(["a"]), np.array(["a", None], dtype=object)
+    recording = logged(tmp_path, log=LOG | {"seed": np.array(3), "names": names, "notes": objects})
+    np.testing.assert_array_equal(recording.xs[:, :2], QPOS)
+    with pytest.raises(ArtifactError, match="object"):
+        logged(tmp_path, log=LOG | {"ctrl": np.full((COUNT, 2), None, dtype=object)})
+
+
+def one_joint(tmp_path):
+    path, body = tmp_path / "one.xml", f'<body name="A">{JOINT_A}{INERTIAL}</body>'
+    motor = '<actuator><motor name="m" joint="a" gear="3"/></actuator>'
+    path.write_text(f"<mujoco><worldbody>{body}</worldbody>{motor}</mujoco>")
+    return dd.load_model(path, time_step=H)
+
+
+@each_row(
+    "header, match",
+    [
+        ("time,qpos_0,qvel_0", "expected arrays time, qpos, qvel, ctrl"),
+        ("time,qpos_0,qvel_0,ctrl_1", r"columns of ctrl: expected ctrl_0 and so on, each once, got ctrl_1"),
+        ("time,qpos_0,qpos0,qvel_0,ctrl_0", r"columns of qpos: .* got qpos_0, qpos0"),
+        ("time,time,qpos_0,qvel_0,ctrl_0", r"column: expected time.*each once.* got time"),
+        ("time,qpos_0,qvel_0,m", r"column: expected time, qpos_0.* got m"),
+        ("time,qpos_0,qvel_0,ctrl_0,phase", r"column: expected .* got phase"),
+        ("time,qpos_0,qvel_0,ctrl_0,A.gyro_x", r"with gaps=True sensors, got A\.gyro_x"),
+    ],
+)
+def test_columns_of_a_log_are_numbered_from_0_and_no_others_are_dropped(tmp_path, header, match):
+    rows = [[k * H] * len(header.split(",")) for k in range(2)]
+    with pytest.raises(InputError, match=match):
+        read_recording(write_csv(tmp_path / "log.csv", header.split(","), rows), one_joint(tmp_path))
+
+
+def test_sensors_in_a_log_are_read(tmp_path):
+    path = write_csv(tmp_path / "log.csv", ["time", "qpos_0", "ctrl_0", "A.gyro_x"], [[0, 1, 2, 3], [H, 4, 5, 6]])
+    recording = read_recording(path, one_joint(tmp_path), gaps=True)
+    np.testing.assert_array_equal(recording.outputs["A.gyro_x"], [3, 6])
+    np.testing.assert_array_equal(recording.us, [[6]])
+    np.testing.assert_array_equal(recording.xs, [[1, np.nan], [4, np.nan]])
