@@ -418,10 +418,8 @@ class Problem:
             judged = [(m.piece.ys, m.xs) for m in predicted.motions if m.piece.held_out or not held_out]
             late = self.watch.is_late
             falls = {} if late else lacks(fit, solved, predicted.fit if held_out else None, predicted.solved)
-            remains = (
-                *where_left(self.model, judged, self.first_noise),
-                *([structure_line(falls, held_out)] if falls else ()),
-            )
+            where = where_left(self.model, judged, self.first_noise)
+            remains = (*where, *([structure_line(falls, held_out)] if falls else ()))
         return identification(
             unknowns,
             unknowns.values(z),

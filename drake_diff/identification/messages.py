@@ -25,10 +25,7 @@ def in_usual_units(before: float, after: float, unit: str) -> Sizes:
 
 
 def where_left(model: Model, motions: Sequence[tuple[Array, Array]], noise: Array) -> tuple[str, ...]:
-    """Return where the largest error of a joint is, in units of the noise (2 nv,) of measured states.
-
-    `motions` are measured and predicted states (n, nx) each.
-    """
+    """Return where a joint's error is largest in units of its noise, from measured and predicted states (n, nx)."""
     ys, xs = (np.concatenate(states) for states in zip(*motions, strict=True))
     most, worst = 0.0, None
     for i, j in coordinates_of(model).single:

@@ -276,9 +276,8 @@ def unsupported(model: Model, pieces: Sequence[Excerpt]) -> tuple[str, ...]:
     """Return the names of `unseen_heights` with nothing below the body at the first sample of a piece."""
     names = []
     for piece in pieces:
-        if unseen := unseen_heights(model, piece):
-            x = guess_states(model, piece, np.zeros(1, dtype=int))[0]
-            names += [model.position_names[i] for i, j in unseen if _resting(model, x, i, j) is None]
+        unseen, x = unseen_heights(model, piece), guess_states(model, piece, np.zeros(1, dtype=int))[0]
+        names += [model.position_names[i] for i, j in unseen if _resting(model, x, i, j) is None]
     return tuple(dict.fromkeys(names))
 
 
@@ -299,11 +298,10 @@ def _resting(model: Model, x: Array, i: int, j: int) -> float | None:
     is_in, rises = touches(0.0), [0.0]
     while touches(rises[-1]) == is_in:
         near = [] if is_in else [(pair.distance, up * pair.gradient[i]) for pair in separations(model.double)]
-        # It passes by a wall, whose rate is 0. The rate of bodies that begin to touch may be NaN.
+        # It passes by a wall, whose rate is 0; at a first touch, a rate may be NaN. Distances have errors of 1e-6 m.
         ways = [float(np.nan_to_num(distance / rate)) for distance, rate in near if not rate < 1e-3]
         if len(rises) > 100 or rises[-1] > 8.0 or not (is_in or ways):
             return None
-        # Drake's distances have errors of 1e-6 m, so that each step is longer.
         rises.append(max(2 * rises[-1], 1e-3) if is_in else rises[-1] - max(min(ways), 1e-4))
     touching, free = sorted(rises[-2:])
     while abs(free - touching) > NEARLY:

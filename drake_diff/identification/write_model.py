@@ -201,11 +201,8 @@ class _Corrected:
         for label, values in by_label.items():
             others = [((*FRICTION, *SPRING), self._write_dynamics), (ROTOR, self._write_rotor)]
             if self.kind == ".xml":
-                others = [
-                    (tuple(IN_MJCF), self._write_joint),
-                    (ROTOR, self._write_armature),
-                    (GAINS, self._write_servo),
-                ]
+                others = [(tuple(IN_MJCF), self._write_joint), (ROTOR, self._write_armature)]
+                others.append((GAINS, self._write_servo))
             for quantities, write in ((BODY, self._write_body), *others, (("offset",), self._write_offset)):
                 some = {q: v for q, v in values.items() if q in quantities}
                 if some:
@@ -300,15 +297,13 @@ class _Corrected:
         """Set both gains of a servo, as a damping ratio depends on kp; MuJoCo's servo acts through the gear."""
         servo = self._element(label, *ACTUATORS)
         if servo.tag != "position":
-            got = f"a <{servo.tag}> actuator in the file"
-            raise InputError(f"{label}.{next(iter(values))}", got=got, expected="a <position> actuator")
+            raise InputError(f"{label}.{next(iter(values))}", got=f"a <{servo.tag}>", expected="a <position> actuator")
         gear = first_number(Mjcf(self.xml).attributes(servo), "gear", 1.0)
-        own = {p.name: float(p.value[0]) for p in list_parameters(self.model) if p.name.startswith(f"{label}.k")}
+        gains = {p.name.removeprefix(f"{label}."): p.value[0] for p in list_parameters(self.model)} | values
         self.xml.before(servo, comment)
         self.xml.drop(servo, "dampratio")  # MuJoCo refuses it beside kv, which overrides that of a default class
         for quantity, attribute in zip(GAINS, ("kp", "kv"), strict=True):
-            value = values.get(quantity, own[f"{label}.{quantity}"])
-            self.xml.set(servo, attribute, _number(float(value) / gear**2))
+            self.xml.set(servo, attribute, _number(float(gains[quantity]) / gear**2))
 
     def _set_children(self, element: Element, tags: dict[str, str]) -> None:
         """Set the texts of an SDF element's children, or the values of a URDF element's; append missing children."""

@@ -220,7 +220,7 @@ def test_the_gains_of_a_general_actuator_are_refused(tmp_path):
     general = '<general name="p" joint="j" gainprm="40" biastype="affine" biasprm="0 -40 -3"'
     (tmp_path / "arm.xml").write_text(SERVOS.replace('<position name="p" joint="j" kp="30" kv="1"', general))
     model = dd.load_model(tmp_path / "arm.xml", inputs="position", time_step=0.01)
-    with pytest.raises(InputError, match=r"p\.kp: expected a <position> actuator, got a <general> actuator"):
+    with pytest.raises(InputError, match=r"p\.kp: expected a <position> actuator, got a <general>"):
         write_model(saying(model, {"p.kp": 50.0}), tmp_path / "b.xml")
 
 
