@@ -49,6 +49,7 @@ from drake_diff.identification.recordings import (
     noise_by_differences,
     read_given,
     read_pieces,
+    unsupported,
 )
 from drake_diff.identification.results import Followed, Identification, Request, identification
 from drake_diff.identification.sensors import Sensors, choose_sensors
@@ -87,7 +88,8 @@ def identify(
         model: The model; its own values are the initial guess.
         recordings: One or more of `dd.Recording`, or files for `comparison.read_recording`. States that were not
             measured are NaN, or columns that are missing in a file; positions alone are enough. Inputs are constant
-            from each sample to the next. The sample times need not be equidistant.
+            from each sample to the next. The sample times need not be equidistant. A body whose height is not recorded
+            is assumed at rest on what is below it at the start.
         parameters: Names as in `dd.list_parameters`, and also JOINT.coulomb_friction, INPUT.strength, STATE.bias,
             BODY.point_mass [kg], added at the centre of mass with the inertia about it unchanged, and
             model.input_delay [s], by which inputs act later than they are recorded. Or "all": masses, centres of mass,
@@ -186,6 +188,9 @@ def identify(
         dict(bounds or {}),
         dict(sensors or {}),
     )
+    for name in unsupported(model, pieces):
+        why = f"{name}, not recorded, begins at the model's default, as it is found to rest on nothing"
+        result = replace(result, reason=f"{result.reason}; {why}")
     return replace(result, asked=asked)
 
 
@@ -413,7 +418,8 @@ class Problem:
             judged = [(m.piece.ys, m.xs) for m in predicted.motions if m.piece.held_out or not held_out]
             late = self.watch.is_late
             falls = {} if late else lacks(fit, solved, predicted.fit if held_out else None, predicted.solved)
-            remains = (*where_left(self.model, judged), *([structure_line(falls, held_out)] if falls else ()))
+            where = where_left(self.model, judged, self.first_noise)
+            remains = (*where, *([structure_line(falls, held_out)] if falls else ()))
         return identification(
             unknowns,
             unknowns.values(z),

@@ -24,19 +24,21 @@ def in_usual_units(before: float, after: float, unit: str) -> Sizes:
     return factor * before, factor * after, DEGREES.get(unit, unit)
 
 
-def where_left(model: Model, motions: Sequence[tuple[Array, Array]]) -> tuple[str, ...]:
-    """Return where the largest error of a joint is, for motions of measured and predicted states (n, nx) each."""
+def where_left(model: Model, motions: Sequence[tuple[Array, Array]], noise: Array) -> tuple[str, ...]:
+    """Return where a joint's error is largest in units of its noise, from measured and predicted states (n, nx)."""
     ys, xs = (np.concatenate(states) for states in zip(*motions, strict=True))
-    rms, worst = 0.0, None
+    most, worst = 0.0, None
     for i, j in coordinates_of(model).single:
         seen = np.isfinite(ys[:, i])
-        error = (ys[seen, i] - xs[seen, i]) * in_usual_units(1.0, 1.0, model.contract.positions[i].unit)[0]
-        if len(error) and np.sqrt(np.mean(error**2)) > rms:
-            rms, worst = float(np.sqrt(np.mean(error**2))), (i, model.nq + j, seen, error)
+        error = ys[seen, i] - xs[seen, i]
+        if len(error) and np.sqrt(np.mean(error**2)) > most * noise[j]:
+            most, worst = float(np.sqrt(np.mean(error**2)) / noise[j]), (i, model.nq + j, seen, error)
     if worst is None:
         return ()
     i, j, seen, error = worst
     unit, rate = model.contract.positions[i].unit, model.contract.velocities[j - model.nq].unit
+    error = error * in_usual_units(1.0, 1.0, unit)[0]
+    rms = float(np.sqrt(np.mean(error**2)))
     places = [_worst_third(error, np.abs(xs[seen, j]), "speeds", rate)]
     places.append(_worst_third(error, xs[seen, i], "positions", unit))
     for sign, word in ((1, "positive"), (-1, "negative")):
@@ -44,7 +46,7 @@ def where_left(model: Model, motions: Sequence[tuple[Array, Array]]) -> tuple[st
         if len(some) and np.mean(some**2) > rms**2:
             places.append(f"{np.sqrt(np.mean(some**2)):.3g} at {word} velocities, {np.mean(some):+.3g} in the mean")
     text = f"{rms:.3g} {in_usual_units(1.0, 1.0, unit)[2]} rms, measured minus model {np.mean(error):+.3g} in the mean"
-    return (f"the largest error is in {model.state_names[i]}: {text}; {'; '.join(places)}",)
+    return (f"the largest error, relative to the noise, is in {model.state_names[i]}: {text}; {'; '.join(places)}",)
 
 
 def _worst_third(error: Array, values: Array, name: str, unit: str) -> str:

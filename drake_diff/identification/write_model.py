@@ -17,12 +17,12 @@ from drake_diff._base.files import write_whole
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, UnknownNameError
 from drake_diff.identification.results import Identification, Request
 from drake_diff.identification.unknowns import BIAS, CENTER, COULOMB, DELAY, GAINS, INERTIA, MASS, POINT_MASS, STRENGTH
-from drake_diff.model.file_facts import Mjcf
+from drake_diff.model.file_facts import ACTUATORS, Mjcf
 from drake_diff.model.load_file import add_packages
 from drake_diff.model.model import Model, load_model
 from drake_diff.model.parameters import applied, list_parameters, select
 from drake_diff.model.plant import labelled, rotors
-from drake_diff.model.xml_text import Element, XmlText, first_number
+from drake_diff.model.xml_text import Element, XmlText, first_number, numbers_in
 
 BODY = (MASS, CENTER, INERTIA, POINT_MASS)
 SPRING = {
@@ -32,11 +32,11 @@ SPRING = {
 }
 ROTOR = ("rotor_inertia", "gear_ratio")
 FRICTION = {"damping": "damping", COULOMB: "friction"}  # Drake ignores friction
-IN_MJCF = {"damping": "damping", COULOMB: "frictionloss", "spring_stiffness": "stiffness", "kp": "kp", "kd": "kv"}
+IN_MJCF = {"damping": "damping", COULOMB: "frictionloss", "spring_stiffness": "stiffness"}
 IN_FILES = {  # by the ending of a file
     ".urdf": (*BODY, *FRICTION, "offset", *ROTOR),
     ".sdf": (*BODY, *FRICTION, *SPRING, *ROTOR),
-    ".xml": (*BODY, *IN_MJCF, "rotor_inertia"),
+    ".xml": (*BODY, *IN_MJCF, "rotor_inertia", *GAINS),
 }
 IN_COMMENTS = (DELAY, *GAINS)  # quantities of commands, which `load_model` has if the file has no place for them
 SAME = 1e-9  # relative to a parameter's largest entry: rounding by printing and by shifting an inertia
@@ -104,6 +104,7 @@ def write_model(identification: Identification, path: str | Path) -> Path:
         for target, text in texts.items():
             write_whole(target, text.encode())
         _check(identification, asked.model, path)
+        _check_friction(_changed(identification), [target for target in texts if target.suffix in IN_FILES])
     except DrakeDiffError as error:
         for target in texts:
             target.unlink(missing_ok=True)
@@ -126,7 +127,9 @@ def _overlay(e: Identification, asked: Request, source: Path, path: Path) -> dic
             files[str(directive.add_model.file)] = Path(packages.ResolveUrl(directive.add_model.file))
     has = {uri: _names_in(file) for uri, file in files.items() if file.suffix in (".urdf", ".sdf")}
     by_file: dict[str, dict[str, Any]] = {}
-    for name, value in _changed(e).items():
+    changed = _changed(e)
+    delays = {name: changed.pop(name) for name in tuple(changed) if name.endswith(f".{DELAY}")}
+    for name, value in changed.items():
         label = name.rsplit(".", 1)[0]
         places = [uri for uri, names in has.items() if label in names]
         if len(places) != 1:
@@ -142,8 +145,7 @@ def _overlay(e: Identification, asked: Request, source: Path, path: Path) -> dic
             )
         texts[beside] = _Corrected(e, asked, files[uri], values).text()
         text = _pointed(text, uri, f"file://{beside}", source)
-    data = " ".join(_data(asked).split())
-    comment = "".join(c if c.isprintable() else " " for c in f"{e.sentence} By drake_diff from {data}; {e.motion}.")
+    comment = "".join(c if c.isprintable() else " " for c in " ".join(_summary(e, asked, delays).split()))
     return {**texts, path: f"# {comment}\n{text}"}
 
 
@@ -168,6 +170,12 @@ def _data(asked: Request) -> str:
     )
 
 
+def _summary(e: Identification, asked: Request, beside: Mapping[str, Any]) -> str:
+    """Return the words at the top of a file, with the values that it has no place for."""
+    values = "".join(f" {name} is {value:.6g} {e.units[name]}." for name, value in beside.items())
+    return f"{e.sentence}{values} By drake_diff from {_data(asked)}; {e.motion}."
+
+
 class _Corrected:
     """The text of a model file, and the changes to it."""
 
@@ -176,7 +184,8 @@ class _Corrected:
         self.is_sdf, room = source.suffix == ".sdf", IN_FILES[source.suffix]
         self.xml = XmlText(source.read_bytes())
         self.beside = {n: v for n, v in changed.items() if n.rsplit(".", 1)[1] in set(IN_COMMENTS).difference(room)}
-        self.data, self.changed = _data(asked), {n: v for n, v in changed.items() if n not in self.beside}
+        self.data, self.top = _data(asked), _summary(e, asked, self.beside)
+        self.changed = {n: v for n, v in changed.items() if n not in self.beside}
         for name in self.changed:
             quantity = name.rsplit(".", 1)[1]
             if quantity not in room:
@@ -191,14 +200,14 @@ class _Corrected:
             by_label.setdefault(label, {})[quantity] = value
         for label, values in by_label.items():
             others = [((*FRICTION, *SPRING), self._write_dynamics), (ROTOR, self._write_rotor)]
-            others = [((*IN_MJCF, *ROTOR), self._write_mjcf)] if self.kind == ".xml" else others
+            if self.kind == ".xml":
+                others = [(tuple(IN_MJCF), self._write_joint), (ROTOR, self._write_armature)]
+                others.append((GAINS, self._write_servo))
             for quantities, write in ((BODY, self._write_body), *others, (("offset",), self._write_offset)):
                 some = {q: v for q, v in values.items() if q in quantities}
                 if some:
                     write(label, some, self._comment_on(label, some))
-        beside = "".join(f" {name} is {value:.6g} {self.e.units[name]}." for name, value in self.beside.items())
-        top = _comment(f"{self.e.sentence}{beside} By drake_diff from {self.data}; {self.e.motion}.")
-        self.xml.before(self.xml.root, top + "\n")
+        self.xml.before(self.xml.root, _comment(self.top) + "\n")
         return str(self.xml)
 
     def _element(self, label: str, *tags: str) -> Element:
@@ -267,23 +276,34 @@ class _Corrected:
         self.xml.before(dynamics, comment)
         if self.is_sdf:
             self._set_children(dynamics, tags)
-        for tag, value in {} if self.is_sdf else tags.items():
-            self.xml.set(dynamics, tag, value)
+        else:
+            for tag, value in tags.items():
+                self.xml.set(dynamics, tag, value)
 
-    def _write_mjcf(self, label: str, values: dict[str, Any], comment: str) -> None:
-        """Set attributes of an actuator or a joint of an MJCF file; an armature is that of the rotor's joint."""
-        motor = labelled(rotors(self.model.plant)).get(label)
+    def _write_joint(self, label: str, values: dict[str, Any], comment: str) -> None:
+        joint = self._element(label, "joint")
+        self.xml.before(joint, comment)
         for quantity, value in values.items():
-            of_joint = quantity not in GAINS
-            name = motor.joint().name() if motor is not None and quantity == "rotor_inertia" else label
-            element = self._element(name, *(("joint",) if of_joint else ("position",)))
-            factor = motor.default_gear_ratio() ** 2 if motor is not None and of_joint else 1.0
-            if not of_joint:
-                factor = first_number(Mjcf(self.xml).attributes(element), "gear", 1.0) ** -2
-                self.xml.drop(element, "dampratio")
-            self.xml.before(element, comment)
-            comment = ""
-            self.xml.set(element, IN_MJCF.get(quantity, "armature"), _number(factor * float(value)))
+            self.xml.set(joint, IN_MJCF[quantity], _number(float(value)))
+
+    def _write_armature(self, label: str, values: dict[str, Any], comment: str) -> None:
+        """Set the armature of the joint that a motor moves, which is gear^2 times the inertia of its rotor."""
+        motor = labelled(rotors(self.model.plant))[label]
+        joint = self._element(motor.joint().name(), "joint")
+        self.xml.before(joint, comment)
+        self.xml.set(joint, "armature", _number(motor.default_gear_ratio() ** 2 * float(values["rotor_inertia"])))
+
+    def _write_servo(self, label: str, values: dict[str, Any], comment: str) -> None:
+        """Set both gains of a servo, as a damping ratio depends on kp; MuJoCo's servo acts through the gear."""
+        servo = self._element(label, *ACTUATORS)
+        if servo.tag != "position":
+            raise InputError(f"{label}.{next(iter(values))}", got=f"a <{servo.tag}>", expected="a <position> actuator")
+        gear = first_number(Mjcf(self.xml).attributes(servo), "gear", 1.0)
+        gains = {p.name.removeprefix(f"{label}."): p.value[0] for p in list_parameters(self.model)} | values
+        self.xml.before(servo, comment)
+        self.xml.drop(servo, "dampratio")  # MuJoCo refuses it beside kv, which overrides that of a default class
+        for quantity, attribute in zip(GAINS, ("kp", "kv"), strict=True):
+            self.xml.set(servo, attribute, _number(float(gains[quantity]) / gear**2))
 
     def _set_children(self, element: Element, tags: dict[str, str]) -> None:
         """Set the texts of an SDF element's children, or the values of a URDF element's; append missing children."""
@@ -366,6 +386,23 @@ def _check(e: Identification, model: Model, path: Path) -> None:
                 raise UnknownNameError(f"{path.name}: parameter", got=p.name, known=new)
             if not np.allclose(new[p.name], wanted, rtol=0, atol=SAME * size):
                 raise InputError(f"{path.name}: {p.name}", got=new[p.name], expected=f"{wanted}, as estimated")
+
+
+def _check_friction(changed: Mapping[str, Any], files: Iterable[Path]) -> None:
+    """Raise an error if the files have another Coulomb friction than the estimates, as Drake does not read it."""
+    written: dict[str, float] = {}
+    for file in files:
+        xml = XmlText(file.read_bytes())
+        for joint in xml.root.iter("joint"):
+            dynamics = next(joint.iter("dynamics"), joint)
+            child = dynamics.find("friction")
+            text = dynamics.get("friction") if child is None else child.text
+            text = Mjcf(xml).attributes(joint).get("frictionloss", "") if file.suffix == ".xml" else text
+            written.update({joint.get("name"): number for number in numbers_in(text)})
+    for name, wanted in changed.items():
+        label, quantity = name.rsplit(".", 1)
+        if quantity == COULOMB and written.get(label) != float(wanted):
+            raise InputError(f"{name} in the file", got=written.get(label), expected=f"{wanted}, as estimated")
 
 
 def _comment(words: str) -> str:

@@ -319,13 +319,13 @@ def softened(model: Model, contact: SoftContact) -> Model:
 def distances(twin: Twin) -> dict[tuple[str, str], float]:
     """Return the smallest signed distance [m] of each two bodies that may collide, in the context's state."""
     by_pair: dict[tuple[str, str], float] = {}
-    for names, distance in gaps(twin):
+    for names, distance in pair_distances(twin):
         by_pair[names] = min(distance, by_pair.get(names, np.inf))
     return by_pair
 
 
-def gaps(twin: Twin) -> list[tuple[tuple[str, str], float]]:
-    """Return the bodies and the distance of each of the `separations`, which take ten times as long."""
+def pair_distances(twin: Twin) -> list[tuple[tuple[str, str], float]]:
+    """Return the bodies and the distance [m] of each pair of `separations`, a call of which takes ten times as long."""
     return [((a.name(), b.name()), float(pair.distance)) for pair, (a, b) in _pairs(twin.plant, twin.context)]
 
 
@@ -396,7 +396,7 @@ def _measured(plant: Any, query: Any, ids: Any) -> tuple[Any, tuple[Any, Any]]:
     try:
         pair = from_half_space(query, ids) or query.ComputeSignedDistancePairClosestPoints(*ids)
     except RuntimeError as error:
-        why = "soft contact requires the distance of every pair of shapes, and Drake does not support one of them"
+        why = "the distance of every pair of shapes is needed, and Drake does not support one of them"
         raise ModelError(f"{why}: {error}") from error
     bodies = [plant.GetBodyFromFrameId(query.inspector().GetFrameId(i)) for i in (pair.id_A, pair.id_B)]
     return pair, (bodies[0], bodies[1])

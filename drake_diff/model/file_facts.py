@@ -273,7 +273,8 @@ class Mjcf:
         joint = says.get("joint", "")
         if joint in self.joints:
             scaled.append((self.joints[joint].sides, 1.0))
-        read, ratio = kind in KINDS and bool(joint), first_number(says, "dampratio")
+        read = kind in KINDS and bool(joint)
+        ratio = 0.0 if "kv" in element.attributes else first_number(says, "dampratio")  # kv overrides that of a class
         name, sides = says.get("name", ""), _within(scaled)
         return FileActuator(kind, name, joint, read, sides, gains, element.line, command, ratio)
 

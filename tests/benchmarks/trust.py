@@ -47,25 +47,29 @@ PARTS = (
 
 @dataclass(frozen=True)
 class Figure:
-    """`found` of `of` cases, whose share must be at least or at most `bound`."""
+    """`found` of `of` cases, whose share must be at least or at most `bound`; None if nothing is asked."""
 
     name: str
     found: int
     of: int
-    bound: float
-    at_least: bool
+    bound: float | None
+    at_least: bool = True
 
     @property
     def holds(self) -> bool:
+        if self.bound is None:
+            return True
         share = self.found / self.of
         return share >= self.bound if self.at_least else share <= self.bound
 
     def __str__(self) -> str:
         rate = success_rate(self.found, self.of)
-        asked = f"{'at least' if self.at_least else 'at most'} {100 * self.bound:g} %"
+        asked = ""
+        if self.bound is not None:
+            asked = f", asked {'at least' if self.at_least else 'at most'} {100 * self.bound:g} %"
         return (
             f"{self.name}: {self.found} of {self.of}, {100 * rate.value:.2f} % "
-            f"({100 * rate.lower:.2f} to {100 * rate.upper:.2f} %), asked {asked}" + ("" if self.holds else ": MISSED")
+            f"({100 * rate.lower:.2f} to {100 * rate.upper:.2f} %){asked}" + ("" if self.holds else ": MISSED")
         )
 
 

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from helpers.table import each_row
 
 import drake_diff as dd
 from drake_diff.exceptions import InputError
 from drake_diff.identification import first_state, identify_contact
 from drake_diff.identification.impacts import shrink_to, start_of
-from drake_diff.identification.recordings import read_pieces
+from drake_diff.identification.recordings import _resting, heights, read_pieces
 from drake_diff.model.tangent import tangent_space
 
 pytestmark = pytest.mark.solve
@@ -188,3 +189,37 @@ def test_friction_is_that_of_a_block_on_the_ground_if_its_height_is_not_recorded
     log = dd.Recording("lab", "1", 0.01 * np.arange(len(truth)), measured, np.zeros((len(truth) - 1, 0)))
     low, high = dd.identify(model, log, ["block.friction"]).intervals["block.friction"]
     assert low < 0.25 < high < low + 0.01
+
+
+OVER_A_FLOOR = """<sdf version="1.9"><world name="w"><model name="floor"><static>true</static><link name="floor">
+<collision name="plate"><pose>{0} 0 -0.01 0 0 0</pose><geometry><box><size>4 4 0.02</size></box></geometry></collision>
+<collision name="wall"><pose>{0} 0.11 0 0 0 0</pose><geometry><box><size>4 0.1 4</size></box></geometry></collision>
+</link></model><model name="m"><link name="b"><inertial><mass>1</mass><inertia><ixx>.01</ixx><iyy>.01</iyy>
+<izz>.01</izz></inertia></inertial>
+<collision name="c"><geometry>{1}</geometry></collision></link></model></world></sdf>"""
+BALL, BLOCK = "<sphere><radius>0.05</radius></sphere>", "<box><size>0.1 0.1 0.1</size></box>"
+
+
+def over_a_floor(tmp_path, x, shape):
+    path = tmp_path / "floor.sdf"
+    path.write_text(OVER_A_FLOOR.format(x, shape))
+    return dd.load_model(path, time_step=0.01)
+
+
+@each_row("height", [0.04, 0.05, 0.06, 0.2, 0.8, 1.3, 9.0])
+@each_row("shape", [BALL, BLOCK])
+def test_a_body_of_unmeasured_height_comes_to_rest_on_a_floor_of_2_cm(tmp_path, height, shape):
+    model = over_a_floor(tmp_path, 0.0, shape)
+    ((i, j),), x = heights(model), model.default_state.copy()
+    x[i] = height
+    assert _resting(model, x, i, j) == pytest.approx(0.05, abs=2e-7)  # it overlaps by 1e-7 m at most
+
+
+def test_a_body_with_nothing_below_it_begins_at_the_default_height_as_the_reason_says(tmp_path):
+    model = over_a_floor(tmp_path, 10.0, BALL)
+    measured = np.full((30, model.nx), np.nan)
+    measured[:, model.state_names.index("b_x")] = 1e-3 * np.random.default_rng(0).standard_normal(30)
+    log = dd.Recording("lab", "1", 0.01 * np.arange(30), measured, np.zeros((29, 0)))
+    assert "b_z, not recorded, begins at the model's default" in dd.identify(model, log, ["b.mass"]).reason
+    over = over_a_floor(tmp_path, 0.0, BALL)
+    assert "default" not in dd.identify(over, log, ["b.friction"]).reason

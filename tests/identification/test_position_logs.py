@@ -12,7 +12,7 @@ from drake_diff.exceptions import InputError, UnknownNameError
 from drake_diff.identification.fit import Fit
 from drake_diff.identification.identify import Problem
 from drake_diff.identification.judge import colour_of
-from drake_diff.identification.messages import identification_sentence
+from drake_diff.identification.messages import identification_sentence, where_left
 from drake_diff.identification.motion import servo_motion, with_exact_derivatives
 from drake_diff.identification.recordings import Excerpt
 from drake_diff.identification.tree import tree_for_identification
@@ -103,7 +103,7 @@ def test_a_fit_that_leaves_errors_names_what_the_model_lacks(pendulum, lack, mor
     fit = dd.identify(pendulum, recorded(commands(), more=more))
     assert not fit.explained
     where, line = fit.remains
-    assert where.startswith("the largest error is in hinge_q: ")
+    assert where.startswith("the largest error, relative to the noise, is in hinge_q: ")
     assert line.split(": ", 1)[1].startswith(f"{lack} by ")
     assert "of held-out samples" in fit.sentence
 
@@ -280,3 +280,16 @@ def test_a_log_of_commanded_positions_may_have_efforts(pendulum, tmp_path):
     path.write_text("t,q_hinge,q_desired_hinge,effort_hinge\n0,0.1,0.2,1.5\n0.005,0.11,0.25,1.6\n")
     recording = read_recording(path, pendulum, gaps=True)
     np.testing.assert_array_equal(recording.us, [[0.2]])
+
+
+def test_the_joint_with_the_largest_error_is_that_of_the_largest_ratio_to_the_noise(tmp_path):
+    """An error of 0.5 m is 500 times its noise; one of 0.01 rad, or 0.573 degrees, is 10 times its noise."""
+    path = tmp_path / "slide.urdf"
+    path.write_text(TWO_JOINTS.format(JOINT.format("slide").replace("continuous", "prismatic") + JOINT.format("turn")))
+    model = dd.load_model(path, base="weld", time_step=0.01)
+    xs = np.random.default_rng(0).standard_normal((30, 4))
+    ys = xs + np.array([0.5, 0.01, 0, 0])
+    (where,) = where_left(model, [(ys, xs)], np.array([1e-3, 1e-3, 1.0, 1.0]))
+    assert "is in slide_x: 0.5 m rms" in where
+    (where,) = where_left(model, [(ys, xs)], np.array([1.0, 1e-3, 1.0, 1.0]))
+    assert "is in turn_q: 0.573 degrees rms" in where

@@ -13,6 +13,7 @@ import drake_diff as dd
 from drake_diff.exceptions import InputError, ModelError
 from drake_diff.identification import Identification, write_model
 from drake_diff.identification.results import Request
+from drake_diff.identification.write_model import IN_MJCF
 
 ARM = """<?xml version="1.0"?>
 <!-- an arm -- of one link -->
@@ -100,6 +101,7 @@ def test_a_urdf_file_takes_everything_that_it_has_a_place_for(arm, tmp_path):
 def test_an_sdf_file_takes_springs_too(load, tmp_path):
     model = load("mass_spring_damper.sdf")
     values = {"block.mass": 2.5, "slide.damping": 1.0, "slide.spring_stiffness": 60.0, "slide.spring_rest_length": 0.2}
+    values["slide.coulomb_friction"] = 0.3
     # A mass scales the inertia, as in Drake.
     path = write_model(saying(model, values), tmp_path / "right.sdf")
     same(model, path, {**values, "block.inertia": number(model, "block.inertia") * 1.25})
@@ -166,28 +168,83 @@ SERVOS = """<mujoco><default><joint damping="0.1"/><position kp="20" dampratio="
 <body name="arm"><joint name="j" axis="0 1 0" armature="0.02"/><geom size="0.03" pos="0 0 -0.2" mass="1"/>
 <body name="fore" pos="0 0 -.3"><inertial pos="0 0 -.1" mass="0.5" diaginertia=".01 .01 .002"/>
 <joint name="k" axis="0 1 0"/></body></body></worldbody>
-<actuator><position name="p" joint="j" kp="30" kv="1" gear="2"/><position name="pk" joint="k"/></actuator></mujoco>"""
+<actuator><position name="p" joint="j" kp="30" kv="1" gear="2"/><position name="k" joint="k" gear="3"/></actuator>
+</mujoco>"""
 
 
 def test_an_mjcf_file_takes_what_mujoco_has_a_place_for(tmp_path):
     (tmp_path / "arm.xml").write_text(SERVOS)
     model = dd.load_model(tmp_path / "arm.xml", inputs="position", time_step=0.01)
-    servos = {"p.rotor_inertia": 0.05, "pk.rotor_inertia": 0.01, "p.kp": 100.0, "p.kd": 5.0, "pk.kp": 25.0}
-    values = {"j.damping": 0.3, **servos, "arm.mass": 1.3, "fore.center_of_mass": np.array([0.01, 0, -0.1])}
+    servos = {"p.rotor_inertia": 0.05, "k.rotor_inertia": 0.01, "p.kp": 100.0, "p.kd": 5.0, "k.kp": 225.0}
+    values = {
+        "j.damping": 0.3,
+        "k.damping": 0.4,
+        "k.spring_stiffness": 2.0,
+        **servos,
+        "arm.mass": 1.3,
+        "fore.center_of_mass": np.array([0.01, 0, -0.1]),
+    }
     path = write_model(
-        saying(model, values | {"j.coulomb_friction": 0.2, "model.input_delay": 0.004}), tmp_path / "b.xml"
+        saying(model, values | {"k.coulomb_friction": 0.2, "model.input_delay": 0.004}), tmp_path / "b.xml"
     )
     assert "model.input_delay is 0.004" in path.read_text()
     m = mujoco.MjModel.from_xml_path(str(path))
-    np.testing.assert_allclose(m.dof_damping, [0.3, 0.1])
-    np.testing.assert_allclose(m.dof_frictionloss, [0.2, 0.0])
-    np.testing.assert_allclose(m.dof_armature, [0.2, 0.01])  # the gear of p is 2
+    np.testing.assert_allclose(m.dof_damping, [0.3, 0.4])
+    np.testing.assert_allclose(m.dof_frictionloss, [0.0, 0.2])
+    np.testing.assert_allclose(m.jnt_stiffness, [0.0, 2.0])
+    np.testing.assert_allclose(m.dof_armature, [0.2, 0.09])  # the gears are 2 and 3
     np.testing.assert_allclose(m.actuator_gainprm[:, 0], [25.0, 25.0])
     np.testing.assert_allclose(m.actuator_biasprm[:, 2], [-1.25, 0.0])
     np.testing.assert_allclose(m.body_mass[1:], [1.3, 0.5])
     again = {p.name: p.value for p in dd.list_parameters(dd.load_model(path, **model.options))}
     for name, value in values.items():
         np.testing.assert_allclose(again[name], value, rtol=1e-9, err_msg=name)
+    comments = [line for line in path.read_text().splitlines() if "drake_diff: k." in line]
+    assert [comment.count(" was ") for comment in comments] == [3, 1, 1]  # of the joint, its armature, its servo
+
+
+@each_row("in_class, own", [('kp="40" dampratio="0.7"', ""), ("", 'kp="40" dampratio="0.7"'), ('kv="3" kp="40"', "")])
+@each_row("values", [{"p.kp": 60.0}, {"p.kd": 2.0}, {"p.kp": 60.0, "p.kd": 2.0}])
+def test_a_gain_of_a_servo_with_a_damping_ratio_is_written_with_the_other_gain(tmp_path, in_class, own, values):
+    text = SERVOS.replace('kp="20" dampratio="0"', in_class).replace('kp="30" kv="1"', own)
+    (tmp_path / "arm.xml").write_text(text)
+    model = dd.load_model(tmp_path / "arm.xml", inputs="position", time_step=0.01)
+    path = write_model(saying(model, values), tmp_path / "b.xml")
+    same(model, path, values)
+    m = mujoco.MjModel.from_xml_path(str(path))
+    gains = [float(np.ravel(values.get(f"p.{name}", number(model, f"p.{name}")))[0]) for name in ("kp", "kd")]
+    np.testing.assert_allclose([m.actuator_gainprm[0, 0], -m.actuator_biasprm[0, 2]], np.array(gains) / 4)  # gear 2
+
+
+def test_the_gains_of_a_general_actuator_are_refused(tmp_path):
+    general = '<general name="p" joint="j" gainprm="40" biastype="affine" biasprm="0 -40 -3"'
+    (tmp_path / "arm.xml").write_text(SERVOS.replace('<position name="p" joint="j" kp="30" kv="1"', general))
+    model = dd.load_model(tmp_path / "arm.xml", inputs="position", time_step=0.01)
+    with pytest.raises(InputError, match=r"p\.kp: expected a <position> actuator, got a <general>"):
+        write_model(saying(model, {"p.kp": 50.0}), tmp_path / "b.xml")
+
+
+def test_each_joint_that_changes_has_a_comment(tmp_path):
+    """The motor of joint k has the name of joint j."""
+    servo = '<position name="p" joint="j" kp="30" kv="1" gear="2"/>'
+    (tmp_path / "arm.xml").write_text(SERVOS.replace(servo, "").replace('name="k" joint', 'name="j" joint'))
+    model = dd.load_model(tmp_path / "arm.xml", inputs="position", time_step=0.01)
+    path = write_model(saying(model, {"j.damping": 0.3, "j.rotor_inertia": 0.05}), tmp_path / "b.xml")
+    lines = path.read_text().splitlines()
+    changed = [
+        i for i, line in enumerate(lines) if 'damping="0.3"' in line or 'armature="0.45' in line
+    ]  # the gear is 3
+    assert len(changed) == 2
+    assert all("drake_diff: j." in lines[i - 1] for i in changed)
+
+
+def test_a_file_with_another_friction_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "arm.xml").write_text(SERVOS)
+    model = dd.load_model(tmp_path / "arm.xml", inputs="position", time_step=0.01)
+    monkeypatch.setitem(IN_MJCF, "coulomb_friction", "user")
+    with pytest.raises(ModelError, match=r"k\.coulomb_friction in the file: expected 0\.2, as estimated"):
+        write_model(saying(model, {"k.coulomb_friction": 0.2}), tmp_path / "b.xml")
+    assert not (tmp_path / "b.xml").exists()
 
 
 def test_friction_is_in_a_urdf_file_and_what_belongs_to_commands_in_its_comment(tmp_path):
@@ -228,12 +285,14 @@ def test_an_overlay_stays_over_a_corrected_copy_of_the_file_that_it_adds(tmp_pat
     (tmp_path / "arm.dmd.yaml").write_text(OVERLAY.format(f"file://{tmp_path / 'arm.urdf'}"))
     model = dd.load_model(tmp_path / "arm.dmd.yaml", time_step=0.01)
     values = {"shoulder.damping": 0.7, "shoulder.offset": np.array([0.0, 0.1, 1.2])}
-    path = write_model(saying(model, values), tmp_path / "right.dmd.yaml")
+    more = {"shoulder.coulomb_friction": 0.4, "model.input_delay": 0.004}
+    path = write_model(saying(model, values | more), tmp_path / "right.dmd.yaml")
     same(model, path, values)
     new = dd.load_model(path, time_step=0.01)
     np.testing.assert_array_equal(new.default_state, model.default_state)  # the positions come from the overlay
     lines = path.read_text().splitlines()
-    assert lines[0].startswith("# Explained: so -- it is -->.")
+    assert lines[0].startswith("# Explained: so -- it is -->. model.input_delay is 0.004")
+    assert 'friction="0.4"' in (tmp_path / "right_arm.urdf").read_text()
     assert [line for line in lines[1:] if "file:" not in line] == [
         line for line in (tmp_path / "arm.dmd.yaml").read_text().splitlines() if "file:" not in line
     ]

@@ -16,7 +16,7 @@ from drake_diff._base.arrays import Array
 from drake_diff._base.autodiff import chain
 from drake_diff._base.clock import now
 from drake_diff.exceptions import ModelError
-from drake_diff.model.contact import distances, gaps, separation_at
+from drake_diff.model.contact import distances, pair_distances, separation_at
 from drake_diff.model.model import Model
 from drake_diff.model.step import set_state
 from drake_diff.optimize.ilqr.ilqr import solve_ilqr
@@ -146,7 +146,7 @@ def beginnings(problem: Problem, xs: Array) -> tuple[ContactHold, ...]:
     rows = []
     for x in xs[:-1]:
         set_state(problem.model.double, x)
-        rows.append(gaps(problem.model.double))
+        rows.append(pair_distances(problem.model.double))
     phi, names = np.array([[distance for _, distance in row] for row in rows]), [pair for pair, _ in rows[0]]
     holds = list[ContactHold]()
     for before, pair in np.argwhere((phi[:-1] >= 0) & (phi[1:] < 0)):
