@@ -58,8 +58,8 @@ def sweep_of(f: Many, size: int, steps: Sequence[float], *, minus: Difference = 
 
 
 def one_by_one(f: Function) -> Many:
-    """Turn a function `f` of one displacement into a function of many."""
-    return lambda displacements: np.array([f(d) for d in displacements])
+    """Turn a function `f` of one displacement into a function of many; `f` may return the same buffer each time."""
+    return lambda displacements: np.array([np.array(f(d)) for d in displacements])
 
 
 def richardson(central: Array) -> Array:

@@ -494,7 +494,7 @@ def certify_jacobian(
     shape: Shape = ("K", len(at_x)) if batched else (len(at_x),)
 
     def ask(point: Array) -> Array:
-        return np.asarray(called("f", f, point, shape=shape), dtype=float)
+        return np.array(called("f", f, point, shape=shape), dtype=float)
 
     many = ask if batched else one_by_one(ask)
     unsolved: Array | float = 0.0

@@ -322,6 +322,8 @@ class StepAround:
     def screened(self, derivative: Array) -> Screened:
         """Screen the derivative. Return the result, the residual of Drake's steps and the doubt."""
         residuals = [-1.0]
+        if not np.isfinite(derivative).all():
+            return None, -1.0, "the derivative is not finite"
 
         def values(displacements: Array) -> Array:
             x_next, residual = ends(displacements)

@@ -133,18 +133,18 @@ def is_broken(changes: Many, n: int, noise: Array | float = 0.0) -> tuple[str, A
 
 
 def noise_of(changes: Many, n: int) -> Array:
-    """Return the scatter (m,) of a function's values on both sides of the point, from its `changes` (K, m)."""
-    spacing = DIFFERENCES.spacings[DIFFERENCES.near]
-    places = np.multiply.outer([1.0, -1.0], spacing * np.arange(1, DIFFERENCES.values + 1))
-    values = changes(np.multiply.outer(places, line(n)).reshape(-1, n))
-    return np.asarray(_scatter(values.reshape(2, DIFFERENCES.values, -1)).min(axis=0))
+    """Return the scatter (3, m) of a function's values, from its `changes` (K, m), at spacings of 1e-9, 1e-7 and 1e-5.
+
+    It is the larger one of both sides of the point, but the smaller one at 1e-5.
+    """
+    spacings = DIFFERENCES.spacings[: DIFFERENCES.near + 1]
+    scatter = _scatter(changes(_along(n, spacings)).reshape(2, len(spacings), DIFFERENCES.values, -1))
+    return np.vstack([scatter[:, :-1].max(axis=0), scatter[:, -1:].min(axis=0)])
 
 
-def _along(n: int) -> Array:
-    """Return places (K, n) along a line to both sides of the point, at each of DIFFERENCES.spacings."""
-    places = np.multiply.outer(
-        [1.0, -1.0], np.multiply.outer(DIFFERENCES.spacings, np.arange(1, DIFFERENCES.values + 1))
-    )
+def _along(n: int, spacings: tuple[float, ...] = DIFFERENCES.spacings) -> Array:
+    """Return places (K, n) along a line to both sides of the point, at each of the spacings."""
+    places = np.multiply.outer([1.0, -1.0], np.multiply.outer(spacings, np.arange(1, DIFFERENCES.values + 1)))
     return np.asarray(places.reshape(-1, 1) * line(n))
 
 

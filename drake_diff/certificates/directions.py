@@ -97,10 +97,9 @@ class Claim:
         second: Scales | None = None,
         *,
         least: Array | float = 0.0,
-        power: float = LIMITS.power,
         still: float = 0.0,
     ) -> "Claim":
-        """Claim the slopes of the Jacobian `a` (m, n), of which errors of `power` of an entry must be noticed.
+        """Claim the slopes of the Jacobian `a` (m, n), of which errors of 1 % of an entry must be noticed.
 
         An entry counts `least` (m, 1) at least. Columns of zeros get the weight `still`. If it is
         0, they must have no effect at all.
@@ -108,7 +107,7 @@ class Claim:
         size = weigh(a, a, second, least)[0]
         weights = _weights(a, size)
         weights[weights == 0] = still
-        allowed = power * np.min((weights * size)[:, weights > 0], axis=1, initial=np.inf)
+        allowed = LIMITS.power * np.min((weights * size)[:, weights > 0], axis=1, initial=np.inf)
         return cls(lambda z: z @ a.T, weights, allowed, np.abs(a).sum(axis=1), size, second)
 
 
@@ -128,7 +127,7 @@ class Screen:
         unmoved = signs * (claim.weights == 0)
         *claimed, self._along_line = claim.along(np.vstack([self.directions, line]))
         self.claimed = np.array(claimed).reshape(SCREEN.directions, -1)
-        self.powers = [first - 1, first]
+        self.powers, self._first = [first - 1, first], 10.0 ** (-first / 2)
         self.displacements = [
             np.zeros((1, n)),
             _to_both_sides(self.directions, self._widths(self.powers)),
@@ -156,7 +155,7 @@ class Screen:
     @property
     def noticeable(self) -> Array:
         """The error (m,) along a unit column that would have been noticed with a probability of 1 - SCREEN.miss."""
-        return np.asarray(_bound(self.gaps).min(axis=0))
+        return np.asarray(np.nan_to_num(_bound(self.gaps), nan=np.inf).min(axis=0))
 
     @property
     def in_doubt(self) -> Flags:
@@ -168,10 +167,24 @@ class Screen:
         """The gaps (K, m) to the slopes at the widths at which all rows together are nearest to the claim."""
         return np.asarray(self.gaps[self._nearest()])
 
+    def within_steps(self) -> Flags:
+        """Return the rows (m,) whose claimed slope, over the first width, exceeds all changes of the values seen.
+
+        They change within that width, unless they disagree with the claim and their slopes do not depend on the width.
+        """
+        risen = np.nanmax(np.abs(self._wide), axis=(0, 1), initial=0.0)
+        changes = np.abs(self.slopes) * self._widths(self.powers)[:, None, None]
+        risen = np.maximum(risen, np.nanmax(changes, axis=(0, 1, 2), initial=0.0)) + self.rounding
+        slopes, h = self.claimed - self.gaps, self._widths(self.powers)[1:]
+        left = np.maximum(SCREEN.same * _bound(slopes[1:]), self._hidden / h[1:, None])
+        steady = (_bound(np.diff(slopes, axis=0)) <= left).any(axis=0)
+        steep = np.abs(self.claimed).max(axis=0, initial=0.0) * self._first > 2 * risen
+        return np.asarray(steep & ~(steady & self.in_doubt))
+
     def certificate(self, derivative: Array, scale: Array, *, told: str = "", **named: Any) -> Certificate:
         """Return the certificate that all entries of `derivative` agree, for a screen without doubt."""
         claim, per_weight = self.claim, self._per_weight
-        best = np.argmin(_bound(self.gaps), axis=0)
+        best = np.argmin(np.nan_to_num(_bound(self.gaps), nan=np.inf), axis=0)
         gap = np.take_along_axis(self.gaps, best[None, None], axis=0)[0]  # (K, m)
         error = np.linalg.lstsq(self.directions * per_weight, gap, rcond=None)[0].T
         noticeable = self.noticeable[:, None] * per_weight
@@ -303,7 +316,8 @@ def _one_sided(changes: Array, widths: Array) -> Array:
 
 def _bound(gaps: Array) -> Array:
     """Return, from gaps (..., K, m), bounds (..., m) that errors of rows exceed with probability SCREEN.miss."""
-    return np.asarray(np.sqrt((gaps**2).sum(axis=-2) / SCREEN.quantile))
+    largest = np.abs(gaps).max(axis=-2, initial=TINY)  # squares of smaller numbers than 1e-162 vanish
+    return np.asarray(largest * np.sqrt(((gaps / largest[..., None, :]) ** 2).sum(axis=-2) / SCREEN.quantile))
 
 
 @cache

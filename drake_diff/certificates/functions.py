@@ -35,10 +35,12 @@ class FunctionOptions:
     columns: int = 8  # most columns that are compared entry by entry
     rows: int = 8  # most values of a function whose VJPs are asked for each row
     alone: float = 2e-4  # 1 - cosine of the angle between a gap and the only column that explains it
-    noisy: float = 10.0  # scatter over the precision of the type, above which the screen is repeated for this scatter
-    noisiest: float = 4e-5  # relative to the values: what scatters more is no noise
+    noisy: float = 10.0  # error of the values over the precision of the type, above which the screen is repeated
+    noisiest: float = 4e-5  # error relative to the values, above which the screen is not repeated
+    alike: float = 0.1  # scatter at smaller spacings over that at 1e-5, at least, of noise
+    single: float = 1.2e-7  # relative scatter that may be rounding to single precision, constant at spacings of 1e-9
     bound: float = 4.0  # largest error of a value over its scatter, a standard deviation
-    unsolved: float = 4.0  # rounding of a value over its precision, in differences of single entries
+    unsolved: float = 4.0  # allowed error of a value over the precision of the values, if single entries are compared
     stretch: float = 30.0  # of the steps for single entries, if the values have single precision or less
     double: float = 1e-12  # precision beyond which steps need no stretch
 
@@ -61,7 +63,7 @@ class FunctionCertificate(Verdict):
     why: str  # it is undecided, or where the function is discontinuous beside the entries
     power: float  # the smallest error that would have been noticed in every entry, relative to its size
     least: float  # relative to the largest entry of its row: the size of an entry is this at least
-    noise: float  # relative scatter of the function's values
+    noise: float  # relative error of the values that is allowed for: rounding, tolerance, or 4 times their scatter
     evaluations: int  # of the function
     derivative_calls: int
     subject: str
@@ -88,6 +90,7 @@ def certify_function(
 
     A few random directions with several step sizes decide first. If they find something wrong, it is traced to single
     entries. The noise of the function is measured. Functions in single precision are differenced over larger steps.
+    A feature narrower than 1e-6 of the scale, such as a ripple, may be missed or taken for noise.
 
     Args:
         f: The function of an array like `x`. It returns a number or an array of any shape, also of PyTorch or JAX.
@@ -106,6 +109,7 @@ def certify_function(
         The verdict, the entries that are wrong, the smallest error that would have been noticed, and the cost. An error
         is relative to the entry (units of `f` per unit of `x`), or to `least` times the largest entry of its row if
         that is larger, with each column multiplied by its scale. `least` is 1e-4, but 0.1 in single precision.
+        `power` may be large for a `vjp` if rows differ by more than a factor of 100.
 
     Raises:
         InputError: None or several of `jacobian`, `jvp` and `vjp` are given; a function raises or returns no numbers.
@@ -128,33 +132,52 @@ def certify_function(
     precision = function.precision
     if not (function.rows and function.columns):
         return _certificate(claimed, "agree", precision=precision)
-    screen = claimed.screen(precision)
+    screen, why = claimed.screen(precision), ""
     if screen.doubt:
-        size = np.abs(screen.centre) + screen.claim.reach
-        noise = noise_of(screen.changes, len(function.columns))[size > 0] / size[size > 0]
-        scatter = OPTIONS.bound * float(np.max(noise, initial=0.0))
-        if OPTIONS.noisy * precision < scatter <= OPTIONS.noisiest:
+        if screen.within_steps().any():
+            why = f"{screen.doubt}; the function changes within the smallest step: give smaller `scales`"
+            return _certificate(claimed, "undecided", (), why, precision=precision, power=np.inf)
+        scatter, why = _noise(screen, precision)
+        if OPTIONS.noisy * precision < scatter:
             precision, screen = scatter, claimed.screen(scatter)
     if not screen.doubt:
-        return _certificate(claimed, "agree", precision=precision, power=_power(screen))
-    return _examined(claimed, screen, precision, f"the values scatter by {scatter:.1g} of their size")
+        return _certificate(claimed, "agree", precision=precision, power=_power(screen, claimed.unbalanced))
+    if np.isfinite(function.undefined):
+        why = f"f is not finite at a distance of {function.undefined:.1g} from x: give smaller `scales`"
+    return _examined(claimed, screen, precision, why)
 
 
-def _power(screen: Screen) -> float:
-    """Return the smallest error, relative to the size of an entry, that the rows without doubt would have shown."""
+def _noise(screen: Screen, precision: float) -> tuple[float, str]:
+    """Return the largest error of the values relative to their size, if they scatter as noise does, and a sentence."""
+    size = np.abs(screen.centre) + screen.claim.reach
+    stretch = OPTIONS.stretch if precision > OPTIONS.double else 1.0
+    values = noise_of(lambda d: screen.changes(stretch * d), len(screen.claim.weights))
+    scatter = values[:, size > 0] / size[size > 0]  # (spacings, rows)
+    largest = OPTIONS.bound * float(np.max(scatter[-1], initial=0.0))
+    fine, finer = (scatter[k] >= OPTIONS.alike * scatter[-1] for k in (1, 0))
+    noise = fine & (finer | (scatter[-1] <= max(OPTIONS.single, OPTIONS.noisy * precision)))
+    noise |= OPTIONS.bound * scatter[-1] <= OPTIONS.noisy * precision  # too little to matter
+    if largest <= OPTIONS.noisiest and noise.all():
+        return largest, f"the values scatter by {largest:.1g} of their size"
+    return 0.0, f"the values scatter by {largest:.1g} of their size, but not as noise does"
+
+
+def _power(screen: Screen, unbalanced: float) -> float:
+    """Return the smallest relative error that rows without doubt show, times `unbalanced` (of the smallest value)."""
     known = ~screen.in_doubt & (screen.allowed > 0)
-    return LIMITS.power * float(np.max(screen.noticeable[known] / screen.allowed[known], initial=0.0))
+    return LIMITS.power * float(np.max(screen.noticeable[known] / screen.allowed[known], initial=0.0)) * unbalanced
 
 
 def _examined(claimed: _Claimed, screen: Screen, precision: float, scatter: str) -> FunctionCertificate:
     """Compare the entries that a screen suspects, and return the verdict."""
     rows = screen.in_doubt if screen.in_doubt.any() else ~screen.in_doubt
-    n, power, entries = len(claimed.function.columns), _power(screen), tuple[Entry, ...]()
+    n, power, entries = len(claimed.function.columns), _power(screen, claimed.unbalanced), tuple[Entry, ...]()
     for columns in _suspects(screen):
         for block in claimed.blocks(columns, rows):
             compared = _compared(claimed.function, block, columns, precision)
             entries = _wrong(compared)
-            power = max(power, float(np.max(compared.tolerance / compared.size, initial=0.0)))
+            relative = np.nan_to_num(compared.tolerance / compared.size, nan=np.inf)
+            power = max(power, float(np.max(relative, initial=0.0)))
             if compared.verdict in ("disagree", "discontinuous"):
                 return _certificate(claimed, compared.verdict, entries, precision=precision, power=power)
         if not (entries or screen.broken) and len(columns) == n:
@@ -237,8 +260,8 @@ def _certificate(
 
 
 def _plain(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the function with results that NumPy can read: tensors of PyTorch and arrays of Warp are converted."""
-    return wraps(function)(lambda *arguments: _readable(function(*arguments)))
+    """Return the function with results that are copied to NumPy: a function may return the same buffer each time."""
+    return wraps(function)(lambda *arguments: _copied(_readable(function(*arguments))))
 
 
 def _readable(result: Any) -> Any:
@@ -247,20 +270,37 @@ def _readable(result: Any) -> Any:
     return result
 
 
+def _copied(result: Any) -> Any:
+    array = np.array(result)
+    return array if array.ndim or array.dtype.kind != "O" else result  # no numbers, which messages show as they are
+
+
+def _numbers(subject: str, given: Any) -> Any:
+    """Return the user's numbers as an array, or raise InputError."""
+    try:
+        array = np.asarray(_copied(_readable(given)))
+    except (TypeError, ValueError) as error:
+        raise InputError(subject, got=f"{given!r:.80}", expected="an array of numbers") from error
+    if given is None:
+        raise InputError(subject, got="None", expected="an array of numbers")
+    return array
+
+
 class _Function:
     """A user's function of scaled displacements (K, n) from the point, with values (K, m). `calls` are counted."""
 
     def __init__(self, f: Any, x: ArrayLike, scales: ArrayLike | None, solver_tolerance: float):
         if not callable(f):
             raise InputError("f", got=f"{f!r:.80}", expected="a function")
-        self.f, self._plain, given = f, _plain(f), np.asarray(_readable(x))
+        self.f, self._plain, given = f, _plain(f), _numbers("x", x)
         self.solver_tolerance = solver_tolerance
-        self.shape, self.calls = given.shape, 0
+        self.shape, self.calls, self.undefined = given.shape, 0, np.inf  # smallest distance where f is not finite
         self.type = given.dtype if given.dtype.kind == "f" else np.dtype(float)
         self.point = finite_array("x", given, given.shape).ravel()
         self.scale = np.maximum(1.0, np.abs(self.point))
         if scales is not None:
-            scale = finite_array("scales", scales, self.shape if np.ndim(scales) else ())
+            scale = _numbers("scales", scales)
+            scale = finite_array("scales", scale, self.shape if scale.ndim else ())
             if np.any(scale <= 0):
                 raise InputError("scales", got=f"{np.min(scale):g}", expected="numbers above 0")
             self.scale = np.broadcast_to(scale, self.shape).ravel()
@@ -287,7 +327,10 @@ class _Function:
         for value in values:
             if value.shape != self.value_shape:
                 raise ShapeError("f(x)", got=value.shape, expected=self.value_shape)
-        return np.array(values).reshape(len(values), -1)
+        table = np.array(values).reshape(len(values), -1)
+        reach = np.abs(self.scale * displacements).max(axis=1, initial=0.0)
+        self.undefined = min([self.undefined, *reach[~np.isfinite(table).all(axis=1)]])
+        return table
 
 
 def _names(letter: str, shape: tuple[int, ...]) -> tuple[str, ...]:
@@ -303,10 +346,12 @@ class _Claimed:
     def __init__(self, function: _Function, kind: str, given: Any):
         self.function, self.kind, self._given, self.calls = function, kind, given, 0
         m, n = len(function.rows), len(function.columns)
-        self.mixed, self.matrix = np.eye(m), np.zeros((m, n))
+        if kind != "jacobian" and not callable(given):
+            raise InputError(kind, got=f"{given!r:.80}", expected="a function")
+        self.mixed, self.matrix, self.unbalanced = np.eye(m), np.zeros((m, n)), 1.0
         if kind == "jacobian":
             shapes = (m, n), function.value_shape + function.shape
-            matrix = self._ask(function.given(function.point)) if callable(given) else _readable(given)
+            matrix = self._ask(function.given(function.point)) if callable(given) else _numbers(kind, given)
             if np.shape(matrix) not in shapes:
                 raise ShapeError("jacobian", got=np.shape(matrix), expected=shapes[0])
             self.matrix = finite_array("jacobian", matrix, np.shape(matrix)).reshape(m, n) * function.scale
@@ -317,15 +362,15 @@ class _Claimed:
     def _ask(self, *arguments: Any, shape: tuple[int, ...] | None = None) -> Array:
         self.calls += 1
         result = called(self.kind, _plain(self._given), *arguments, shape=shape)
-        return finite_array(f"{self.kind}(x)", np.asarray(result), np.shape(result))
+        return finite_array(f"{self.kind}(x)", result, np.shape(result))
 
     def _along(self, directions: Array) -> Array:
         """Return the slopes (K, k) along `directions` (K, n)."""
         if self.kind != "jvp":
             return directions @ self.matrix.T
-        given, shape, scale = self.function.given, self.function.value_shape, self.function.scale
-        point, tangents = given(self.function.point), [given(scale * direction) for direction in directions]
-        slopes = [self._ask(point, tangent, shape=shape).ravel() for tangent in tangents]
+        given, shape, point = self.function.given, self.function.value_shape, self.function.point
+        tangents = [given(self.function.scale * direction) for direction in directions]
+        slopes = [self._ask(given(point), tangent, shape=shape).ravel() for tangent in tangents]
         return np.array(slopes).reshape(len(directions), -1)
 
     def _rows(self, cotangents: Array) -> Array:
@@ -338,11 +383,14 @@ class _Claimed:
         return np.array(rows).reshape(len(cotangents), -1)
 
     def _sizes(self) -> Array:
-        """Return (m,) the slopes of the values along two directions, which balance their combinations."""
+        """Return (m,) the slopes of the values along the directions, which balance their combinations, or 1 % of the
+        largest slope, beside which the combinations are `unbalanced`."""
         width = 10.0 ** (-first_power(self.function.precision) / 2)
-        ends = self.function.values(width * normals(len(self.function.columns))[:2])
+        ends = self.function.values(width * normals(len(self.function.columns)))
         sizes = np.abs(ends - self.function.value).max(axis=0) / width
-        return np.maximum(sizes, SCREEN.flat * np.max(sizes, initial=0.0)) + float(not np.any(sizes))
+        balanced = np.maximum(sizes, SCREEN.flat * np.max(sizes, initial=0.0)) + float(not np.any(sizes))
+        self.unbalanced = float(np.max(balanced[sizes > 0] / sizes[sizes > 0], initial=1.0))
+        return balanced
 
     def _mix(self, values: Array) -> Array:
         return values @ self.mixed.T
@@ -351,7 +399,9 @@ class _Claimed:
         """Screen the derivative, for values of this relative precision."""
         n, values = len(self.function.columns), np.abs(self.mixed) @ np.abs(self.function.value)
         if self.kind == "jvp" or len(self.mixed) < len(self.function.rows):  # the entries themselves are not known
-            norm = np.sqrt((self._along(normals(n)) ** 2).mean(axis=0))  # about that of each row
+            norm = np.linalg.norm(self._along(normals(n)), axis=0) / np.sqrt(
+                SCREEN.directions
+            )  # about that of each row
             size = least_size(norm, values, precision)
             claim = Claim(self._along, np.ones(n), LIMITS.power * size, np.sqrt(n) * norm, size[:, None])
         else:
@@ -381,5 +431,6 @@ class _Claimed:
         ahead, behind = ends.reshape(2, 2, len(columns), -1).swapaxes(0, 1)
         slopes = richardson((ahead - behind) / (2 * widths[:, None, None]))[0]  # (columns, m)
         gap = self.matrix[:, columns] - self._mix(slopes).T  # (k, columns)
-        alike = np.abs(self.mixed.T @ gap) / np.linalg.norm(self.mixed, axis=0)[:, None]
+        mixed = self.mixed / np.max(np.abs(self.mixed))  # the squares of larger numbers may overflow
+        alike = np.abs(mixed.T @ gap) / np.linalg.norm(mixed, axis=0)[:, None]
         return np.unique(np.argsort(-alike, axis=0)[:2])

@@ -107,6 +107,7 @@ def certify_function(
     jvp: Annotated[str | None, typer.Option(metavar="NAME", help="Its products with tangents (x, v).")] = None,
     vjp: Annotated[str | None, typer.Option(metavar="NAME", help="Its products with cotangents (x, w).")] = None,
     scales: Annotated[str | None, typer.Option(help="Scales of the variables, as --x.")] = None,
+    solver_tolerance: Annotated[float, typer.Option(help="Relative tolerance of a function solved iteratively.")] = 0.0,
 ) -> None:
     """Certify the derivative of a function of any engine, along random directions and then entry by entry.
 
@@ -116,23 +117,33 @@ def certify_function(
 
     name, _, attribute = function.partition(":")
     sys.path.insert(0, str(Path.cwd()))
-    try:
-        module = import_module(name)
-    except (ModuleNotFoundError, ValueError) as error:  # ValueError: an empty name
-        if getattr(error, "name", name) != name:
-            raise
-        raise InputError("MODULE:FUNCTION", got=repr(function), expected="a module here or installed") from error
+    missing = InputError("MODULE:FUNCTION", got=repr(function), expected="a module here or installed")
+    if not name or name.startswith("."):
+        raise missing
 
     def named(option: str, word: str | None) -> Any:
-        if word is None or not word.isidentifier():
+        if word is None or not all(inner.isidentifier() for inner in word.split(".")):
             return None if word is None else floats_in(option, word, "numbers separated by commas, or a name in MODULE")
-        if not hasattr(module, word):
-            raise UnknownNameError(option, got=word, known=[key for key in vars(module) if not key.startswith("_")])
-        return getattr(module, word)
+        value = module
+        for inner in word.split("."):
+            if not hasattr(value, inner):
+                raise UnknownNameError(option, got=inner, known=[key for key in dir(value) if not key.startswith("_")])
+            value = getattr(value, inner)
+        return value
 
     words = {"jacobian": jacobian, "jvp": jvp, "vjp": vjp, "scales": scales}
-    given = {key: named(f"--{key}", word) for key, word in words.items()}
-    certificate = certify_derivative(named("MODULE:FUNCTION", attribute), named("--x", x), **given)
+    try:
+        module = import_module(name)
+        given = {key: named(f"--{key}", word) for key, word in words.items()}
+        f, point = named("MODULE:FUNCTION", attribute), named("--x", x)
+        certificate = certify_derivative(f, point, **given, solver_tolerance=solver_tolerance)
+    except ModuleNotFoundError as error:
+        if not f"{name}.".startswith(f"{error.name}."):
+            raise
+        raise missing from error
+    except SystemExit as end:  # whose status would be taken for the verdict
+        got = f"sys.exit({end.code!r})"
+        raise InputError("MODULE:FUNCTION", got=got, expected="code that does not end the process") from end
     show(judged(certificate.verdict), str(certificate).removeprefix(certificate.verdict).strip())
     conclude(certificate.verdict == "agree")
 

@@ -1,5 +1,7 @@
 """The check along a few random directions accepts right derivatives, and doubts wrong or undefined ones."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.derivatives import scaled
@@ -167,3 +169,13 @@ def test_a_ball_that_has_just_touched_passes_nearer_to_the_point_where_every_ent
     assert found.around is None  # it was not necessary to compare every entry
     assert "random directions" in found.told
     assert found.verdict == certify_inside(model, x, np.zeros(0)).verdict == "agree"
+
+
+@pytest.mark.parametrize("thorough", [False, True])
+def test_a_derivative_that_is_not_a_number_is_undecided_and_named(thorough):
+    model = dd.load_model(MODELS / "pendulum.urdf", time_step=0.05)
+    right = dd.differentiate_step(model, [0.3, 0.1], [0.2])
+    wrong = replace(right, A=right.A * np.nan)
+    certificate = dd.certify(model, [0.3, 0.1], [0.2], derivatives=wrong, thorough=thorough)
+    assert certificate.verdict == "undecided"
+    assert "d hinge_q / d hinge_q: derivative nan" in str(certificate)

@@ -5,7 +5,7 @@ import pytest
 from helpers.table import each_row
 
 import drake_diff as dd
-from drake_diff.certificates import FunctionCertificate
+from drake_diff.certificates import FunctionCertificate, certify_jacobian
 from drake_diff.exceptions import CertificateError, InputError, NonFiniteError, ShapeError
 
 KINDS = ("jacobian", "jvp", "vjp")
@@ -178,6 +178,95 @@ def test_any_shape_is_accepted(f, x, derivative):
         assert dd.certify_function(f, x, **derivative).verdict == "agree"
 
 
+@each_row(
+    "f, slope",
+    [
+        (lambda x: np.where(np.abs(x) < 1e-5, 0.0, x - 1e-5 * np.sign(x)), 0.0),
+        (lambda x: x + 1e-5 * np.tanh(x / 1e-5), 2.0),
+        (lambda x: x + 3e-6 * np.tanh(x / 3e-6), 2.0),
+        (lambda x: x + np.sin(1e5 * x) / 1e5, 2.0),
+        (lambda x: np.round(x, 5), None),
+    ],
+)
+def test_a_small_feature_is_not_taken_for_noise(f, slope):
+    certificate = dd.certify_function(f, np.zeros(1), jacobian=np.eye(1))
+    assert certificate.verdict == ("discontinuous" if slope is None else "disagree")
+    if slope is not None:
+        assert certificate.entries[0].difference == pytest.approx(slope, rel=1e-3, abs=1e-6)
+
+
+def test_rounding_to_single_precision_inside_the_function_is_noise():
+    f, x = (lambda x: np.sin(x.astype(np.float32)).astype(float)), np.array([0.3, 0.4])
+    assert dd.certify_function(f, x, jacobian=np.diag(np.cos(x))).verdict == "agree"
+    assert dd.certify_function(f, x, jacobian=1.05 * np.diag(np.cos(x))).verdict == "disagree"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_buffer_that_is_returned_at_each_call_is_copied(kind):
+    values, slopes = np.zeros(2), np.zeros((2, 2))
+
+    def f(x):
+        values[:] = np.sin(x)
+        return values
+
+    def jacobian(x):
+        slopes[:] = np.diag(np.cos(x))
+        x *= 2  # each call has its own point
+        return slopes
+
+    product = {"jacobian": jacobian, "jvp": lambda x, v: jacobian(x) @ v, "vjp": lambda x, w: w @ jacobian(x)}
+    assert dd.certify_function(f, [0.3, 0.4], **{kind: product[kind]}).verdict == "agree"
+    assert dd.certify_function(f, [0.3, 0.4], **given(kind, np.zeros((2, 2)))).verdict == "disagree"
+    exact = np.diag(np.cos([0.3, 0.4]))
+    assert certify_jacobian(f, [0.3, 0.4], exact).verdict == "agree"
+    assert certify_jacobian(f, [0.3, 0.4], np.zeros((2, 2))).verdict == "disagree"
+
+
+def test_values_that_are_not_finite_near_the_point_are_said():
+    with np.errstate(all="ignore"):
+        right = dd.certify_function(np.log, [1e-5], jacobian=[[1e5]])
+        wrong = dd.certify_function(np.log, [1e-5], jacobian=[[1.2e5]])
+    assert (right.verdict, 0 < right.power < 0.01) == ("agree", True)
+    assert (wrong.verdict, wrong.power) == ("undecided", np.inf)
+    assert "f is not finite at a distance of 1e-05 from x: give smaller `scales`" in wrong.why
+
+
+@each_row(
+    "f, x, slope",
+    [
+        (lambda x: np.sin(1e9 * x), 1e-9, 1e9 * np.cos(1.0)),
+        (lambda x: np.sin(1e7 * x), 1e-8, 1e7 * np.cos(0.1)),
+        (lambda x: np.tanh(1e9 * x), 0.0, 1e9),
+    ],
+)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_function_that_changes_within_the_steps_needs_scales(f, x, slope, kind):
+    certificate = dd.certify_function(f, [x], **given(kind, np.array([[slope]])))
+    assert certificate.verdict == "undecided"
+    assert "the function changes within the smallest step: give smaller `scales`" in certificate.why
+    assert dd.certify_function(f, [x], **given(kind, np.array([[slope]])), scales=1e-10).verdict == "agree"
+    # A slope that is far too large for a function of moderate slope remains wrong.
+    assert dd.certify_function(np.sin, [0.3], **given(kind, np.array([[slope]]))).verdict == "disagree"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_slopes_whose_squares_underflow_are_compared(kind):
+    for factor, verdict in ((1.0, "agree"), (1.02, "disagree")):
+        claim = given(kind, 1e-200 * factor * np.eye(12))
+        assert dd.certify_function(lambda x: 1e-200 * x, np.arange(12.0), **claim).verdict == verdict
+
+
+def test_the_power_is_that_of_the_smallest_row_of_a_vjp_of_many_values():
+    sizes, weight = among(20, 7, 1e-9, 1.0), np.random.default_rng(0).standard_normal((20, 5))
+    x = np.linspace(0.5, 1.0, 5)
+
+    def vjp(x, w):
+        return w @ ((sizes * np.cos(weight @ x))[:, None] * weight)
+
+    assert dd.certify_function(lambda x: sizes * np.sin(weight @ x), x, vjp=vjp).power > 1.0
+    assert dd.certify_function(lambda x: np.sin(weight @ x), x, vjp=lambda x, w: vjp(x, w / sizes)).power < 0.01
+
+
 def test_scales_set_the_steps_and_the_size_of_errors():
     def f(x):
         return np.sin(1e6 * x)
@@ -195,6 +284,13 @@ def test_what_is_reported():
     assert "d f[1] / d x[1]" in repr(certificate)
     with pytest.raises(CertificateError, match=r"the derivative of sin.*f\[1\]"):
         certificate.require()
+
+
+class Symbolic:
+    """A value that is no array of numbers, as a CasADi SX."""
+
+    def __array__(self, dtype=None, copy=None):
+        raise TypeError("symbolic")
 
 
 @each_row(
@@ -215,6 +311,12 @@ def test_what_is_reported():
         ({"jacobian": np.eye(2), "f": lambda x: None}, InputError, "f"),
         ({"jacobian": np.eye(2), "f": lambda x: x if np.all(x == x[0]) else x[:1]}, ShapeError, "f"),
         ({"jacobian": np.eye(2), "f": 3.0}, InputError, "f"),
+        ({"jacobian": np.eye(2), "f": lambda x: [x, x[:1]]}, InputError, "f"),
+        ({"jacobian": np.eye(2), "f": lambda x: Symbolic()}, InputError, "f.*symbolic"),
+        ({"jvp": np.eye(2)}, InputError, "jvp: expected a function"),
+        ({"jacobian": [[1.0], [2.0, 3.0]]}, InputError, "jacobian: expected an array of numbers"),
+        ({"jacobian": np.eye(2), "x": [[1.0], [2.0, 3.0]]}, InputError, "x: expected an array of numbers"),
+        ({"jacobian": np.eye(2), "x": None}, InputError, "x: expected an array of numbers, got None"),
     ],
 )
 def test_wrong_input_is_named(arguments, error, message):

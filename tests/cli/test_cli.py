@@ -412,6 +412,16 @@ def test_a_plan_of_another_tool_is_checked(tmp_path, monkeypatch, capsys):
         (("mine", "--x", "start", "--jacobian", "wrong"), 2, "numbers separated by commas, or a name in MODULE"),
         (("mine:step", "--x", "1,two", "--jacobian", "wrong"), 2, "numbers separated by commas"),
         (("mine:step", "--x", "1,2"), 2, "expected one of them"),
+        ((".mine:step", "--x", "1,2"), 2, "a module here or installed"),
+        (("mine.other:step", "--x", "1,2"), 2, "a module here or installed"),
+        (
+            ("mine:Own.step", "--x", "start", "--jacobian", "Own.jacobian", "--solver-tolerance", "1e-9"),
+            0,
+            "noise 1e-09",
+        ),
+        (("mine:Own.stop", "--x", "start", "--jacobian", "wrong"), 2, "did you mean 'step'"),
+        (("mine:leave", "--x", "start", "--jacobian", "wrong"), 2, "got sys.exit(0)"),
+        (("leaves:step", "--x", "start", "--jacobian", "wrong"), 2, "got sys.exit(0)"),
     ],
 )
 def test_a_function_of_a_module_is_certified(tmp_path_factory, words, status, message):
@@ -423,7 +433,10 @@ def test_a_function_of_a_module_is_certified(tmp_path_factory, words, status, me
         "jacobian = lambda x: np.array([[x[1], x[0]], [0.0, np.cos(x[1])]])\n"
         "wrong = lambda x: jacobian(x) * [1.0, 1.02]\n"
         "vjp = lambda x, w: w @ jacobian(x)\n"
+        "leave = lambda x: exit(0)\n"
+        "class Own: step, jacobian = staticmethod(step), staticmethod(jacobian)\n"
     )
+    (folder / "leaves.py").write_text("raise SystemExit(0)\n")
     done = drake_diff("certify-function", *words, cwd=folder)
     assert done.returncode == status, done.stderr
     assert message in re.sub(r"\s+", " ", done.stdout + done.stderr)
