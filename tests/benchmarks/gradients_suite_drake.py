@@ -7,6 +7,7 @@ inputs and contact parameters. Rigid impacts and ideal Coulomb friction are not 
 """
 
 import logging
+import sys
 import warnings
 
 import numpy as np
@@ -14,7 +15,6 @@ from pydrake.geometry import AddContactMaterial, HalfSpace, ProximityProperties,
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlantConfig
 from pydrake.multibody.tree import (
-    BallRpyJoint,
     FixedOffsetFrame,
     PrismaticJoint,
     PrismaticSpring,
@@ -28,17 +28,18 @@ from pydrake.systems.framework import DiagramBuilder
 import drake_diff as dd
 
 X, Y, Z = np.eye(3)
+STICTION = 1e-3  # [m/s]
 
 
 class Plant:
     """A plant under construction whose time step is the duration of a case."""
 
-    def __init__(self, duration, gravity, stiction=1e-3):
+    def __init__(self, duration, gravity):
         self.builder = DiagramBuilder()
         config = MultibodyPlantConfig(
             time_step=duration,
             contact_model="point",
-            stiction_tolerance=stiction,
+            stiction_tolerance=STICTION,
             discrete_contact_approximation="lagged",
             use_sampled_output_ports=False,
         )
@@ -49,16 +50,13 @@ class Plant:
         """Add a body with a joint to the world, or to `parent` at a point of it. A spring is (rest, stiffness)."""
         plant = self.plant
         body, base = plant.AddRigidBody(name, inertia), parent or plant.world_body()
-        joint = plant.AddJoint(kind(f"{name}_joint", self.frame(base, at), body.body_frame(), axis, damping=damping))
+        frame = plant.AddFrame(FixedOffsetFrame(f"{name}_base", base.body_frame(), RigidTransform(at)))
+        joint = plant.AddJoint(kind(f"{name}_joint", frame, body.body_frame(), axis, damping=damping))
         if spring:
             plant.AddForceElement((PrismaticSpring if kind is PrismaticJoint else RevoluteSpring)(joint, *spring))
         if driven:
             plant.AddJointActuator(f"{name}_motor", joint)
         return body
-
-    def frame(self, body, at):
-        offset = FixedOffsetFrame(f"{body.name()}_{self.plant.num_frames()}", body.body_frame(), RigidTransform(at))
-        return self.plant.AddFrame(offset)
 
     def ground(self, ball, p):
         """Add the contact of a ball with the ground. Each side is twice as stiff as the pair."""
@@ -78,7 +76,9 @@ NOTHING = SpatialInertia.Zero()
 
 
 def point(mass, at=(0, 0, 0)):
-    return SpatialInertia.PointMass(mass, at)
+    x, y, z = at
+    about = UnitInertia(y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z)
+    return SpatialInertia(mass, np.array(at, dtype=float), about)
 
 
 def projectile(p, T):
@@ -117,10 +117,25 @@ def cart_pole(p, T):
 
 
 def rigid_body(p, T):
+    """Three hinges, as drake_diff has no joint with roll, pitch and yaw; see `to_hinges` and `from_hinges`."""
     made, inertia = Plant(T, 0.0), UnitInertia(p["Ix"], p["Iy"], p["Iz"])
-    body = made.plant.AddRigidBody("body", SpatialInertia(1.0, np.zeros(3), inertia))
-    made.plant.AddJoint(BallRpyJoint("joint", made.plant.world_frame(), body.body_frame()))
+    yaw = made.joint(RevoluteJoint, "yaw", Z, NOTHING)
+    pitch = made.joint(RevoluteJoint, "pitch", Y, NOTHING, yaw)
+    made.joint(RevoluteJoint, "roll", X, SpatialInertia(1.0, np.zeros(3), inertia), pitch)
     return made
+
+
+def to_hinges(x):
+    """Return yaw, pitch, roll and their rates from roll, pitch, yaw and the angular velocity."""
+    a, b, c, wx, wy, wz = x
+    roll = (np.cos(c) * wx + np.sin(c) * wy) / np.cos(b)
+    return np.array([c, b, a, wz + np.sin(b) * roll, np.cos(c) * wy - np.sin(c) * wx, roll])
+
+
+def from_hinges(x):
+    c, b, a, yaw, pitch, roll = x
+    wx = np.cos(b) * np.cos(c) * roll - np.sin(c) * pitch
+    return np.array([a, b, c, wx, np.cos(b) * np.sin(c) * roll + np.cos(c) * pitch, yaw - np.sin(b) * roll])
 
 
 def spring_damper(p, T):
@@ -137,24 +152,18 @@ def falling_ball(p, T):
 
 
 def resting_contact(p, T):
-    made = Plant(T, p["g"], p["vs"])
+    if p["vs"] != STICTION:  # the motion in continuous time has this one in any model
+        raise NotImplementedError
+    made = Plant(T, p["g"])
     slide = made.joint(PrismaticJoint, "slide", X, NOTHING, driven=True)
     made.ground(made.joint(PrismaticJoint, "ball", Z, point(p["m"]), slide, driven=True), p)
     return made
 
 
 FAMILIES = {
-    "projectile": projectile,
-    "pendulum": pendulum,
-    "pd_joint": pd_joint,
-    "double_pendulum": double_pendulum,
-    "cart_pole": cart_pole,
-    "rigid_body": rigid_body,
-    "spring_damper": spring_damper,
-    "spring_contact": falling_ball,
-    "damped_contact": falling_ball,
-    "resting_contact": resting_contact,
-}
+    made.__name__: made
+    for made in (projectile, pendulum, pd_joint, double_pendulum, cart_pole, rigid_body, spring_damper, resting_contact)
+} | {"spring_contact": falling_ball, "damped_contact": falling_ball}
 QUANTITIES = {"k": ("stiffness", 2.0), "c": ("dissipation", 1.0), "mu": ("friction", 1.0)}  # with each side's share
 SIDES = ("ball", "world")
 
@@ -167,16 +176,21 @@ def engine(case):
     model = FAMILIES[case["family"]](case["state"] | case["inputs"] | case["constants"], case["duration"]).model()
     x0, inputs, n = np.array(list(case["state"].values())), list(case["inputs"].values()), len(case["state"])
     us = np.array([inputs]) if model.nu else np.zeros((1, 0))
+    into, out = (to_hinges, from_hinges) if case["family"] == "rigid_body" else (np.array, np.array)
+    start = into(x0[:, None] + 1e-30j * np.eye(n))  # the derivative by complex steps
     touches = case["family"].endswith("contact")
     chosen = {key: each for key, each in QUANTITIES.items() if touches and key in case["constants"]}
     names = [f"{side}.{quantity}" for quantity, _ in chosen.values() for side in SIDES]
     value, slopes = np.empty(n), np.full((n, n + len(inputs) + len(case["constants"])), np.nan)
     at = {key: n + len(inputs) + j for j, key in enumerate(case["constants"])}
+    options = {"method": "continuous", "parameters": names}
     for i in range(n):
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", dd.exceptions.GradientWarning)  # no slope, which the suite's cases have
-            found = dd.differentiate_rollout(model, x0, us, lambda x, i=i: x[i], method="continuous", parameters=names)
-        value[i], slopes[i, :n] = found.loss, found.by_x0
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always", dd.exceptions.GradientWarning)
+            found = dd.differentiate_rollout(model, start[:, 0].real, us, lambda x, i=i: out(x)[i], **options)
+        for each in warned:  # the slope is compared all the same
+            print(f"{case['name']}: {list(case['state'])[i]}: {each.message}", file=sys.stderr)
+        value[i], slopes[i, :n] = found.loss, found.by_x0 @ start.imag / 1e-30
         if model.nu:
             slopes[i, n : n + model.nu] = found.by_us[0]
         by = dict(zip(found.parameter_names, found.by_parameters, strict=True))

@@ -149,12 +149,12 @@ draws(
 @family(
     "step", 10, "x:m y:m v:m/s w:m/s", "u:N", "m1:kg m2:kg k1:N/m k2:N/m c1:N*s/m c2:N*s/m",
     """Two masses on a line without gravity: spring k1 and damper c1 connect m1 to a wall, spring k2 and damper c2
-    connect m2 to m1, and the force u acts on m2. x is the displacement of m1 and y that of m2 relative to m1, both 0
-    where the springs are relaxed; v and w are the rates of x and y.""",
-)  # fmt: skip
+    connect m2 to m1, and a drive pushes m2 with the force u and m1 with -u. x is the
+    displacement of m1 and y that of m2 relative to m1, both 0 where the springs are relaxed; v and w are the rates
+    of x and y.""", )  # fmt: skip
 def spring_damper(p, T, tolerance):
     m1, m2, zero = p["m1"], p["m2"], 0 * p["m1"]
-    of_1 = np.array([-p["k1"] / m1, p["k2"] / m1, -p["c1"] / m1, p["c2"] / m1, zero])
+    of_1 = np.array([-p["k1"] / m1, p["k2"] / m1, -p["c1"] / m1, p["c2"] / m1, -p["u"] / m1])
     of_2 = np.array([zero, -p["k2"] / m2, zero, -p["c2"] / m2, p["u"] / m2]) - of_1
     A = np.zeros((len(zero), 5, 5), dtype=complex)
     A[:, 0, 2] = A[:, 1, 3] = 1.0
@@ -216,10 +216,12 @@ def slope(p, T, tolerance):
 def resting_point(n, random):
     """Draw a stiffness, a start near the rest, and a force that friction can resist."""
     weight, depth = n["m"] * n["g"], random.uniform(1e-4, 2e-3)
+    vs = float(random.choice([1e-3, random.uniform(0.005, 0.1)]))  # the first is Drake's default
     return {
+        "vs": vs,
         "k": weight / depth,
         "z": n["r"] - depth * random.uniform(0.8, 1.2),
-        "vx": n["vs"] * random.uniform(-3, 3),
+        "vx": vs * random.uniform(-3, 3),
         "vz": random.uniform(-0.3, 0.3) * depth * np.sqrt(n["g"] / depth),
         "ux": random.uniform(-0.6, 0.6) * n["mu"] * weight,
         "uz": random.uniform(-0.3, 0.3) * weight,
@@ -228,7 +230,7 @@ def resting_point(n, random):
 
 draws(
     "resting_contact", resting_point, x=(-1, 1), m=(0.1, 3), r=(0.03, 0.1), g=(5, 12), c=(0.1, 2), mu=(0.2, 1),
-    vs=(0.005, 0.1), T=(0.005, 0.2),
+    T=(0.005, 0.2),
 )  # fmt: skip
 
 
@@ -248,7 +250,8 @@ def resting_contact(p, T, tolerance):
         if size(N) <= 0:
             near(1.0)
         r = sign(vx) * vx / p["vs"]
-        drag = sign(vx) * p["mu"] * N * (1.0 if is_slipping else r**3 * (10 - 15 * r + 6 * r * r))
+        share = 1.0 if is_slipping or size(r) >= 1 else r**3 * (10 - 15 * r + 6 * r * r)
+        drag = sign(vx) * p["mu"] * N * share
         return np.array([vx, vz, (p["ux"] - drag) / p["m"], (p["uz"] + N) / p["m"] - p["g"]])
 
     def beyond(y):
