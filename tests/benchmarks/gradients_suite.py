@@ -18,9 +18,6 @@ from pathlib import Path
 
 import gradients_suite_steps  # noqa: F401 registers families
 import numpy as np
-from gradients_suite_families import FAMILIES, NearSwitchError
-
-importlib.import_module("gradients_suite_steps")  # registers the families without impacts
 
 SUITE = Path(__file__).with_suffix(".json")
 SEED = 44
@@ -28,7 +25,7 @@ TINY = 1e-30  # the complex step
 EXACT, COARSER = 1e-13, 3e-12  # tolerances of DOP853
 CLEAR = 0.03  # no event is nearer to the end, relative to the duration: the final state has no slope at an event
 VALUE, SLOPE = 1e-6, 1e-5  # relative tolerances: 1/1000 of a 1 % error, and far above the doubt
-DOUBT = 0.05  # relative to the tolerance; the suite has no case with more
+DOUBT = 0.01  # relative to the tolerance; the suite has no case with more
 SMALL = 1e-3  # of its row's largest effect: a smaller slope is compared with this part of it
 LEAST = 1e-6  # the effect at least, in a row without effects
 DIGITS = 12
@@ -53,9 +50,11 @@ def tolerances(numbers, value, slopes, num_constants):
     return VALUE * np.maximum(np.abs(value), 0.1), SLOPE * np.maximum(np.abs(slopes), least)
 
 
-def case(family, number):
-    """Return case `number` of a family, from the first draw that is clear of events."""
-    random = np.random.default_rng([SEED, list(FAMILIES).index(family.name), number])
+def case(family, index, number):
+    """Return case `number` of family `index`, from the first draw that is clear of events."""
+    from gradients_suite_families import NearSwitchError
+
+    random = np.random.default_rng([SEED, index, number])
     while True:
         numbers, duration = family.draw(random)
         numbers = {name: rounded(numbers[name], 4) for name in family.units}
@@ -95,7 +94,9 @@ def rounded(value, digits=DIGITS):
 
 
 def suite():
-    """Return the whole suite."""
+    """Return the whole suite. Only this needs SciPy."""
+    from gradients_suite_families import FAMILIES
+
     families = {
         family.name: {
             "group": family.group,
@@ -107,7 +108,7 @@ def suite():
         }
         for family in FAMILIES.values()
     }
-    cases = [case(family, number) for family in FAMILIES.values() for number in range(family.count)]
+    cases = [case(f, index, number) for index, f in enumerate(FAMILIES.values()) for number in range(f.count)]
     about = (
         "value is the state after `duration` [s]; slopes[i][j] is the derivative of its entry i with respect to entry "
         "j of state, inputs and constants, in their order. An entry is right if it differs by at most its tolerance. "
@@ -138,9 +139,7 @@ def compare(one, value, slopes, times):
     return {
         "values right": int(np.all(np.abs(value - true) <= of_value)),
         "slopes right": int(given.any() and np.all(off <= of_slopes[given])),
-        "wrong signs": int(
-            np.sum((slopes * exact)[given] < 0) and np.sum((off > of_slopes[given]) & ((slopes * exact)[given] < 0))
-        ),
+        "wrong signs": int(np.sum((off > of_slopes[given]) & ((slopes * exact)[given] < 0))),
         "entries": int(given.sum()),
         "not given": int((~given).sum()),
     }, float(np.max(off / of_slopes[given], initial=0.0))

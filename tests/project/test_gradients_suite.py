@@ -66,7 +66,7 @@ def test_writing_again_gives_the_same_cases(suite, tmp_path):
     for case, again in zip(suite["cases"], json.loads(out.read_text())["cases"], strict=True):
         assert all(case[name] == again[name] for name in ("state", "inputs", "constants", "duration"))
         off = np.abs(np.array(case["slopes"]) - again["slopes"])
-        assert np.all(off <= 0.05 * np.array(case["slope_tolerance"])), case["name"]
+        assert np.all(off <= 0.01 * np.array(case["slope_tolerance"])), case["name"]
 
 
 @pytest.mark.slow
