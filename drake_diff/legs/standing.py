@@ -176,6 +176,16 @@ def ranges(model: Model, turn: float = ANGLE) -> tuple[Array, Array]:
     return low, high
 
 
+def state_limits(model: Model) -> tuple[Array, Array]:
+    """Return (lower, upper) (nx,) the limits of a state, without those of positions with equal limits.
+
+    Drake holds such a position only to about 1e-6.
+    """
+    terms = [*model.contract.positions, *model.contract.velocities]
+    low, high = np.array([t.lower for t in terms]), np.array([t.upper for t in terms])
+    return np.where(low == high, -np.inf, low), np.where(low == high, np.inf, high)
+
+
 def stand_at_rest(model: Model, lower: Array, upper: Array) -> tuple[Legs, Rest] | Refusal:
     """Return the legs of a robot and the state in which it stands at rest, within lower and upper (nq,), or a Refusal.
 
@@ -597,8 +607,7 @@ def _regulated(legs: Legs, xs: Array, us: Array) -> Shift | Refusal:
             depths.append(_depths(legs))
     except (SimulationError, GradientError) as error:
         return Refusal(f"Drake cannot take the steps of the motion: {error}")
-    terms = [*model.contract.positions, *model.contract.velocities]
-    low, high = np.array([t.lower for t in terms]), np.array([t.upper for t in terms])
+    low, high = state_limits(model)
     beyond = np.any((np.array(states) < low) | (np.array(states) > high), axis=0)
     if np.any(beyond):
         return Refusal(f"{model.state_names[int(np.argmax(beyond))]} would leave its limits")

@@ -540,8 +540,8 @@ def load_model(
         actuators: The joints to drive in addition to those that the file drives: "all" revolute and prismatic joints
             without a mimic, a list of names, or a mapping from names to effort limits [N or N m]. The default limit is
             the file's, or none if it is 0 or missing. A range from 0 to 0 of such a joint is removed, also if the file
-            drives it; Drake locks other joints at 0. A velocity limit of 0 is removed from every joint. A file without
-            transmissions or actuators has no input.
+            drives it; Drake holds other joints at 0 to about 1e-6. A velocity limit of 0 is removed from every joint. A
+            file without transmissions or actuators has no input.
         base: "weld" welds floating mechanisms with joints to the world at their pose in the file. The name of a frame
             welds that frame to the world's origin. "free" refuses a file with a fixed base.
         fix_joints: The joints to replace by welds at their default positions, or the nearest positions within limits.

@@ -346,21 +346,21 @@ def fix(plant: MultibodyPlant, names: tuple[str, ...]) -> tuple[str, ...]:
             )
         low, high = float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
         q = float(np.clip(joint.default_positions()[0], low, high))
-        try:
-            weld(plant, joint, q)
-        except DRAKES_REFUSALS as error:
-            raise ModelError(f"fix_joints={name!r}: {_plain(error)}") from error
+        weld(plant, joint, q, f"fix_joints={name!r}")
         fixed_at.append(f"{name} at {q:g}")
     return note(f"{len(fixed_at)} joints fixed", fixed_at)
 
 
-def weld(plant: MultibodyPlant, joint: Any, q: float) -> None:
-    """Replace a revolute or prismatic joint by a weld at the position q, and remove its actuators."""
+def weld(plant: MultibodyPlant, joint: Any, q: float, subject: str) -> None:
+    """Replace a revolute or prismatic joint by a weld at q, without actuators; `subject` begins Drake's errors."""
     for actuator in [a for a in actuators(plant) if a.joint().index() == joint.index()]:
         plant.RemoveJointActuator(actuator)
     name, parent, child = joint.name(), joint.frame_on_parent(), joint.frame_on_child()
     moved = joint_pose(joint, q)
-    plant.RemoveJoint(joint)
+    try:
+        plant.RemoveJoint(joint)
+    except DRAKES_REFUSALS as error:
+        raise ModelError(f"{subject}: {_plain(error)}") from error
     plant.AddJoint(WeldJoint(name, parent, child, moved))
 
 
@@ -602,7 +602,7 @@ def fix_mimics(plant: MultibodyPlant, mimics: tuple[Mimic, ...]) -> tuple[str, .
         welds += [(joint, ratio * q + offset) for joint, ratio, offset in moving]
     positions = [f"{joint.name()} at {q:.6g}" for joint, q in welds]  # before the joints are removed
     for joint, q in welds:
-        weld(plant, joint, q)
+        weld(plant, joint, q, f"mimic='fix': {joint.name()}")
     return note(f"{len(welds)} mimic joints and the joints that they follow were fixed", positions)
 
 

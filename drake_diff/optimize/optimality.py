@@ -150,10 +150,11 @@ def _sides(values: Array, lower: Array, upper: Array, scales: Any) -> tuple[Mask
 
 def _multipliers(of_cost: Array, jacobian: Array, lowest: Array, highest: Array) -> Array:
     """Return (m,) the mu between `lowest` and `highest` that minimize |of_cost + jacobian mu|."""
-    count = len(lowest)
+    count, scale = len(lowest), np.linalg.norm(jacobian, axis=0)
+    if not (np.all(np.isfinite(scale)) and np.all(np.isfinite(of_cost))):  # along an unstable motion
+        raise GradientError("the derivatives of later states with respect to the inputs exceed the range of numbers")
     if not count or not len(of_cost):
         return np.zeros(count)
-    scale = np.linalg.norm(jacobian, axis=0)
     scale[scale == 0] = 1.0
     unit, acts = jacobian / scale, np.ones(count, dtype=bool)
     multipliers = np.linalg.lstsq(unit, -of_cost)[0]

@@ -31,6 +31,9 @@ from drake_diff.optimize.problem.obstacles import ClearanceConstraint, Obstacle,
 from drake_diff.optimize.problem.problem import Problem
 from drake_diff.planning.robot import (
     HOLD_SHARE,
+    LONGER,
+    MOST_IF_STIFF,
+    SHORTEST,
     TOUCHING,
     Robot,
     coordinates_of,
@@ -60,9 +63,8 @@ CONTROLS, CUBIC = (8, 12, 20, 40), 4  # control points of a spline along a path 
 # Motions.
 FASTEST = 1.0  # [rad/s or m/s] peak speed of a joint without a velocity limit
 OF_SPEED, OF_EFFORT, OF_PULL = 0.6, 0.9, 0.8  # share of speed limits, of effort limits, and of a controller's effort
-SHORTEST, LONGEST = 0.6, 6.0  # [s] limits of a motion's duration
+LONGEST = 6.0  # [s] limit of a motion's duration
 STEPS = (30, 100)  # minimum and maximum number of steps of a plan
-MOST_IF_STIFF = 1000  # steps of a plan with springs that need short steps
 PEAK = 1.875  # the maximum slope of the smooth profile from 0 to 1
 PROBED = 1e-3  # [rad/s or m/s] size of a change by which the effect of an input is measured
 SETTLED = 1e-3  # [rad or m] largest motion in a step of a joint at rest
@@ -262,7 +264,7 @@ def _random_posture(space: Space, random: np.random.Generator) -> Array | None:
     """Sample a posture near the start, within the limits, without overlap, that the motors can hold, preferably within
     HOLD_SHARE; return None if there is none."""
     robot = space.robot
-    far = speed_limits(robot.model) * SOON / PEAK
+    far = speed_limits(robot.model) * min(SOON, _durations(robot, 0.0)[1]) / PEAK
     reach = np.minimum(MOVE * (robot.upper - robot.lower), far)
     margin = 0.2 * MOVE * (robot.upper - robot.lower)
     best, least = None, 1.0
@@ -452,18 +454,28 @@ def along(robot: Robot, line: PostureLine, *, slower: float = 1.0) -> MotionGues
     """Return the smooth motion along a path, at rest at both ends, with its inputs.
 
     It is as fast as the joints' speed and effort limits allow, within the limits of this module. Raises SimulationError
-    if Drake cannot take a step.
+    if Drake cannot take a step, and InputError if the motion needs more steps that resolve a spring than a plan has.
     """
     t = np.linspace(0, 1, 101)
     speeds = np.abs(np.gradient(line.at(smooth(t)), t, axis=0))
-    duration = slower * float(np.max(speeds / speed_limits(robot.model), initial=0.0))
+    duration, longest = _durations(robot, float(np.max(speeds / speed_limits(robot.model), initial=0.0)))
     name = line.name if slower == 1 else f"{line.name}, {slower:g} times slower"
-    duration = float(np.clip(duration, SHORTEST, LONGEST))
+    duration = float(np.clip(slower * duration, SHORTEST, longest))
     guess = _timed(robot, name, line.at, duration)
-    while guess.effort > OF_EFFORT and duration < LONGEST:
-        duration = min(1.5 * duration, LONGEST)
+    while guess.effort > OF_EFFORT and duration < longest:
+        duration = min(1.5 * duration, longest)
         guess = _timed(robot, name, line.at, duration)
     return guess
+
+
+def _durations(robot: Robot, wanted: float) -> tuple[float, float]:
+    """Return the duration [s] of a motion nearest to `wanted`, and the longest, in steps that resolve the springs."""
+    step = robot.model.time_step
+    longest = max(SHORTEST, min(LONGEST, LONGER * MOST_IF_STIFF * step)) if robot.stiff else LONGEST
+    if longest < min(wanted, LONGEST):
+        got = f"a motion of {wanted:.3g} s, in which the spring of {robot.stiff} needs time steps of {step:g} s"
+        raise InputError("goals", got=got, expected=f"a nearer goal, as a plan has at most {MOST_IF_STIFF} steps")
+    return max(wanted, SHORTEST), longest
 
 
 def flight(robot: Robot, places: Mapping[str, Array], seed: int) -> MotionGuess:
@@ -484,7 +496,7 @@ def flight(robot: Robot, places: Mapping[str, Array], seed: int) -> MotionGuess:
             v = _carrier(robot, name)
             way[v + 3 : v + 6] = position - frame_position(model, name)(np.append(robot.q, still))
         speeds = [max(np.linalg.norm(way[v + 3 : v + 6]) / FLY_SPEED, abs(way[v + 2]) / FLY_TURN) for _, _, v in free]
-        duration = float(np.clip(PEAK * max(speeds), SHORTEST, LONGEST))
+        duration = min(_durations(robot, PEAK * float(max(speeds))))
 
         def postures_at(s: Array, way: Array = way) -> Array:
             moves = [np.append(fraction * way, still) for fraction in s]
@@ -516,8 +528,8 @@ def _carrier(robot: Robot, name: str) -> int:
 def _timed(robot: Robot, name: str, postures_at: Callable[[Array], Array], duration: float) -> MotionGuess:
     """Return the motion through postures (M, nq) at s (M,) from 0 to 1 in `duration` [s], with its inputs."""
     model = robot.model
-    steps = int(np.clip(round(duration / model.time_step), STEPS[0], MOST_IF_STIFF if robot.is_stiff else STEPS[1]))
-    if duration / steps > 1.25 * model.time_step:
+    steps = int(np.clip(round(duration / model.time_step), STEPS[0], MOST_IF_STIFF if robot.stiff else STEPS[1]))
+    if not robot.stiff and duration / steps > LONGER * model.time_step:
         model = model.at_time_step(float(f"{duration / steps:.1g}"))
     # It reaches the goal one step before the end and rests there: Drake's step uses the velocity after the step.
     path = postures_at(smooth(np.clip(np.arange(steps + 1) / (steps - 1), 0.0, 1.0)))

@@ -18,7 +18,7 @@ from drake_diff.certificates.finding import Finding
 from drake_diff.derivatives.step import differentiate_step
 from drake_diff.exceptions import DrakeDiffError, InputError, ModelError, ModelWarning, WriteError
 from drake_diff.legs.feet import Legs
-from drake_diff.legs.standing import FRAME_TOLERANCE, SLOW_ENOUGH, Rest, random_shift, shift_to
+from drake_diff.legs.standing import FRAME_TOLERANCE, SLOW_ENOUGH, Rest, random_shift, shift_to, state_limits
 from drake_diff.model.assembly import single_coordinates
 from drake_diff.model.model import Model
 from drake_diff.optimize.options import Options
@@ -531,7 +531,6 @@ def _bounds(model: Model, near: Array) -> Bounds:
 
 def _goes(guess: MotionGuess) -> bool:
     """Return whether the motion is large enough and within the model's limits."""
-    terms = [*guess.model.contract.positions, *guess.model.contract.velocities]
-    low, high = np.array([t.lower for t in terms]), np.array([t.upper for t in terms])
+    low, high = state_limits(guess.model)
     goes = np.max(np.ptp(guess.xs[:, : guess.model.nq], axis=0)) >= SMALLEST_WAY
     return bool(goes and np.all((guess.xs >= low) & (guess.xs <= high)))

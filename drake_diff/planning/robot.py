@@ -24,13 +24,15 @@ from drake_diff.model.assembly import assembled, closed, loop_velocities
 from drake_diff.model.contact import overlaps
 from drake_diff.model.inputs import BodyForce
 from drake_diff.model.model import Model, load_model
-from drake_diff.model.plant import actuators, bodies, joints, labelled
+from drake_diff.model.plant import actuators, bodies, joints, key_of, labelled
 from drake_diff.model.step import advance, set_state
 from drake_diff.model.tangent import tangent_space
 
 TIME_STEP = 0.02  # [s] of a plan
 # Drake's springs are explicit: a step of 2 / (their angular frequency) is unstable, and a fourth of it is accurate.
 OF_SPRING, NUDGE = 0.5, 1e-6  # the second in rad or m
+# The least duration [s] of a motion, and the largest number of its steps and ratio to their time if springs are stiff.
+SHORTEST, MOST_IF_STIFF, LONGER = 0.6, 1000, 1.25
 FEW = 0.5  # of all joints: if fewer have a motor, the file does not describe motors or lacks some
 TEXTBOOK = 6  # joints: in a larger file, which is not a textbook model, every joint should have a motor
 SMALLEST_DRIVE = 1e-9  # of the largest singular value: a velocity with a smaller one is not driven
@@ -75,7 +77,7 @@ class Robot:
     shapes that overlap in every posture, which are ignored. If `model` has contact, `apart` is the model without it
     in its steps, for motions without contact. `standing` describes how the robot stands on its feet, if it does.
     Otherwise, floating bases are welded. `steered` (nv,) are the velocities that a motion of a fully driven robot
-    chooses; it is None for other robots. `is_stiff` tells that springs limit the time step.
+    chooses; it is None for other robots. `stiff` is the joint whose spring limits the time step, or "".
     """
 
     model: Model
@@ -88,7 +90,7 @@ class Robot:
     always: frozenset[Pair] = frozenset()
     standing: tuple[Legs, Rest] | None = None
     apart: Model | None = None
-    is_stiff: bool = False
+    stiff: str = ""
 
     def closed(self, q: Array) -> Array | None:
         """Return posture q (nq,) with closed loops and unchanged coordinates of the steered joints, or None."""
@@ -139,17 +141,31 @@ def load_robot(path: Path, seed: int, packages: Mapping[str, str | Path] | None 
     _fix_stuck(draft)
     _fix_massless(draft)
     _add_thrusters(draft)
-    resolved = spring_step(draft.model)
-    if is_stiff := resolved < TIME_STEP:
-        step = float(f"{resolved:.1g}")
-        draft.mend(f"stiff springs need short time steps: {step:g} s (time_step={step:g})", time_step=step)
-    return replace(_placed(draft, np.random.default_rng(seed)), is_stiff=is_stiff)
+    stiff = _resolve_springs(draft)
+    return replace(_placed(draft, np.random.default_rng(seed)), stiff=stiff)
 
 
-def spring_step(model: Model) -> float:
-    """Return the time step [s] that resolves the fastest vibration of the springs in the default state, or inf."""
+def _resolve_springs(draft: _Draft) -> str:
+    """Shorten the time step if a spring needs it, and return the name of its joint, or ""."""
+    (resolved, name), usual = spring_step(draft.model), draft.model.time_step
+    step = float(f"{resolved:.1g}")
+    if step >= usual:
+        return ""
+    if step * MOST_IF_STIFF * LONGER >= SHORTEST:
+        draft.mend(f"stiff springs need short time steps: {step:g} s for {name} (time_step={step:g})", time_step=step)
+        return name
+    needed = f"the spring of {name} needs time steps of {step:g} s"
+    if not draft.options.get("ground"):
+        expected = f"a plan of {SHORTEST:g} s has at most {MOST_IF_STIFF}: fix this joint in the file, or soften it"
+        raise ModelError(f"{draft.path}: {needed}, and {expected}")
+    draft.repairs.append(f"{needed}, which those of {usual:g} s on feet do not resolve")
+    return ""
+
+
+def spring_step(model: Model) -> tuple[float, str]:
+    """Return the time step [s] for the springs' fastest vibration in the default state, or inf, and its main joint."""
     if model.plant.num_force_elements() == 1:  # gravity
-        return float("inf")
+        return float("inf"), ""
     x, still, space = model.default_state, np.zeros(model.nv), tangent_space(model)
     x = np.append(x[: model.nq], still)
 
@@ -161,8 +177,14 @@ def spring_step(model: Model) -> float:
     set_state(model.double, x)
     ways = loop_velocities(model, x[: model.nq])
     mass = ways.T @ model.double.mass_matrix() @ ways
-    squares = np.linalg.eigvals(np.linalg.pinv(mass) @ ways.T @ stiffness @ ways).real
-    return OF_SPRING / float(np.sqrt(max(np.max(squares, initial=0.0), np.finfo(float).tiny)))
+    squares, modes = np.linalg.eig(np.linalg.pinv(mass) @ ways.T @ stiffness @ ways)
+    if np.max(squares.real, initial=0.0) <= np.finfo(float).tiny:
+        return float("inf"), ""
+    fastest = int(np.argmax(squares.real))
+    motion = ways @ modes[:, fastest].real
+    energy, names = motion * (stiffness @ motion), labelled(joints(model.plant))
+    name = max(names, key=lambda n: float(np.sum(energy[list(model.places(names[n])[1])])))
+    return OF_SPRING / float(np.sqrt(squares.real[fastest])), name
 
 
 def _reduce_followers(draft: _Draft) -> None:
@@ -185,10 +207,15 @@ def _add_motors(draft: _Draft) -> None:
             begin = f"only {had} joints had a motor" if had else "no joint had a motor"
             repair = f"{begin}: motors were added, {driven.nu} in total (actuators='all')"
             draft.mend(repair, driven, actuators="all")
-    driven_joints = [actuator.joint() for actuator in actuators(draft.model.plant)]
-    locked = [j.name() for j in driven_joints if j.position_lower_limits()[0] == 0 == j.position_upper_limits()[0]]
+    driven_joints, labels = [actuator.joint() for actuator in actuators(draft.model.plant)], _labels(draft.model)
+    stuck = [j for j in driven_joints if j.position_lower_limits()[0] == 0 == j.position_upper_limits()[0]]
+    locked = [labels[key_of(joint)] for joint in stuck]
     if locked:
         draft.mend(f"the range from 0 to 0 of {_few(locked)} was removed (actuators=)", actuators=tuple(locked))
+
+
+def _labels(model: Model) -> dict[tuple[str, str], str]:
+    return {key_of(joint): name for name, joint in labelled(joints(model.plant)).items()}
 
 
 def _movable(model: Model) -> int:
@@ -210,10 +237,10 @@ def _fix_stuck(draft: _Draft) -> None:
     """Weld joints with equal lower and upper limits, and their followers."""
     model, (lower, upper) = draft.model, draft.model.position_limits
     names: list[str] = []
-    for joint in joints(model.plant):
+    for name, joint in labelled(joints(model.plant)).items():
         positions, _ = model.places(joint)
         if joint.num_positions() == 1 and len(positions) and lower[positions[0]] >= upper[positions[0]]:
-            names.append(joint.name())
+            names.append(name)
     stuck = _with_followers(model, names)
     if stuck and len(stuck) == _movable(model):
         got = "each joint has equal lower and upper limits, which Drake enforces"
@@ -235,8 +262,8 @@ def _fix_massless(draft: _Draft) -> None:
             return
     mass = np.diag(model.double.mass_matrix())
     light = [
-        joint.name()
-        for joint in joints(model.plant)
+        name
+        for name, joint in labelled(joints(model.plant)).items()
         if joint.num_velocities() == 1 and any(mass[v] <= 0 for v in model.places(joint)[1])
     ]
     if light:
@@ -279,6 +306,7 @@ def _standing(read: _Draft, seed: int) -> Robot | Refusal:
         draft = _Draft(read.path, read.options | ON_FEET | GROUND | {"time_step": step}, read.repairs)
         _fix_stuck(draft)
         _fix_massless(draft)
+        _resolve_springs(draft)
         derivatives = analytic_of(draft.model)
         if draft.model.nv > MANY and isinstance(derivatives, Refusal) and draft.options.get("mimic") == "reduce":
             what = "mimic joints and their leaders are fixed"
@@ -347,7 +375,8 @@ def _placed(draft: _Draft, random: np.random.Generator) -> Robot:
 def _too_weak(model: Model, posture: StartPosture) -> tuple[str, ...]:
     """Return the joints whose motors are too weak for the posture, and their followers."""
     over = np.flatnonzero(shares_to_hold(model, posture.q) > 1)
-    moved = [actuator.joint().name() for actuator in actuators(model.plant)]
+    labels = _labels(model)
+    moved = [labels[key_of(actuator.joint())] for actuator in actuators(model.plant)]
     return _with_followers(model, [moved[i] for i in model.inputs.actuator[over]])
 
 

@@ -187,6 +187,30 @@ def test_a_standing_robot_is_regulated_until_its_motion_ends(on_feet):
     assert speeds[-1] < 2 * speeds[-20]
 
 
+def antenna(*, limits, stiffness=0):
+    """Return the quadruped as a URDF with a hinged rod on its trunk."""
+    ends = '<frame name="a" link="trunk"/><frame name="b" link="rod"/><drake:linear_bushing_rpy>'
+    ends += '<drake:bushing_frameA name="a"/><drake:bushing_frameC name="b"/>'
+    ends += f'<drake:bushing_torque_stiffness value="0 {stiffness} 0"/>'
+    for zero in ("torque_damping", "force_stiffness", "force_damping"):
+        ends += f'<drake:bushing_{zero} value="0 0 0"/>'
+    spring = f"{ends}</drake:linear_bushing_rpy>" if stiffness else ""
+    hinge = '<joint name="antenna" type="revolute"><parent link="trunk"/><child link="rod"/><axis xyz="0 1 0"/>'
+    more = body("rod", 0.2, "0 0 0.1") + f'{hinge}<limit {limits} effort="5" velocity="9"/></joint>{spring}</robot>'
+    return quadruped().replace("</robot>", more).replace("<robot ", '<robot xmlns:drake="http://drake.mit.edu" ')
+
+
+def test_a_standing_robot_with_a_locked_joint_moves(tmp_path):
+    """Drake holds the joint to about 1e-6, which is not beyond its limits."""
+    path = tmp_path / "table.urdf"
+    path.write_text(antenna(limits='lower="0.1" upper="0.1"'))
+    model = dd.load_model(path, time_step=0.005, actuators="all", **ON_FEET, **GROUND)
+    robot, rest = stand_at_rest(model, *ranges(model))
+    found = shift_to(robot, rest, {"trunk": rest.x[robot.base_q + 4 : robot.base_q + 7] - [0.0, 0.0, 0.05]}, {})
+    assert isinstance(found, Shift), found
+    assert 0 < np.max(np.abs(found.xs[:, model.position_names.index("antenna_q")] - 0.1)) < 1e-4
+
+
 @pytest.mark.parametrize("name", slow_after(1, ["panda.urdf", "iris.urdf", "allegro_left_hand.urdf", "kinova.urdf"]))
 def test_an_arm_a_hand_and_a_drone_have_no_feet(name):
     model = dd.load_model(robot_file(name), time_step=0.005, actuators="all", mimic="reduce", **ON_FEET, **GROUND)
@@ -201,6 +225,16 @@ def test_what_cannot_stand_is_held_and_the_reason_is_told(tmp_path):
     assert any("base='weld'" in told and "it cannot stand: no contact forces" in told for told in robot.repairs)
     path.write_text(quadruped())
     assert any("base='free'" in told for told in load_robot(path, 0).repairs)
+
+
+@pytest.mark.parametrize(("stiffness", "step"), [(300.0, 0.002), (1e6, 0.005)])
+def test_a_spring_of_a_standing_robot_is_resolved_or_named(stiffness, step, tmp_path):
+    path = tmp_path / "table.urdf"
+    path.write_text(antenna(limits='lower="-1" upper="1"', stiffness=stiffness))
+    robot = load_robot(path, 0)
+    assert robot.standing is not None, robot.repairs
+    assert robot.model.time_step == step
+    assert sum("antenna" in repair and "spring" in repair for repair in robot.repairs) == 1
 
 
 def test_a_robot_may_touch_the_ground_and_not_itself(tmp_path):

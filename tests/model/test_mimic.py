@@ -269,6 +269,19 @@ def test_other_engines_and_exports_say_why_not(tmp_path):
         describe(load(sliders(tmp_path), None))
 
 
+def test_a_joint_at_a_bushing_is_not_fixed_and_the_file_is_named(tmp_path):
+    """Drake removes no joint from a plant with a bushing."""
+    ends = '<frame name="f" link="a_link"/><frame name="g" link="b_link"/><drake:linear_bushing_rpy>'
+    ends += '<drake:bushing_frameA name="f"/><drake:bushing_frameC name="g"/>'
+    for size in ("torque_stiffness", "torque_damping", "force_stiffness", "force_damping"):
+        ends += f'<drake:bushing_{size} value="0 1 0"/>'
+    path = sliders(tmp_path)
+    text = path.read_text().replace("</robot>", f"{ends}</drake:linear_bushing_rpy></robot>")
+    path.write_text(text.replace("<robot ", '<robot xmlns:drake="http://drake.mit.edu" '))
+    with pytest.raises(ModelError, match=r"mimic='fix': .*force elements"):
+        load(path, "fix")
+
+
 def mimics_in(path):
     """Return (follower, leader, ratio, offset) of each mimic joint, read without drake_diff."""
     found = []

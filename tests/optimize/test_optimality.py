@@ -135,3 +135,19 @@ def test_norms_beyond_all_numbers_are_infinite():
     norms = final_state_norms([dataclasses.replace(d, A=1e10 * np.eye(4))] * 40)
     assert norms[-2] == 1e10
     assert norms[0] == np.inf
+
+
+def test_a_plan_whose_derivatives_overflow_has_no_multipliers_and_says_so(tmp_path):
+    """In steps of 1 s, an explicit spring of frequency 1000 grows by about 1e6 per step, beyond 1e308 in 60 steps."""
+    path = tmp_path / "spring.xml"
+    path.write_text(SPRING)
+    model = dd.load_model(path, time_step=1.0)
+    problem = dd.Problem(model, x0=[0, 0], x_goal=[0, 0], num_steps=60, running_cost=EFFORT)
+    solution = dd.solve(problem, method="shooting", initial_guess=(np.zeros((61, 2)), np.zeros((60, 1))))
+    found = solution.optimality
+    assert isinstance(found, Refusal)
+    assert "exceed the range of numbers" in found.reason
+
+
+SPRING = """<mujoco model="spring"><worldbody><body><joint name="slide" type="slide" axis="1 0 0" stiffness="1e6"/>
+<geom type="sphere" size="0.1" mass="1"/></body></worldbody><actuator><motor joint="slide"/></actuator></mujoco>"""

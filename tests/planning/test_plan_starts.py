@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import drake_diff as dd
-from drake_diff.exceptions import ModelError
+from drake_diff.exceptions import InputError, ModelError
 from drake_diff.planning import plan
-from drake_diff.planning.guesses import Goals, postures
+from drake_diff.planning.guesses import Goals, MotionGuess, PostureLine, along, postures
+from drake_diff.planning.planner import _goes
 from drake_diff.planning.robot import TOUCHING, load_robot, share_to_hold, spring_step
 from drake_diff.runs.fields import Failure
 
@@ -234,9 +235,56 @@ def test_the_step_that_resolves_a_spring_is_half_the_inverse_of_its_frequency(st
     path = tmp_path / "slide.xml"
     path.write_text(SLIDE.format(stiffness))
     frequency = np.sqrt(stiffness / 2.5)
-    assert spring_step(dd.load_model(path, time_step=0.01)) == pytest.approx(0.5 / frequency, rel=1e-6)
+    step, name = spring_step(dd.load_model(path, time_step=0.01))
+    assert step == pytest.approx(0.5 / frequency, rel=1e-6)
+    assert name == "slide"
     path.write_text(SLIDE.format(0))
-    assert spring_step(dd.load_model(path, time_step=0.01)) == np.inf
+    assert spring_step(dd.load_model(path, time_step=0.01))[0] == np.inf
+
+
+def test_a_plan_does_not_begin_with_steps_that_leave_a_spring_unresolved(tmp_path):
+    """A spring of 1e4 N m/rad needs steps of 70 us, 9000 in the shortest plan. One of 300 needs 600 of 1 ms, or more
+    than 1000 in 2 rad at 0.6 rad/s. A step that is not shorter in rounded numbers is no repair."""
+    path = tmp_path / "sprung.xml"
+    path.write_text(SPRUNG.format(1e4))
+    with pytest.raises(ModelError, match=r"spring of j2 needs time steps of .*: fix this joint"):
+        load_robot(path, 0)
+    path.write_text(SPRUNG.format(300))
+    with pytest.raises(InputError, match=r"goals: .*spring of j2 needs time steps of 0.001 s"):
+        plan(path, goals={"j1": 1.9}, out=tmp_path / "out")
+    found = load_robot(path, 0)
+    for goal in postures(found, Goals({}, {}), 0):
+        guess = along(found, PostureLine("a line", np.array([found.q, goal]), found))
+        assert guess.model.time_step == found.model.time_step
+        assert guess.num_steps <= 1000
+    path.write_text(SLIDE.format(2.5 * (0.5 / 0.0196) ** 2))
+    found = load_robot(path, 0)
+    assert found.model.time_step == 0.02
+    assert not found.stiff
+    assert not any("spring" in repair for repair in found.repairs)
+
+
+LOCKED = """directives:
+- add_model: {{name: left, file: "file://{0}"}}
+- add_weld: {{parent: world, child: left::rail}}
+- add_model: {{name: right, file: "file://{0}"}}
+- add_weld: {{parent: world, child: right::rail}}
+"""
+
+
+def test_two_robots_of_one_file_are_repaired_by_their_own_names(tmp_path):
+    limit = 'lower="0" upper="0" effort="5" velocity="1"'
+    motor = (
+        '<transmission name="t"><type>transmission_interface/SimpleTransmission</type><joint name="shoulder"/>'
+        '<actuator name="motor"/></transmission>'
+    )
+    parts = [link("rail"), link("arm"), joint("shoulder", "rail", "arm", limit=limit), motor]
+    (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{"".join(parts)}</robot>')
+    both = tmp_path / "both.dmd.yaml"
+    both.write_text(LOCKED.format(tmp_path / "arm.urdf"))
+    found = load_robot(both, 0)
+    assert found.model.nu == 2
+    assert any("0 to 0 of left::shoulder, right::shoulder" in repair for repair in found.repairs)
 
 
 @pytest.mark.slow
@@ -248,3 +296,14 @@ def test_an_arm_with_a_stiff_spring_is_planned_in_steps_that_resolve_it(tmp_path
     assert result.success, result
     assert result.solution.problem.model.time_step == 0.001
     assert any("stiff springs" in repair for repair in result.repairs)
+
+
+def test_a_motion_with_a_locked_joint_is_within_its_limits(tmp_path):
+    """Drake holds the joint at 0 to about 1e-6, which is not beyond its limits."""
+    parts = [link("upper"), joint("shoulder", "world", "upper", limit='lower="0" upper="0" effort="5" velocity="9"')]
+    wide = 'lower="-2" upper="2" effort="5" velocity="9"'
+    parts += [link("fore"), joint("elbow", "upper", "fore", at="0 0 -0.5", limit=wide)]
+    model = dd.load_model(robot(tmp_path, *parts), time_step=0.01, actuators=["elbow"])
+    motion = dd.rollout(model, model.default_state, np.full((30, 1), 1.0))
+    assert 0 < np.max(np.abs(motion.xs[:, model.position_names.index("shoulder_q")])) < 1e-5
+    assert _goes(MotionGuess("", model, motion.xs, motion.us, 0.0))
