@@ -130,7 +130,7 @@ def cart_pole(p, T):
 
 def rigid_body(p, T):
     """Integrate the rotation matrix under a constant angular momentum."""
-    inertia = np.diag([p["Ix"], p["Iy"], p["Iz"]])
+    inertia = np.diag([p["I_x"], p["I_y"], p["I_z"]])
     R = Rotation.from_euler("ZYX", [p["yaw"], p["pitch"], p["roll"]]).as_matrix()
     momentum = R @ inertia @ R.T @ [p["wx"], p["wy"], p["wz"]]
 

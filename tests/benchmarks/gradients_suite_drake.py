@@ -118,7 +118,7 @@ def cart_pole(p, T):
 
 def rigid_body(p, T):
     """Three hinges, as drake_diff has no joint with roll, pitch and yaw; see `to_hinges` and `from_hinges`."""
-    made, inertia = Plant(T, 0.0), UnitInertia(p["Ix"], p["Iy"], p["Iz"])
+    made, inertia = Plant(T, 0.0), UnitInertia(p["I_x"], p["I_y"], p["I_z"])
     yaw = made.joint(RevoluteJoint, "yaw", Z, NOTHING)
     pitch = made.joint(RevoluteJoint, "pitch", Y, NOTHING, yaw)
     made.joint(RevoluteJoint, "roll", X, SpatialInertia(1.0, np.zeros(3), inertia), pitch)

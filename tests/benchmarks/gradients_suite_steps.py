@@ -105,20 +105,20 @@ def cart_pole(p, T, tolerance):
 
 
 draws(
-    "rigid_body", roll=(-1, 1), pitch=(-0.7, 0.7), yaw=(-2, 2), wx=(-4, 4), wy=(-4, 4), wz=(-4, 4), Ix=(0.6, 1.0),
-    Iy=(0.6, 1.0), Iz=(0.6, 1.2), T=(0.02, 0.6),
+    "rigid_body", roll=(-1, 1), pitch=(-0.7, 0.7), yaw=(-2, 2), wx=(-4, 4), wy=(-4, 4), wz=(-4, 4), I_x=(0.6, 1.0),
+    I_y=(0.6, 1.0), I_z=(0.6, 1.2), T=(0.02, 0.6),
 )  # fmt: skip
 
 
 @family(
-    "step", 10, "roll:rad pitch:rad yaw:rad wx:rad/s wy:rad/s wz:rad/s", "", "Ix:kg*m^2 Iy:kg*m^2 Iz:kg*m^2",
-    """A free rigid body without torques, about its center of mass. Its principal axes have the moments of inertia Ix,
-    Iy and Iz. Its rotation from principal axes to the world is Rz(yaw) Ry(pitch) Rx(roll), and (wx, wy, wz) is its
+    "step", 10, "roll:rad pitch:rad yaw:rad wx:rad/s wy:rad/s wz:rad/s", "", "I_x:kg*m^2 I_y:kg*m^2 I_z:kg*m^2",
+    """A free rigid body without torques, about its center of mass. Its principal axes have the moments of inertia I_x,
+    I_y and I_z. Its rotation from principal axes to the world is Rz(yaw) Ry(pitch) Rx(roll), and (wx, wy, wz) is its
     angular velocity in the world's axes.""",
     is_integrated=True,
 )  # fmt: skip
 def rigid_body(p, T, tolerance):
-    inertia = np.array([p["Ix"], p["Iy"], p["Iz"]])
+    inertia = np.array([p["I_x"], p["I_y"], p["I_z"]])
 
     def rates(y):
         (a, b, c), w = y[:3], y[3:]
