@@ -256,7 +256,7 @@ def unseen_heights(model: Model, piece: Excerpt) -> list[tuple[int, int]]:
     if not model.contract.contact.collision_pairs or np.any(model.inputs.actuator < 0):
         return []
     driven = {int(actuator.joint().velocity_start()) for actuator in actuators(model.plant)}
-    unseen = ~np.isfinite(piece.ys).any(axis=0)
+    unseen = ~np.any(np.isfinite(piece.ys), axis=0)
     return [(i, j) for i, j in heights(model) if unseen[i] and j not in driven] if np.any(unseen[: model.nq]) else []
 
 
@@ -267,7 +267,7 @@ def unseen_at_rest(model: Model, piece: Excerpt) -> list[int]:
     """
     if not model.contract.contact.collision_pairs or np.any(model.inputs.actuator < 0):
         return []
-    seen = np.isfinite(tangent_space(model).minus(piece.ys, piece.ys)).any(axis=0)
+    seen = np.any(np.isfinite(tangent_space(model).minus(piece.ys, piece.ys)), axis=0)
     free = {j for _, first in coordinates_of(model).free for j in range(first, first + 6)}
     return [j for j in free.union(j for _, j in unseen_heights(model, piece)) if not seen[j]]
 
