@@ -179,7 +179,8 @@ class UserFunction:
 
 def user_function(subject: str, function: Any, shape: Shape | None = (), ndim: int = 1) -> Any:
     """Wrap a user's function in `UserFunction`; return functions of this package and other objects unchanged."""
-    ours = isinstance(function, UserFunction) or type(function).__module__.startswith("drake_diff.")
+    defined_in = getattr(function, "__module__", None) or "", type(function).__module__
+    ours = isinstance(function, UserFunction) or any(module.startswith("drake_diff.") for module in defined_in)
     if ours or not callable(function) or hasattr(function, "linearize"):
         return function
     return UserFunction(subject, function, shape, ndim)
