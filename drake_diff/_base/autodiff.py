@@ -109,21 +109,20 @@ def returns_jax(subject: str, function: Callable[..., Any], *arguments: Any) -> 
         result = function(*arguments)
     except Exception:  # the caller reports the error of its own call
         return False
-    for part in result if isinstance(result, (list, tuple)) else [result]:
-        if not _is_of_jax(part):
-            continue
-        if part.dtype.kind == "f" and part.dtype != FLOAT:
+    arrays = _arrays_of_jax(result)
+    for array in arrays:
+        if array.dtype.kind == "f" and array.dtype != FLOAT:
             expected = 'double precision: jax.config.update("jax_enable_x64", True)'
-            raise InputError(named(subject, function), got=f"a JAX array of {part.dtype}", expected=expected)
-    return _is_of_jax(result) or UserFunction.calls_in_jax > before
+            raise InputError(named(subject, function), got=f"a JAX array of {array.dtype}", expected=expected)
+    return bool(arrays) or UserFunction.calls_in_jax > before
 
 
-def _is_of_jax(result: Any) -> bool:
-    """Return whether a result is an array of JAX, or a list that contains one."""
+def _arrays_of_jax(result: Any) -> list[Any]:
+    """Return a result that is an array of JAX, or the arrays of JAX in a list."""
     if "jax" not in sys.modules:
-        return False
-    parts = result if isinstance(result, (list, tuple)) else [result]
-    return any(isinstance(part, sys.modules["jax"].Array) for part in parts)
+        return []
+    entries = result if isinstance(result, (list, tuple)) else [result]
+    return [entry for entry in entries if isinstance(entry, sys.modules["jax"].Array)]
 
 
 def chained_by_jax(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -137,8 +136,8 @@ def chained_by_jax(function: Callable[..., Any], *arguments: Any) -> Any:
         result = jax.numpy.asarray(function(*arguments), dtype=float)
         return result, result
 
-    each = tuple(range(len(arguments)))
-    jacobians, value = jax.jacrev(twice, argnums=each, has_aux=True)(*map(plain, arguments))
+    positions = tuple(range(len(arguments)))
+    jacobians, value = jax.jacrev(twice, argnums=positions, has_aux=True)(*map(plain, arguments))
     variables = np.concatenate([np.ravel(argument) for argument in arguments]) + AutoDiffXd(0.0)
     columns = [np.asarray(j).reshape(value.size, -1) for j in jacobians]
     rows = chain_rows(np.ravel(value), np.hstack(columns), variables)
@@ -166,7 +165,7 @@ class UserFunction:
         if isinstance(x, np.ndarray) and x.ndim == self.ndim:
             if x.dtype == FLOAT:
                 result = called(self.subject, self.function, *arguments, shape=self.shape)
-                if type(result) is not float and _is_of_jax(result):
+                if type(result) is not float and _arrays_of_jax(result):
                     UserFunction.calls_in_jax += 1
                     self._is_in_jax = True
                 return result

@@ -53,8 +53,8 @@ class FunctionCertificate(Verdict):
     """The verdict on a function's derivative, with the meaning that it has in `Certificate`.
 
     Example:
-        >>> found = dd.certify_function(np.sin, [0.0, 1.0], jacobian=lambda x: np.diag(np.cos(x)) * [1.0, 1.01])
-        >>> found.verdict, found.entries[0].row, found.entries[0].column
+        >>> certificate = dd.certify_function(np.sin, [0.0, 1.0], jacobian=lambda x: np.diag(np.cos(x)) * [1.0, 1.01])
+        >>> certificate.verdict, certificate.entries[0].row, certificate.entries[0].column
         ('disagree', 'f[1]', 'x[1]')
     """
 
@@ -204,8 +204,10 @@ def _suspects(screen: Screen) -> Iterator[list[int]]:
     while groups and len(single) < OPTIONS.columns:
         group = groups.pop()
         if np.any(screen.doubtful(np.isin(np.arange(n), group))[rows] if rows.any() else True):
-            halves = np.array_split(group, 2)
-            single, groups = (single, groups + halves) if len(group) > 1 else ([*single, int(group[0])], groups)
+            if len(group) > 1:
+                groups += np.array_split(group, 2)
+            else:
+                single.append(int(group[0]))
     if single:
         yield sorted(single)
 

@@ -279,12 +279,12 @@ class WithEfforts:
         x, h, u = xs[:, :-1].reshape(-1, nx), hs.reshape(-1, 1), us.reshape(-1, 1, nu)
         lacking, by_input = self.efforts(self.law.dynamics(values), x, u[:, 0], us[:, before].reshape(-1, nu))
         groups = [b.inputs for b in self.law.branches] if len(branches) == len(self.law.branches) else [np.arange(nu)]
-        begun, added = self.law.run(values, x, h, u)[:, 1], [np.zeros((K * M, len(b.states), 0)) for b in branches]
+        ends, added = self.law.run(values, x, h, u)[:, 1], [np.zeros((K * M, len(b.states), 0)) for b in branches]
         for turn in range(max(map(len, groups))):  # one input of each branch at once
             some = [inputs[turn] for inputs in groups if turn < len(inputs)]
             moved = u.copy()
             moved[..., some] += self.CHANGE
-            by_u = (self.law.run(values, x, h, moved)[:, 1] - begun) / self.CHANGE
+            by_u = (self.law.run(values, x, h, moved)[:, 1] - ends) / self.CHANGE
             for k, (branch, inputs) in enumerate(zip(branches, groups, strict=True)):
                 if turn < len(inputs):
                     share = lacking[:, :, inputs[turn]].T / by_input[inputs[turn]]
