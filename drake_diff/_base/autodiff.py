@@ -107,22 +107,24 @@ def returns_jax(subject: str, function: Callable[..., Any], *arguments: Any) -> 
     before = UserFunction.calls_in_jax
     try:
         result = function(*arguments)
+    except InputError:
+        raise
     except Exception:  # the caller reports the error of its own call
         return False
-    arrays = _arrays_of_jax(result)
+    return _has_arrays_of_jax(subject, function, result) or UserFunction.calls_in_jax > before
+
+
+def _has_arrays_of_jax(subject: str, function: Callable[..., Any], result: Any) -> bool:
+    """Return whether a result is an array of JAX or a list with one; raise InputError for single precision."""
+    if "jax" not in sys.modules:
+        return False
+    entries = result if isinstance(result, (list, tuple)) else [result]
+    arrays = [entry for entry in entries if isinstance(entry, sys.modules["jax"].Array)]
     for array in arrays:
         if array.dtype.kind == "f" and array.dtype != FLOAT:
             expected = 'double precision: jax.config.update("jax_enable_x64", True)'
             raise InputError(named(subject, function), got=f"a JAX array of {array.dtype}", expected=expected)
-    return bool(arrays) or UserFunction.calls_in_jax > before
-
-
-def _arrays_of_jax(result: Any) -> list[Any]:
-    """Return a result that is an array of JAX, or the arrays of JAX in a list."""
-    if "jax" not in sys.modules:
-        return []
-    entries = result if isinstance(result, (list, tuple)) else [result]
-    return [entry for entry in entries if isinstance(entry, sys.modules["jax"].Array)]
+    return bool(arrays)
 
 
 def chained_by_jax(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -165,12 +167,12 @@ class UserFunction:
         if isinstance(x, np.ndarray) and x.ndim == self.ndim:
             if x.dtype == FLOAT:
                 result = called(self.subject, self.function, *arguments, shape=self.shape)
-                if type(result) is not float and _arrays_of_jax(result):
+                if type(result) is not float and _has_arrays_of_jax(self.subject, self.function, result):
                     UserFunction.calls_in_jax += 1
                     self._is_in_jax = True
                 return result
             if x.size and isinstance(x.flat[0], AutoDiffXd):
-                if self._is_in_jax and returns_jax(self.subject, self.function, *map(plain, arguments)):
+                if self._is_in_jax:  # known from a call for plain numbers
                     return chained_by_jax(self.function, *arguments)
                 return carrying(self.subject, self.function, *arguments)
         return self.function(*arguments)

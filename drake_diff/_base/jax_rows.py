@@ -79,11 +79,13 @@ class JaxRows:
             far &= outside & np.isfinite(ahead + behind)
         if np.any(far):
             i = int(np.argmax(far))
-            slopes = f"the slope {claimed[i]:.6g} along a line, whose values have the slope {ahead[i]:.6g}"
-            raise GradientError(f"{self.name}: JAX gives value {i} {slopes}; see dd.certify_function")
+            slopes = f"{claimed[i]:.6g} by JAX and {ahead[i]:.6g} by differences"
+            raise GradientError(
+                f"{self.name}: the slope of value {i} along a line is {slopes}; see dd.certify_function"
+            )
 
     def _run(self, function: Any, points: Array, *more: Array) -> Array:
-        """Call a compiled function of rows, with copies of the last row to one of a few counts that JAX compiles."""
+        """Call a compiled function of rows. Copies of the last row are added, as JAX compiles for each count of rows."""
         count, size = len(points), LEAST_ROWS
         while size < count:
             size *= GROWTH

@@ -189,9 +189,9 @@ class Screen:
         error = np.linalg.lstsq(self.directions * per_weight, gap, rcond=None)[0].T
         noticeable = self.noticeable[:, None] * per_weight
         statement = (
-            f"the slopes along {SCREEN.directions} random directions leave no doubt: of single entries an error that "
-            "large would have been noticed, of several together but for a probability of "
-            f"{SCREEN.miss:g}; differences of entries are the nearest that explain the slopes"
+            f"the slopes along {SCREEN.directions} random directions agree: an error of this size in one entry would "
+            f"have been noticed, errors in several entries except with a probability of {SCREEN.miss:g}; the "
+            "differences shown are the nearest values that explain the slopes"
         )
         numbers = unscaled(scale, derivative, derivative - error * per_weight, noticeable, noticeable, claim.size)
         codes, text = np.full(derivative.shape, AGREE), f"{statement}; {told}" if told else statement
