@@ -85,7 +85,7 @@ class JaxRows:
             )
 
     def _run(self, function: Any, points: Array, *more: Array) -> Array:
-        """Call a compiled function of rows. Copies of the last one are added, as JAX compiles for each count of rows."""
+        """Call a compiled function of rows. Copies of the last are added, since JAX compiles for each count."""
         count, size = len(points), LEAST_ROWS
         while size < count:
             size *= GROWTH
